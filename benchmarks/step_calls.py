@@ -110,9 +110,9 @@ class Held:
     """The workers of a group, stopped until the trainer waits."""
 
     def __init__(self, group: Any) -> None:
-        steps = vars(vars(group)["_steps"])
-        self._rings = steps["_rings"]
-        steps["_poller"].num_cores = 0
+        parts = vars(group)["_core"].parts
+        self._rings = parts.tables.requests.rings
+        parts.poller.num_cores = 0
         self._pids = [worker["pid"] for worker in group.get_workers()]
         self._driver = vars(vars(group)["_driver"])
         self._epoll = self._driver.get("_epoll")
@@ -151,7 +151,7 @@ class Death(Held):
 
     def __init__(self, group: Any) -> None:
         super().__init__(group)
-        self.calls = Calls(until={"Core.hand_out", "Steps._hand_out"})
+        self.calls = Calls(until={"Steps.hand_out"})
 
     def poll(self, timeout: float) -> Any:
         self._driver["_epoll"] = self._epoll

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlightning_aio._core.group.engine.checked import CheckedRequests, CheckedSteps
-from rlightning_aio._core.group.engine.core import Core, Parts
-from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.engine.checked import CheckedRequests
+from rlightning_aio._core.group.engine.core import Core
+from rlightning_aio._core.group.engine.steps import Parts
+from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
-from rlightning_aio._core.group.state.conditions import FIRST_RESULTS, Conditions
+from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.lifetime import Lifetime
 from rlightning_aio._core.group.state.observed import Observed
@@ -397,9 +398,6 @@ class FakeInline(FakeHost):
         self.finish()
         return True
 
-    def poll(self) -> None:
-        """Do nothing: this host posts everything at once."""
-
 
 class FakeGroup:
     """A core over fake hosts, and the clock and driver that its procedures need.
@@ -432,7 +430,7 @@ class FakeGroup:
         bell = TrainerBell(bell_memory, len(rows))
         envs = EnvTable([self.config] * size, self.env_ids)
         conditions = self.conditions = Conditions()
-        observed = Observed(conditions)
+        observed = Observed()
         requests = CheckedRequests(np.repeat(np.arange(len(rows)), rows), len(rows), conditions)
         layout = SlabLayout(size)
         continuity = Continuity(envs, conditions)
@@ -451,8 +449,9 @@ class FakeGroup:
         completions, arena = tables.completions, tables.arena
         supervisor = Supervisor(tables)
         poller = Poller(requests, bell, 0, clock=tables.clock)
-        rings: list[Ring | None] = [None] * len(rows)
-        self.shared = shared = Shared(completions, arena, bell, bell_memory, rings, len(rows))
+        self.shared = shared = Shared(
+            completions, arena, bell, bell_memory, requests.rings, len(rows)
+        )
         self.hosts: list[Any] = []
         for host_id, count in enumerate(rows):
             kind = FakeInline if inline and inline[host_id] else FakeWorker
@@ -461,11 +460,11 @@ class FakeGroup:
             self.hosts.append(host)
             supervisor.add(host, self.config)
             poller.add(host)
-        parts = Parts(tables, supervisor, poller, bell, rings, completions, self)
+        parts = Parts(tables, supervisor, poller, self)
         self.core = Core(parts, zero_copy=False, shares_thread=True)
-        self.steps = CheckedSteps(self.core)
+        self.steps = self.core.steps
         self.running: list[Running] = []
-        opened = self.begin(self.steps.start(self.now))
+        opened = self.begin(self.core.start(self.now))
         self.turn()
         assert opened.done, "fake hosts start at once"
 
@@ -476,11 +475,6 @@ class FakeGroup:
         running.resume(None)
         self.turn()
         return running
-
-    def expect_ordinary_steps(self) -> None:
-        """Skip the check of first observations, so that steps take the ordinary path."""
-        self.core._first_observations.left.clear()
-        self.conditions.note(FIRST_RESULTS, False)
 
     def turn(self, *, newest_first: bool = False) -> None:
         """Act as the driver until nothing is readable and no time has come."""

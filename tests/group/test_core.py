@@ -10,6 +10,7 @@ import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.state.conditions import CLOSED, UNLIKE_ENVS
 from rlightning_aio._core.hosts.messages import Failed, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
@@ -224,6 +225,7 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     group = FakeGroup([1])
     if moment == "before init":
         group.core.lifetime.open = False
+        group.conditions.note(CLOSED, True)
     else:
         group.steps.step_async(steps(0), group.now)
         group.finish(0)
@@ -415,8 +417,7 @@ def test_requests_that_were_sent_in_part_disturb_no_other_call(
 ) -> None:
     """Their results are left to the collector; the value of a call is dropped."""
     group = new_group(1, 1, 1)
-    if ordinary:
-        group.expect_ordinary_steps()
+    group.conditions.note(UNLIKE_ENVS, not ordinary)
     core = group.core
     batch, _ = run(group, core.reset(group.now, None, None, None))
     both = batch.take([0, 1]).respond(action=[PLAIN] * 2)

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio.protocol.entries import Operation
@@ -68,9 +68,6 @@ class Inline:
         self.log.append(self.host_id)
         return True
 
-    def poll(self) -> None:
-        """Do nothing: an inline host posts everything at once."""
-
 
 class Scene:
     """A poller over hosts with given numbers of requests in flight, and a visible bell."""
@@ -89,9 +86,9 @@ class Scene:
         self.orders: list[tuple[int, bool]] = []
         arm = self.bell.arm
 
-        def noted(goal: int, *, at_last: bool) -> None:
+        def noted(goal: int, *, at_last: bool) -> bool:
             self.orders.append((goal - self.bell.goal(0), at_last))
-            arm(goal, at_last=at_last)
+            return arm(goal, at_last=at_last)
 
         self.bell.arm = noted  # type: ignore[method-assign]
         self.poller = Poller(self.requests, self.bell, num_cores, clock=clock)
@@ -112,8 +109,7 @@ class Scene:
             self.requests.in_flight[host_id] -= count
 
     def arm(self, wanted: int) -> bool:
-        self.poller.arm(wanted)
-        return self.poller.is_reached()
+        return self.poller.arm(wanted)
 
 
 # -- orders

@@ -69,7 +69,6 @@ class Driven:
             Event.SENT: lambda: self._ask([SLOT], Operation.STEP, COLLECTOR),
             Event.SENT_FOR_CALL: self._call,
             Event.JOINED: lambda: self.table.join(SLOT, 1.0),
-            Event.STEPPED_AT_ONCE: self._step_at_once,
             Event.RESULT: self._result,
             Event.VALUE: lambda: self.table.set_value(self._end(), "value"),
             Event.FAULT: self._fail,
@@ -112,10 +111,6 @@ class Driven:
     def _free(self) -> None:
         fault = self.table.collector.failed[SLOT]
         assert self.table.collector.take_fault(fault).tolist() == [SLOT]
-
-    def _step_at_once(self) -> None:
-        self.table.answer_at_once(SLOT)
-        self.settled = [SLOT]
 
     def _result(self) -> None:
         assert self.table.complete_one(1, self.entry()) == SLOT
@@ -248,7 +243,7 @@ def test_any_other_event_is_refused_or_has_no_effect(
     table = driven.table
     slots = table.alone(SLOT)
     needs_idle = (
-        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.STEPPED_AT_ONCE, Event.KEPT,
+        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.KEPT,
     )  # fmt: skip
     if event in needs_idle:
         assert table.first_not_idle(slots) == SLOT
@@ -352,19 +347,18 @@ def test_the_debug_mode_refuses_a_change_without_an_event() -> None:
 
 @pytest.mark.parametrize(("value", "checked"), [("1", True), ("", False)])
 def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bool) -> None:
-    """A group has the checked table and the checked steps, or neither."""
+    """A group has the checked table, or the other."""
     variables = {**os.environ, "RLIGHTNING_AIO_DEBUG": value}
     program = (
         "from rlightning_aio.sync import build_env_group\n"
         "group = build_env_group({'name': 'pole', 'backend': 'gymnasium',"
         " 'task': 'CartPole-v1', 'placement': 'inline'})\n"
-        "print(type(group._core.requests).__name__, type(group._steps).__name__)\n"
+        "print(type(group._core.requests).__name__)\n"
         "group.close()\n"
     )
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, capture_output=True, check=True, text=True, env=variables)
-    names = ["CheckedRequests", "CheckedSteps"] if checked else ["Requests", "Steps"]
-    assert ended.stdout.split() == names
+    assert ended.stdout.split() == ["CheckedRequests" if checked else "Requests"]
 
 
 # -- everything at once, compared with a model

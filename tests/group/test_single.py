@@ -17,7 +17,7 @@ import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio._core.group.engine.core import Core
-from rlightning_aio._core.group.state.conditions import FIRST_RESULTS, UNLIKE_ENVS
+from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
 from rlightning_aio.errors import EnvBusy, EnvRaised
 
 PROBE = HALVED | {"backend": "probe"}
@@ -43,11 +43,7 @@ class Used:
     def __init__(self, entry: dict[str, Any], *, ordinary: bool) -> None:
         self.group = rlightning_aio.sync.build_env_group(entry)
         self.group.init()
-        conditions = self.group._core._conditions
-        steps = self.group._steps
-        assert steps._inline is not None
-        self.group._core._first_observations.left.clear()
-        conditions.note(FIRST_RESULTS, False)
+        conditions = self.group._core.parts.tables.conditions
         if not ordinary:
             conditions.note(UNLIKE_ENVS, True)
         self.backend = entry["backend"]
@@ -134,7 +130,7 @@ DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("outcome
 def test_nothing_but_the_time_is_different(
     entry: dict[str, Any], deeds: list[tuple[str, int]]
 ) -> None:
-    """Results, errors, flags and sums equal those of the general path."""
+    """Results, errors, flags and sums equal those of steps that are not ordinary."""
     single, general = Used(entry, ordinary=True), Used(entry, ordinary=False)
     for deed, number in deeds:
         assert single.outcome(deed, number) == general.outcome(deed, number), deed

@@ -1,4 +1,4 @@
-"""The ordinary step and the general path give the same results, whatever happens in between."""
+"""Ordinary and other steps give the same results, whatever happens in between."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def seen(batch: BatchedData) -> Any:
 
 
 class Twins(RuleBasedStateMachine):
-    """Two groups with the same events: one steps as it chooses, one by the general path."""
+    """Two groups with the same events: one steps as it chooses, one never has ordinary steps."""
 
     @initialize(rows=st.lists(st.integers(1, 3), min_size=1, max_size=3), limit=st.integers(1, 4))
     def start(self, rows: list[int], limit: int) -> None:
@@ -80,7 +80,6 @@ class Twins(RuleBasedStateMachine):
         self.folder = tempfile.TemporaryDirectory()
         self.in_context = False
         for group in self.groups:
-            group.expect_ordinary_steps()
             running = group.begin(group.core.reset(group.now, None, None, None))
             self.finish_all(group)
             self.firsts.append(running.result()[0])
@@ -271,7 +270,6 @@ class Twins(RuleBasedStateMachine):
         ordinary, general = (group.core.requests for group in self.groups)
         assert ordinary.numbering.entry.tolist() == general.numbering.entry.tolist()
         assert ordinary.state.tolist() == general.state.tolist()
-        # Ticket numbers differ: the general path takes one before it refuses actions.
         assert np.sign(ordinary.owner).tolist() == np.sign(general.owner).tolist()
         assert ordinary.in_flight == general.in_flight
         for name in ("num_ready", "num_awaited"):
@@ -288,9 +286,8 @@ def test_steps() -> None:
 
 
 def test_steps_are_ordinary_before_and_after_a_death() -> None:
-    """Steps take the general path until the replacement has shown that it works."""
+    """Steps are not ordinary until the replacement has shown that it works."""
     group = FakeGroup([2, 2])
-    group.expect_ordinary_steps()
     running = group.begin(group.core.reset(group.now, None, None, None))
     Twins.finish_all(group)
     batch, _ = running.result()

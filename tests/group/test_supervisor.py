@@ -198,7 +198,7 @@ class Fleet:
             SlabLayout(size),
             Continuity(envs),
             conditions,
-            Observed(conditions),
+            Observed(),
             self.lifetime,
             Arena(),
             clock=lambda: self.now,

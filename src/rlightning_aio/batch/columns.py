@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import pickle
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import gymnasium as gym
+import msgspec
 import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
 
+from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
-    import gymnasium as gym
-    from numpy.typing import NDArray
-
-    from rlightning_aio.batch.names import EnvNames
+    from collections.abc import Iterable
 
 __all__ = ["BY_ROW", "ResultColumns"]
 
@@ -28,8 +28,7 @@ __all__ = ["BY_ROW", "ResultColumns"]
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 
 
-@dataclass(slots=True)
-class ResultColumns:
+class ResultColumns(msgspec.Struct):
     """Results of envs with the same row layout; the first axis of each array is that of rows.
 
     Attributes:

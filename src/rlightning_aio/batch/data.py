@@ -6,12 +6,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, overload
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from rlightning_aio.batch.infos import vector_infos
+from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.batch.parts import (
     column_of_parts,
     infos_of_parts,
@@ -29,10 +31,7 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.batch.names import EnvNames
     from rlightning_aio.batch.sent import Sources
 
 __all__ = [
@@ -48,8 +47,7 @@ _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
 """The end of an env's id: its number in the entry, and the name of a client."""
 
 
-@dataclass(slots=True)
-class Origin:
+class Origin(msgspec.Struct):
     """Group and slots of a batch, so that the answer to it needs no look-up.
 
     Attributes:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from rlightning_aio.batch.columns import BY_ROW
 from rlightning_aio.batch.contents import origin_of, parts_of, sources_of

@@ -237,14 +237,7 @@ class Executing(Protocol):
     """A host that executes requests in the thread of the caller."""
 
     def execute_next(self) -> bool:
-        """Execute one waiting request; return False if there is none.
-
-        Its completion is in the queue after `poll`.
-        """
-        ...
-
-    def poll(self) -> None:
-        """Append completions, as of `Polled`."""
+        """Execute one waiting request and append its completion; return False if there is none."""
         ...
 
 

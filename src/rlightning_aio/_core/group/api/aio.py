@@ -54,7 +54,7 @@ class EnvGroup(GroupInterface):
     async def init(self) -> list[EnvMeta]:
         self._driver.settle()
         try:
-            return await self._driver.run(self._steps.start(time.monotonic()))
+            return await self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise

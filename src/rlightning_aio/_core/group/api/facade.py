@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.drivers.scope import Scope
 from rlightning_aio._core.group.drivers.wait import CollectRules, this_process
-from rlightning_aio._core.group.engine.checked import DEBUG, CheckedSteps
-from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.observed import NO_SPAN
 from rlightning_aio._core.group.timeline.trace import Trace
@@ -90,8 +88,8 @@ class Facade:
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
-        self._steps = (CheckedSteps if DEBUG else Steps)(self._core)
-        self._driver.completions = self._core.parts.completions
+        self._steps = self._core.steps
+        self._driver.completions = self._core.parts.tables.completions
         self._driver.drain = self._core.drain
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False

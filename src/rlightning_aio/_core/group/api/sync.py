@@ -58,7 +58,7 @@ class EnvGroup(GroupInterface):
 
     def init(self) -> list[EnvMeta]:
         try:
-            return self._driver.run(self._steps.start(time.monotonic()))
+            return self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise

@@ -80,12 +80,9 @@ class Aborts:
             self._requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
-        try:
-            while left := aborted.faults.keys() & slots.tolist():
-                now = yield from self._waiting.turn(len(left), None)
-                self._waiting.poll()
-        finally:
-            self._waiting.end()
+        while left := aborted.faults.keys() & slots.tolist():
+            now = yield from self._waiting.turn(len(left), None)
+            self._waiting.poll()
         self._arrivals.admit(slots, self._intake.now)
         return now
 

@@ -144,7 +144,6 @@ class Calls:
                 now = yield from self._waiting.turn(remaining, end)
         finally:
             self._collecting = False
-            self._waiting.end()
         tickets, self._sent = self._sent, []
         for ticket in tickets:
             self._requests.settle(ticket)

@@ -1,23 +1,23 @@
 """The debug mode: each change of a request's state is checked against the table `LEGAL`.
 
-`CheckedRequests` and `CheckedSteps` replace their base classes if the environment variable
-`RLIGHTNING_AIO_DEBUG` is 1 when this module is imported. They apply each event to a copy of the
-table by `LEGAL`, and compare the two. So they refuse an event that can't happen, a change that the
-event doesn't make, and a change without an event. Without the variable, nothing here is called.
+`CheckedRequests` replaces `Requests` if the environment variable `RLIGHTNING_AIO_DEBUG` is 1 when
+this module is imported. It applies each event to a copy of the table by `LEGAL`, and compares the
+two. So it refuses an event that can't happen, a change that the event doesn't make, and a change
+without an event. Without the variable, nothing here is called.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.request_states import COLLECTOR, LEGAL, Event, Owner, State
 from rlightning_aio._core.group.state.requests import CollectorQueue, Requests
+from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio.errors import EnvFault
+    from rlightning_aio.protocol.exchange import Ring
 
-__all__ = ["DEBUG", "CheckedRequests", "CheckedSteps"]
+__all__ = ["DEBUG", "CheckedRequests"]
 
 DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
 """Groups check their requests."""
@@ -136,17 +137,20 @@ class CheckedRequests(Requests):
         with self.changes((event, slots)):
             return super().submit(slots, op, owner, now)
 
-    def answer_at_once(self, slot: int) -> None:
-        with self.changes((Event.STEPPED_AT_ONCE, self.alone(slot))):
-            super().answer_at_once(slot)
+    def publish(
+        self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
+    ) -> list[Ring]:
+        event = Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL
+        with self.changes((event, slots)):
+            return super().publish(slots, resets, owner, now)
 
     def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
         with self.changes((Event.RESTARTED, slots)):
             return super().restart(host_id, slots)
 
-    def join(self, slot: int, now: float) -> None:
+    def join(self, slot: int, now: float, op: int = Operation.JOIN) -> None:
         with self.changes((Event.JOINED, self.alone(slot))):
-            super().join(slot, now)
+            super().join(slot, now, op)
 
     def deliver(self, slots: NDArray[np.intp]) -> None:
         with self.changes((Event.RESULT, slots)):
@@ -187,22 +191,6 @@ class CheckedRequests(Requests):
         others = np.setdiff1d(slots, values)
         with self.changes((Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, others)):
             super().give_up(ticket)
-
-
-class CheckedSteps(Steps):
-    """`Steps` over `CheckedRequests`: it announces what it writes itself."""
-
-    def _publish(self, slots: NDArray[np.intp], now: float) -> None:
-        requests = cast("CheckedRequests", self._requests)
-        event = Event.SENT_FOR_CALL if requests.owner[slots[0]] else Event.SENT
-        with requests.changes((event, slots)):
-            super()._publish(slots, now)
-
-    def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> Any:
-        if self._conditions.unusual:
-            return super()._hand_out(slots, synchronous=synchronous)
-        with cast("CheckedRequests", self._requests).changes((Event.HANDED_OUT, slots)):
-            return super()._hand_out(slots, synchronous=synchronous)
 
 
 def _named(code: int) -> str:

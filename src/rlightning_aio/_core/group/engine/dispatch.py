@@ -6,7 +6,7 @@ Rule: all or nothing. All checks are done and all arguments packed before the fi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.actions import OutOfBandSteps
-    from rlightning_aio._core.group.engine.intake import Intake
-    from rlightning_aio._core.group.engine.poller import Poller
-    from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.engine.waiting import Poller, Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host, Membership, Watcher
 
-__all__ = ["Dispatch"]
+__all__ = ["Dispatch", "Packed"]
+
+Packed: TypeAlias = "tuple[NDArray[np.intp], list[Any]]"
+"""Positions in a batch of steps, and for each the packed arguments that go out of band."""
 
 
 class Dispatch:
@@ -38,7 +39,6 @@ class Dispatch:
         tables: Tables,
         supervisor: Supervisor,
         poller: Poller,
-        intake: Intake,
         waiting: Waiting,
         watcher: Watcher,
     ) -> None:
@@ -47,7 +47,7 @@ class Dispatch:
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
         self._poller = poller
-        self._intake = intake
+        self._intake = waiting.intake
         self._waiting = waiting
         self._watcher = watcher
 
@@ -113,15 +113,15 @@ class Dispatch:
                 "can; use step_async and collect_async"
             )
 
-    def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> list[Any]:
-        """The packed arguments of steps that go out of band."""
+    def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> Packed:
+        """Pack the arguments of steps that go out of band."""
         chosen = slots[out_of_band.positions].tolist()
         try:
             for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
                 if slot >= len(self._envs.all):
                     host = self._host_of(slot)
                     cast("Membership", host).check_step(slot - host.first_slot, action, extras)
-            return [
+            return out_of_band.positions, [
                 self.packed(slot, content, "the response")
                 for slot, content in zip(chosen, out_of_band.contents, strict=True)
             ]
@@ -174,24 +174,20 @@ class Dispatch:
             given = None if arguments is None else arguments[part]
             self._supervisor.submit(host_id, entries[part], given)
 
-    def hand_over_out_of_band(
+    def hand_over_steps(
         self,
         slots: NDArray[np.intp],
         entries: NDArray[np.int64],
-        positions: NDArray[np.intp],
-        packed: Sequence[Any],
-        resets: NDArray[np.bool_] | None,
+        packed: Packed,
+        resets: NDArray[np.bool_],
     ) -> None:
-        """Give submitted requests to their hosts, with out-of-band arguments at `positions`.
-
-        Positions that became resets go without arguments.
-        """
+        """Give submitted steps to their hosts; without their arguments where they became resets."""
+        positions, arguments = packed
         out_of_band = np.zeros(len(slots), np.bool_)
         out_of_band[positions] = True
-        if resets is not None:
-            out_of_band &= ~resets
+        out_of_band &= ~resets
         self.hand_over(slots[~out_of_band], entries[~out_of_band])
         kept = out_of_band[positions]
         chosen = positions[kept]
-        arguments = [one for one, keep in zip(packed, kept.tolist(), strict=True) if keep]
+        arguments = [one for one, keep in zip(arguments, kept.tolist(), strict=True) if keep]
         self.hand_over(slots[chosen], entries[chosen], arguments)

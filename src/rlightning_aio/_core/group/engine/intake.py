@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.messages import Completions
     from rlightning_aio.errors import EnvFault
 
 __all__ = ["Intake"]
@@ -58,14 +57,14 @@ class Intake:
 
     def __init__(
         self,
-        completions: Completions,
         tables: Tables,
         supervisor: Supervisor,
         results: Results,
         arrivals: Arrivals,
     ) -> None:
         self.now = 0.0
-        self._completions = completions
+        self._completions = tables.completions
+        self._conditions = tables.conditions
         self._envs = tables.envs
         self._requests = tables.requests
         self._layout = tables.layout
@@ -103,14 +102,17 @@ class Intake:
 
     def _on_result(self, completion: Result) -> None:
         slot = self._requests.complete_one(completion.host_id, completion.entry)
-        if slot is not None:
+        if slot is None:
+            return
+        if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
-            if completion.is_loss:
-                self._results.mark_lost(slot)
-            if completion.restarted:
-                self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
-                env_id = self._envs.env_ids[slot]
-                self._results.mark_restarted(Report(slot, completion.restarted, env_id, None))
+        if completion.is_loss:
+            self._results.mark_lost(slot)
+        if completion.restarted:
+            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
+            env_id = self._envs.env_ids[slot]
+            self._results.mark_restarted(Report(slot, completion.restarted, env_id, None))
+        if self._conditions.unusual:
             self._note_answered(self._requests.alone(slot))
 
     def _on_value(self, completion: Value) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["Results"]
+
+
+_Chosen: TypeAlias = "tuple[Slab, NDArray[np.intp], NDArray[np.intp] | None]"
+"""A slab, slots whose rows it has, and their positions in a batch; None for 0, 1, 2, …"""
 
 
 class Results:
@@ -99,10 +103,6 @@ class Results:
             self._out_of_band[slot] = out_of_band
             self._conditions.note(BESIDE_ROWS, True)
 
-    def keep_at_once(self, slot: int, out_of_band: OutOfBand) -> None:
-        """Keep what of a result has no place in its row until it is handed out in the same call."""
-        self._out_of_band[slot] = out_of_band
-
     def drop(self, slot: int) -> None:
         """Nobody will ask for the result of `slot`."""
         self._out_of_band.pop(slot, None)
@@ -162,16 +162,65 @@ class Results:
 
         Takes nothing away: should memory run out, they can be gathered again.
         """
-        layout = self._layout
+        layout, width, restarted, whole = self._layout, self._info_width, None, False
         if len(layout.slabs) == 1:
-            return [self.part(layout.slabs[0], slots)]
-        slabs = layout.slab[slots]
+            chosen: list[_Chosen] = [(layout.slabs[0], slots, None)]
+        else:
+            chosen = self._by_slab(slots)
+        parts: list[ResultColumns] = []
+        for slab, own, positions in chosen:
+            if own is self._envs.all:
+                rows: Rows = slice(0, len(own))
+            else:
+                rows = own if layout.row_is_slot else layout.row[own]
+            columns = [slab.reward, slab.flags, slab.times]
+            if width:
+                columns += (slab.info_mark, slab.info[:, :width])
+            observation: Any = slab.observation
+            in_rows = type(observation) is np.ndarray and not self._zero_copy
+            if in_rows:
+                columns.append(observation)
+            reward, flags, times, *others = kernel.gather(columns, rows)
+            marks, info = others[:2] if width else (None, None)
+            if self._any_restarted:
+                restarted = self._restarted[own]
+                # Here and not in the row, where envs write their flags only when they change.
+                flags[restarted, ..., TRUNCATED] = True
+            out_of_band, whole = (
+                self._out_of_band_of(own, marks) if self._out_of_band else ({}, False)
+            )
+            if in_rows:
+                observation = others[-1]
+            else:
+                observation, out_of_band = self._observations(slab, rows, out_of_band)
+            parts.append(
+                ResultColumns(
+                    slots=own,
+                    names=self._envs.names,
+                    positions=positions,
+                    observation=observation,
+                    reward=reward,
+                    flags=flags,
+                    info_marks=marks,
+                    info=info,
+                    schemas=self._schemas,
+                    out_of_band=out_of_band,
+                    restarted=restarted,
+                    times=times,
+                    sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
+                    agents=slab.layout.agents,
+                    observation_space=slab.layout.observation_space,
+                    whole_results=whole,
+                )
+            )
+        return parts
+
+    def _by_slab(self, slots: NDArray[np.intp]) -> list[_Chosen]:
+        """Return each slab with its part of `slots`, and with their positions there."""
+        slabs = self._layout.slab[slots]
         present: list[int] = np.flatnonzero(np.bincount(slabs)).tolist()
-        return [
-            self.part(layout.slabs[slab], slots[places], places)
-            for slab in present
-            for places in (np.flatnonzero(slabs == slab),)
-        ]
+        each = [(slab, np.flatnonzero(slabs == slab)) for slab in present]
+        return [(self._layout.slabs[slab], slots[places], places) for slab, places in each]
 
     def add_episodes(self, part: ResultColumns) -> None:
         """Copy the sums of the episodes that end in `part`; its rows are as they were."""
@@ -212,54 +261,6 @@ class Results:
             if action is not None:
                 self._examples[entry] = {"action": mapped(_without_rows, action)}
         return self._examples[entry]
-
-    def part(
-        self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None = None
-    ) -> ResultColumns:
-        """Copy the results of `slots`, whose rows are in `slab`; see `gather`."""
-        layout, width = self._layout, self._info_width
-        if positions is None and slots is self._envs.all:
-            rows: Rows = slice(0, len(slots))
-        else:
-            rows = slots if layout.row_is_slot else layout.row[slots]
-        columns = [slab.reward, slab.flags, slab.times]
-        if width:
-            columns += (slab.info_mark, slab.info[:, :width])
-        observation: Any = slab.observation
-        in_rows = type(observation) is np.ndarray and not self._zero_copy
-        if in_rows:
-            columns.append(observation)
-        reward, flags, times, *others = kernel.gather(columns, rows)
-        out_of_band: dict[int, Any] = {}
-        restarted, whole = None, False
-        if self._any_restarted:
-            restarted = self._restarted[slots]
-            # Here and not in the row, where envs write their flags only when they change.
-            flags[restarted, ..., TRUNCATED] = True
-        if self._out_of_band:
-            out_of_band, whole = self._out_of_band_of(slots, others[0] if width else None)
-        if in_rows:
-            observation = others[-1]
-        else:
-            observation, out_of_band = self._observations(slab, rows, out_of_band)
-        return ResultColumns(
-            slots=slots,
-            names=self._envs.names,
-            positions=positions,
-            observation=observation,
-            reward=reward,
-            flags=flags,
-            info_marks=others[0] if width else None,
-            info=others[1] if width else None,
-            schemas=self._schemas,
-            out_of_band=out_of_band,
-            restarted=restarted,
-            times=times,
-            sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
-            agents=slab.layout.agents,
-            observation_space=slab.layout.observation_space,
-            whole_results=whole,
-        )
 
     def _out_of_band_of(
         self, slots: NDArray[np.intp], info_marks: NDArray[np.uint8] | None

@@ -1,117 +1,147 @@
-"""`Steps`: the ordinary step, from the actions of a batch to the results of the next one.
+"""`Steps`: from the actions of a batch to the results of the next one.
 
-Ordinary is a batch that answers the group's own results and goes to envs in worker processes, or
-to envs of one inline host. Everything else takes the general path (`core`), which is correct for
-all cases. One attribute tells them apart: `Conditions.unusual`. It is asked at the start of each of
-the three parts (send, wait, hand out), so a death or an error in the middle of a step has the rest
-of it take the general path.
-In reading order: validate, write actions, number and publish; wait; verify, gather.
-Absent on purpose: errors of the user's. What is refused is refused by the general path.
+In reading order: check a batch, write its actions, send its requests; wait; hand results out.
+`Conditions.unusual` says whether anything rare must be looked at. A batch is *ordinary* where it is
+0, if the batch answers the group's own results: its actions are written with one copy, and its
+requests go into the rings of all workers with one call. For any other batch `actions` checks and
+writes, and finds the words for what it refuses, and `Dispatch` sends.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import ANY, TURN, Procedure
-from rlightning_aio._core.group.engine.actions import number_limits, write_column
-from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
+from rlightning_aio._core.group.drivers.wait import Procedure, earliest
+from rlightning_aio._core.group.engine.actions import (
+    number_limits,
+    response_columns,
+    write_actions,
+    write_column,
+)
+from rlightning_aio._core.group.engine.first_observations import FirstObservations
+from rlightning_aio._core.group.engine.newest import Newest
+from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, UNLIKE_ENVS
+from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
-from rlightning_aio.protocol import exchange, kernel
-from rlightning_aio.protocol.entries import Operation, slot_of
+from rlightning_aio.errors import BadAction, NothingPending, RLightningError
+from rlightning_aio.protocol import exchange
+from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import CollectRules
-    from rlightning_aio._core.group.engine.core import Core
+    from rlightning_aio._core.group.engine.arrivals import Arrivals
+    from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
+    from rlightning_aio._core.group.engine.results import Results
+    from rlightning_aio._core.group.engine.waiting import Poller, Waiting
+    from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio._core.group.state.stats import Stats
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.base import Watcher
     from rlightning_aio._core.hosts.messages import OutOfBand
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
-    from rlightning_aio.types import EnvMeta
 
-__all__ = ["Steps", "StepsAtOnce"]
+__all__ = ["Flags", "Parts", "Steps", "StepsAtOnce"]
 
 _STEP: Final = int(Operation.STEP)
-_IDLE: Final = 0
-"""The state of `Requests` as its array holds it."""
+Flags: TypeAlias = "list[bool]"
 
 
 @runtime_checkable
 class StepsAtOnce(Protocol):
-    """A host that executes steps in the calls of the group."""
+    """A host that can step its first env in the call of the group, without a request."""
 
     def step_now(self) -> OutOfBand | None:
-        """Step the first env, without a request, with the action in the row; what of the result is
-        out of band.
-        """
+        """Step that env with the action in its row; return what of the result is out of band."""
         ...
 
-    def submit(self, entries: NDArray[np.int64]) -> None:
-        """Accept steps and resets; see `hosts.base.Host`."""
-        ...
 
-    def step_next(self) -> tuple[int, OutOfBand | None] | None:
-        """Execute the next step or reset: its entry, and what of the result is out of band.
+@dataclass(frozen=True)
+class Parts:
+    """What a core is built from.
 
-        None if the next request is none of these or there is none, or after an error, which is in
-        the queue of completions.
-        """
-        ...
+    Attributes:
+        tables: the state of the group.
+        supervisor, poller: of the hosts.
+        watcher: the driver.
+    """
+
+    tables: Tables
+    supervisor: Supervisor
+    poller: Poller
+    watcher: Watcher
 
 
 class Steps:
-    """See the module.
+    """See the module; methods have the names of those of `EnvGroup`.
 
     Args:
-        core: the general path.
+        parts: of the group.
+        group: what batches of results say that they are from.
+        results, arrivals, dispatch, waiting, stats: of the group.
+
+    Attributes:
+        newest: which results are the newest.
+        collecting: a call of `collect` waits.
     """
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
-        parts, tables = core.parts, core.parts.tables
+    def __init__(
+        self,
+        parts: Parts,
+        group: object,
+        results: Results,
+        arrivals: Arrivals,
+        dispatch: Dispatch,
+        waiting: Waiting,
+        stats: Stats,
+    ) -> None:
+        tables = parts.tables
+        self._group = group
         self._layout = tables.layout
         self._conditions = tables.conditions
         self._envs = tables.envs
         self._requests = tables.requests
-        self._supervisor = parts.supervisor
-        self._poller = parts.poller
-        self._bell = parts.bell
-        self._rings = parts.rings
-        self._completions = parts.completions
-        self._watcher = parts.watcher
-        self._results = core.results
         self._continuity = tables.continuity
-        self._stats = core.stats
+        self._observed = tables.observed
+        self._lifetime = tables.lifetime
+        self._supervisor = parts.supervisor
         self._hints = parts.supervisor.hints
-        self._intake = core.intake
-        self._waiting = core.waiting
-        self._fence = exchange.new_fence()
-        # The inline host of all envs; also the one of the only env, if the group is synchronous.
-        self._inline: StepsAtOnce | None = None
+        self._poller = parts.poller
+        self._completions = tables.completions
+        self._watcher = parts.watcher
+        self._results = results
+        self._arrivals = arrivals
+        self._dispatch = dispatch
+        self._waiting = waiting
+        self._intake = waiting.intake
+        self._stats = stats
+        self._first_observations = FirstObservations(tables.envs)
+        self.newest = Newest(tables, parts.supervisor.members)
+        self.collecting = False
+        # The host of the only env, which steps in the calls of a synchronous group.
         self._alone: StepsAtOnce | None = None
 
-    def start(self, now: float) -> Procedure[list[EnvMeta]]:
-        """Start the hosts, and find out whether steps of their envs can be ordinary."""
-        metas = yield from self._core.start(now)
-        self._begin()
-        return metas
-
-    def _begin(self) -> None:
+    def begin(self, *, shares_thread: bool) -> None:
+        """Note what kind of envs were started, and whether other tasks may run during a step."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
-        if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce):
-            self._inline = hosts[0]
-            if len(envs) == 1 and not self._core.shares_thread:
-                self._alone = hosts[0]
-        in_rings = None not in self._rings
+        here = hosts[0] if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce) else None
+        self._alone = here if len(envs) == 1 and not shares_thread else None
+        self._requests.in_rings = None not in self._requests.rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
         ordinary = (
             in_one_slab
-            and (in_rings or self._inline is not None)
+            and (here is not None or self._requests.in_rings)
             and not envs.any_out_of_band
             and bool(slabs[0].action_columns)
         )
@@ -126,103 +156,128 @@ class Steps:
     # -- the operations ---------------------------------------------------------------
 
     def step_async(self, batch: BatchedData, now: float) -> None:
-        """Send a batch of steps."""
-        slots = None if self._conditions.unusual else self._written(batch)
-        if slots is None:
-            self._core.step_async(batch, now)
-            return
-        self._requests.collector.num_awaited += len(slots)
-        self._publish(slots, now)
-        if self._waiting.wanted:
-            self._watcher.wake()  # They have not asked these envs' workers to wake them.
-
-    def step(
-        self, batch: BatchedData, now: float
-    ) -> Procedure[tuple[BatchedData, list[bool] | None]]:
-        """Send a batch of steps and wait for all of them."""
-        slots = None if self._conditions.unusual else self._written(batch)
-        if slots is None:
-            return (yield from self._core.step(batch, now))
-        if self._alone is not None and not self._continuity.due[0]:
-            self._step_at_once(self._alone, now)
-            results, flags = self._hand_out(slots, synchronous=True)
-            return results, flags if self._continuity.auto_reset_is_open else None
-        requests = self._requests
-        ticket = requests.tickets.open(slots)
+        """Send a batch of steps, whose results `collect` returns."""
         try:
-            requests.owner[slots] = ticket.owner
-            self._publish(slots, now)
-            while ticket.remaining > 0 and not self._conditions.unusual:
-                yield from self._turn(ticket.remaining)
-                self._complete()
-            if ticket.remaining > 0:
-                yield from self._waiting.until_replied(ticket, now)
-        except BaseException:
-            self._waiting.give_up(ticket)
-            raise
+            slots, packed = self._write(batch, now)
+            self._send(slots, packed, now, None)
         finally:
-            if not self._waiting.wanted:
-                self._bell.disarm()
-        requests.settle(ticket)
-        if ticket.failed:
-            results, flags = self._core.settled(ticket, slots)
-        else:
-            results, flags = self._hand_out(slots, synchronous=True)
+            if self._observed.observer is not None:
+                self._observed.observer.note_call("step_async", now)
+        if self._waiting.wanted:  # A waiting collector has not armed the bell for these results.
+            self._waiting.wake()
+
+    def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
+        """Send a batch of steps and wait for all of them."""
+        began = now
+        try:
+            slots, packed = self._write(batch, now, is_local=True)
+            at_once = self._alone is not None and len(slots) > 0
+            if at_once and not (self._conditions.unusual or self._continuity.due[0]):
+                self._step_at_once(now)
+            else:
+                send = partial(self._send, slots, packed, now)
+                ticket, now = yield from self._waiting.ask(now, slots, send)
+                if ticket.failed:
+                    self._raise_faults(ticket)
+            results, flags = self.hand_out(slots, synchronous=True)
+        finally:
+            if self._observed.observer is not None:
+                self._observed.observer.note_call("step", began)
         return results, flags if self._continuity.auto_reset_is_open else None
 
-    def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, list[bool]]]:
-        """Wait for results by `rules`, and return them."""
-        core, requests = self._core, self._requests
-        most = 0
-        if (
-            rules.timeout is rules.deadline is rules.entries is None
-            and not core.collecting
-            and now < self._supervisor.look_by
-        ):
-            core.collecting = True
+    def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
+        """Wait for results by the rules of `EnvGroup.collect_async`, and return them."""
+        began, waiting, collector = now, self._waiting, self._requests.collector
+        try:
+            if self.collecting or self._conditions.unusual:
+                self.check_collectable()
+            among = None if rules.entries is None else self._envs.of_entries(rules.entries)
+            limits = None if rules.timeout is rules.deadline is None else _Limits(rules, now)
+            self.collecting = True
             try:
-                while not self._conditions.unusual:
-                    self._complete()
-                    ready = requests.collector.num_ready
-                    total = ready + requests.collector.num_awaited
-                    most = total if rules.max_results is None else min(total, rules.max_results)
+                if now >= self._supervisor.look_by:
+                    now = yield from waiting.look()
+                while True:
+                    waiting.poll()
+                    ready = collector.num_ready
+                    total = ready + collector.num_awaited
+                    if among is not None:
+                        ready, total = self._requests.pending(among)
+                    if collector.faults or not total:
+                        self._check_possible(rules, among, total)
+                    most = min(total, rules.max_results or total)
                     need = most if rules.wait_all else min(rules.min_results, most)
-                    if ready >= need:
+                    wanted, until = (need or 1) - ready, None
+                    if limits is not None:
+                        wanted, until = limits.wait(now, ready, most, need or 1)
+                    if wanted <= 0:
                         break
-                    yield from self._turn(need - ready)
+                    now = yield from waiting.turn(wanted, until)
             finally:
-                core.collecting = False
-                if not self._waiting.wanted:
-                    self._bell.disarm()
-        if self._conditions.unusual or not most:
-            return (yield from core.collect(now, rules))
-        slots = requests.collector.take(most)
-        if rules.ordered:
-            slots = slots.copy()
-            slots.sort()
-            if len(slots) == len(self._envs.all):
-                slots = self._envs.all
-        return self._hand_out(slots, synchronous=False)
+                self.collecting = False
+            slots = collector.take(most, among)
+            slots = self._in_order(slots) if rules.ordered else slots
+            return self.hand_out(slots, synchronous=False)
+        finally:
+            if self._observed.observer is not None:
+                self._observed.observer.note_call("collect_async", began)
 
-    # -- validate, write actions, number, publish -------------------------------------
+    def check_collectable(self) -> None:
+        """Raise an error if the group is closed, or another call collects."""
+        self._lifetime.check_open()
+        if self.collecting:
+            raise RLightningError(
+                "another collect_async is already waiting on this group; one collector at a time"
+            )
 
-    def _written(self, batch: BatchedData) -> NDArray[np.intp] | None:
-        """Slots of an ordinary batch, all idle, whose actions lie in their rows.
+    def _check_possible(
+        self, rules: CollectRules, among: NDArray[np.bool_] | None, total: int
+    ) -> None:
+        """Raise the collector's oldest error of these slots, or else if no result can come."""
+        for fault in self._requests.collector.faults:
+            if among is None or among[self._envs.one_of_entry(fault.env_id)]:
+                self.note_raised(fault)
+                raise fault
+        if not total and not self._supervisor.members.possible:
+            whose = "" if rules.entries is None else f" of entries {', '.join(rules.entries)}"
+            raise NothingPending(
+                f"nothing to collect: no request{whose} is outstanding; send one with step_async"
+            )
 
-        None for any other batch: nothing has happened then, but that rows of idle envs may have
-        been written.
+    def _in_order(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        slots = slots.copy()
+        slots.sort()
+        return self._envs.all if len(slots) == len(self._envs.all) == len(self._envs) else slots
+
+    def note_raised(self, fault: EnvFault) -> None:
+        """Note that an error of the collector is raised, so that its envs are free."""
+        self._arrivals.admit(self._requests.collector.take_fault(fault), self._intake.now)
+
+    # -- check, write, send -----------------------------------------------------------
+
+    def _write(
+        self, batch: BatchedData, now: float, *, is_local: bool = False
+    ) -> tuple[NDArray[np.intp], Packed | None]:
+        """Write the actions of a batch into the rows of its envs, all of which are idle.
+
+        Args:
+            batch: of responses.
+            now: monotonic seconds.
+            is_local: refuse envs of clients.
+
+        Returns their slots, and what goes out of band.
 
         Raises:
-            BadAction: the actions don't fit; nothing was sent.
+            RLightningError: something is wrong with the batch or its envs; nothing was sent.
         """
         if self._completions:
             self._intake.drain()
-        answer = answer_of(batch, self._core)
-        if answer is None or self._conditions.unusual:
-            return None
+        answer = None if self._conditions.unusual else answer_of(batch, self._group)
+        if answer is None:
+            return self._write_any(batch, now, is_local=is_local)
         slots, columns = answer
-        if len(self._requests.state[slots].nonzero()[0]) or not len(slots):
-            return None
+        if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
+            return self._write_any(batch, now, is_local=is_local)
         slab = self._layout.slabs[0]
         rows: Rows = self._all_rows if slots is self._envs.all else slots
         action = columns["action"]
@@ -234,163 +289,212 @@ class Steps:
         else:
             write_column(action, slab, slots, rows, self._envs)
         self._results.note_sent(slots, columns)
-        return slots
+        return slots, None
 
-    def _publish(self, slots: NDArray[np.intp], now: float) -> None:
-        """Number the requests and give them to their workers."""
+    def _write_any(
+        self, batch: BatchedData, now: float, *, is_local: bool
+    ) -> tuple[NDArray[np.intp], Packed | None]:
+        """Do the same for any batch."""
+        slots = self._slots_of(batch)
+        if is_local:
+            self._dispatch.check_local(slots, "step")
+        self._intake.now = now
+        if self._supervisor.members.possible:
+            batch, slots = self._arrivals.without_gone(batch, slots)
+        self._dispatch.check_sendable(now, slots, "step")
+        if not len(slots):
+            return slots, None
+        out_of_band = write_actions(batch, slots, self._envs, self._layout)
+        packed = None if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
+        self._results.note_sent(slots, response_columns(batch, slots, self._layout))
+        return slots, packed
+
+    def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
+        """Return the slots of a batch's envs; a batch that answers our results knows them."""
+        if not isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise BadAction(
+                f"a step takes a batch of responses, not a {type(batch).__name__}: answer the last "
+                "results with batch.respond(action=...); nothing was sent"
+            )
+        slots = slots_of(batch, self._group)
+        return self._dispatch.distinct(_answered(batch)) if slots is None else slots
+
+    def _send(
+        self, slots: NDArray[np.intp], packed: Packed | None, now: float, ticket: Ticket | None
+    ) -> None:
+        """Number the requests of a batch that is written, and give them to their hosts."""
         requests = self._requests
-        if self._inline is not None:
-            self._publish_inline(self._inline, slots, now)
+        owner = COLLECTOR if ticket is None else ticket.owner
+        if requests.in_rings and len(slots) and not self._conditions.unusual:
+            for ring in requests.publish(slots, self._continuity.due[slots], owner, now):
+                ring.wake()
             return
-        asleep = kernel.submit(
-            slots,
-            self._continuity.due[slots],
-            int(now * 1e9),
-            requests.numbering.entry,
-            requests.state,
-            requests.sent_ns,
-            requests.hosts,
-            requests.in_flight,
-            self._rings,
-            self._fence,
-        )
-        for ring in asleep:
-            ring.wake()
-
-    def _publish_inline(self, host: StepsAtOnce, slots: NDArray[np.intp], now: float) -> None:
-        """Number the requests and give them to the host of all envs."""
-        requests, resets = self._requests, self._continuity.due[slots]
-        entries = requests.numbering.renew(slots, _STEP)
-        if np.count_nonzero(resets):
+        resets = self._continuity.begin_steps(slots)
+        if self._continuity.exceptional:
+            reports, seeds = self._continuity.report_losses(slots, ~resets)
+            self._layout.write_seeds(slots[reports], seeds[reports])
+            resets = resets | reports
+        entries = requests.submit(slots, _STEP, owner, now)
+        if b"\1" in resets.tobytes():
             requests.numbering.into_resets(slots, entries, resets)
-        requests.state[slots] = exchange.BUSY
-        requests.sent_ns[slots] = int(now * 1e9)
-        requests.in_flight[0] += len(slots)
-        host.submit(entries)
+        if packed is None:
+            self._dispatch.hand_over(slots, entries)
+        else:
+            self._dispatch.hand_over_steps(slots, entries, packed, resets)
+        if self._supervisor.members.possible:
+            self._intake.drain()  # Requests to absent envs are withdrawn immediately.
 
-    def _step_at_once(self, host: StepsAtOnce, now: float) -> None:
+    def _step_at_once(self, now: float) -> None:
         """Step the only env here and now: there is nobody to wait for."""
-        self._requests.number_step_at_once(0, now)
+        assert self._alone is not None
+        requests, slots = self._requests, self._envs.all
         try:
-            out_of_band = host.step_now()
+            out_of_band = self._alone.step_now()
         except BaseException as error:
+            requests.numbering.renew(slots, _STEP)
             fault = self._intake.raised(0, ErrorText.of(error))
             if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
-                self._requests.collector.keep(self._requests.alone(0), fault)
+                requests.collector.keep(slots, fault)
                 raise
             raise fault from None
         if out_of_band:
-            self._results.keep_at_once(0, out_of_band)
-        self._requests.answer_at_once(0)
+            self._results.keep(0, out_of_band)
+        requests.join(0, now, _STEP)
+        requests.collector.take(1)
         if self._completions:
             self._intake.drain()  # An info has come in a new form.
 
-    def _step_next(self, host: StepsAtOnce) -> bool:
-        """Execute the next request here; True if there was one, and it raised no error."""
-        found = host.step_next()
-        if found is None:
-            return False
-        entry, out_of_band = found
-        if out_of_band:
-            self._results.keep_at_once(slot_of(entry), out_of_band)
-        self._requests.complete_one(0, entry)
-        self._requests.has_news = False
-        if len(self._waiting.wanted) > 0:
-            self._watcher.wake()  # Another call may have what it waits for.
-        return True
+    # -- hand out ---------------------------------------------------------------------
 
-    # -- wait -------------------------------------------------------------------------
+    def settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
+        """Return the results of a call in its order, or raise its faults with the results."""
+        if ticket.failed:
+            self._raise_faults(ticket)
+        return self.hand_out(slots, synchronous=True)
 
-    def _turn(self, wanted: int) -> Procedure[None]:
-        """One turn of waiting for `wanted` more results; see `Waiting.turn`."""
-        if self._inline is not None and (self._step_next(self._inline) or self._completions):
-            yield TURN
-            if self._completions:
-                self._intake.drain()  # An error, with which an ordinary step ends.
-            return
-        waiting, supervisor, in_flight = self._waiting, self._supervisor, self._requests.in_flight
-        at_work = len(in_flight) - in_flight.count(0)
-        if (
-            at_work < self._poller.num_cores
-            or supervisor.detector.timed
-            or not at_work
-            or self._inline is not None  # It rings no bell; what is next there is a call.
-        ):
-            yield from waiting.turn(wanted, None)
-            return
-        all_wanted = waiting.wanted
-        all_wanted.append(wanted)
+    def _raise_faults(self, ticket: Ticket) -> NoReturn:
+        done = self._requests.ready(ticket.slots)  # Others may have requests of other calls.
+        fault = ticket.faults[0]
+        fault.others = tuple(ticket.faults[1:])
+        if len(done):
+            try:
+                fault.results = self.hand_out(done, synchronous=True)[0]
+            except BaseException:
+                for unraised, own in ticket.failures():
+                    self._requests.collector.keep(own, unraised)
+                raise
+            others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
+            fault.add_note(f"the results of {others} of the same call are in the error's `results`")
+        raise fault
+
+    def hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
+        """Return the results of `slots`, all ready.
+
+        They stay ready until the batch is complete: if memory runs out on the way, the next
+        collect returns them.
+        """
+        results, continuity, observer = self._results, self._continuity, self._observed.observer
+        noted = None if observer is None else observer.before_results(slots)
         try:
-            first = wanted if len(all_wanted) == 1 else min(all_wanted)
-            total = sum(in_flight)
-            bell = self._bell
-            goal = bell.read[-1] + min(first, total)
-            if bell.arm(goal, at_last=first >= total):
-                now = yield TURN
-            else:
-                now = yield ANY
-                supervisor.look_by = now + LOOK_SECONDS
-        finally:
-            all_wanted.remove(wanted)
-        if self._conditions.unusual or now >= supervisor.look_by:
-            waiting.check(now)
-
-    # -- verify, gather ---------------------------------------------------------------
-
-    def _complete(self) -> None:
-        """Have requests end whose results lie in their rows."""
-        if self._completions:
-            self._intake.drain()
-        bell, requests = self._bell, self._requests
-        if bell.counters == bell.read_by_worker:
-            return
-        slots = None
-        if not self._conditions.unusual:
-            slots = kernel.complete(
-                bell.counters,
-                bell.read,
-                requests.numbering.entry,
-                requests.in_flight,
-                self._rings,
-                self._fence,
-            )
-        if slots is None:
-            self._waiting.poll()
-            return
-        requests.deliver(slots)
-        requests.has_news = False
-        if self._waiting.wanted:
-            self._watcher.wake()  # Another call may have what it waits for.
-
-    def _hand_out(
-        self, slots: NDArray[np.intp], *, synchronous: bool
-    ) -> tuple[BatchedData, list[bool]]:
-        """The results of `slots`, all ready; see `Core.hand_out`."""
-        if self._conditions.unusual:
-            return self._core.hand_out(slots, synchronous=synchronous)
-        requests, results, continuity = self._requests, self._results, self._continuity
-        try:
-            part = results.part(self._layout.slabs[0], slots)
-            parts = (part,)
-            flagged = parts if b"\1" in part.flags.tobytes() else ()
+            parts = results.gather(slots)
+            flagged: list[ResultColumns] = []
+            for part in parts:  # A comprehension is a call more.
+                if b"\1" in part.flags.tobytes():
+                    flagged.append(part)  # noqa: PERF401
             judged = continuity.judge(slots, flagged)
             is_cut = judged.is_cut
-            if is_cut is not None:
-                part.limit_reached = is_cut
-                if continuity.mark_truncated:
-                    part.flags[is_cut, ..., TRUNCATED] = True
-            if flagged or is_cut is not None:
+            for part in flagged if is_cut is None else parts:
+                if is_cut is not None:
+                    self._mark_cut(part, is_cut)
                 results.add_episodes(part)
-            batch = batch_of_results(parts, self._core, slots, part.names, results.sources(slots))
+            batch = batch_of_results(
+                parts, self._group, slots, self._envs.names, results.sources(slots)
+            )
+            if self._first_observations.left:
+                self._first_observations.check(parts)
             self._watcher.check_interrupt()
             self._stats.account(parts, synchronous=synchronous)
             continuity.returned(slots, flagged, judged)
-            if self._inline is not None:
+            if self._conditions.unusual & BESIDE_ROWS:
                 results.let_go(slots)
-            requests.state[slots] = _IDLE
+            self._requests.hand_out(slots)
         except BaseException:
-            requests.put_back(slots)
+            self._requests.put_back(slots)
             raise
-        if self._stats.num_batches >= self._hints.due:
-            self._core.give_hints()
+        if observer is not None:
+            observer.after_results(noted, parts)
+        if (
+            self._arrivals.held_back
+            or self.newest.keeps
+            or self._stats.num_batches >= self._hints.due
+        ):
+            self._note_returned(slots, batch, synchronous=synchronous)
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
+
+    def _note_returned(
+        self, slots: NDArray[np.intp], batch: BatchedData, *, synchronous: bool
+    ) -> None:
+        """Let envs join whose rows are free now, keep the newest results, and give hints."""
+        self._arrivals.admit(slots, self._intake.now)
+        if self._stats.num_batches >= self._hints.due:
+            self._hints.look(self._stats, self._poller.num_cores)
+        if synchronous and self.newest.keeps:
+            self.newest.note_returned(batch)
+
+    def _mark_cut(self, part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:
+        """Mark where the step limit cuts an episode."""
+        part.limit_reached = is_cut if part.positions is None else is_cut[part.positions]
+        if self._continuity.mark_truncated:
+            part.flags[part.limit_reached, ..., TRUNCATED] = True
+
+
+class _Limits:
+    """The time limits of a collect.
+
+    Args:
+        rules: of the collect.
+        now: when it began.
+    """
+
+    def __init__(self, rules: CollectRules, now: float) -> None:
+        self._timeout = rules.timeout
+        self._deadline = rules.deadline
+        self._end = None if rules.deadline is None else now + rules.deadline
+        self._window: float | None = None
+
+    def wait(self, now: float, ready: int, most: int, need: int) -> tuple[int, float | None]:
+        """Return for how many more results to wait, and until when; 0 if there are enough.
+
+        With a timeout, the first result opens a window in which further ones may come.
+
+        Args:
+            now: monotonic seconds.
+            ready: number of results that are ready.
+            most: that can be.
+            need: that are needed.
+        """
+        if ready and self._timeout is not None and self._window is None:
+            self._window = now + self._timeout
+        is_open = self._window is not None and now < self._window and ready < most
+        if ready >= need and not is_open:
+            return 0, None
+        if self._end is not None and now >= self._end:
+            raise TimeoutError(
+                f"{ready} of the {need} results needed came within {self._deadline} s; nothing is "
+                "lost, the next collect_async gets them"
+            )
+        if is_open:
+            return most - ready if ready else 1, earliest(self._end, self._window)
+        return 1 if self._timeout is not None else need - ready, self._end
+
+
+def _answered(batch: BatchedData) -> list[str]:
+    """Return the ids of the envs that a batch of the user's own values answers."""
+    env_ids = batch.env_ids()
+    for id_, env_id in zip(batch.ids(), env_ids, strict=True):
+        if env_id != id_ and not env_id.startswith(f"{id_}/"):
+            raise BadAction(
+                f"under the id {id_!r} there is a response of {env_id!r}; give each under its own "
+                "env's id; nothing was sent"
+            )
+    return env_ids

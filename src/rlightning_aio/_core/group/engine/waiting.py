@@ -1,14 +1,18 @@
-"""`Waiting`: lets concurrent calls of a group wait for replies.
+"""`Waiting`: lets concurrent calls of a group wait for replies; and `Poller`, which finds them.
 
-Each call is a procedure that takes turns here until its replies are ready. The bell is armed for
-the call that waits for the fewest.
+Each call is a procedure that takes turns here until its replies are ready. The bell of the workers
+is armed for the call that waits for the fewest results, however long the other envs take.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING
 
-from rlightning_aio._core.group.drivers.wait import TURN, Procedure, Wait
+from rlightning_aio._core.group.drivers.wait import ANY, TURN, Procedure, Wait
+from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
+from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
+from rlightning_aio._core.hosts.spinner import Spinner
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,51 +21,68 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.intake import Intake
-    from rlightning_aio._core.group.engine.poller import Poller
     from rlightning_aio._core.group.state.requests import Requests, Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
-    from rlightning_aio._core.hosts.base import Watcher
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.base import Host, Watcher
+    from rlightning_aio.protocol.rings import TrainerBell
 
-__all__ = ["Waiting"]
+__all__ = ["Poller", "Waiting"]
 
 
 class Waiting:
     """The waiting calls of a group.
 
+    Args:
+        tables, supervisor, poller: of the group.
+        intake: applies what the poller finds.
+        watcher: the driver.
+        one_by_one: inline envs are executed in one turn each, so that other tasks have theirs.
+
     Attributes:
         wanted: the number of results that each call waits for.
+        intake: as given.
     """
 
     def __init__(
         self,
-        requests: Requests,
+        tables: Tables,
         supervisor: Supervisor,
         poller: Poller,
         intake: Intake,
         watcher: Watcher,
+        *,
+        one_by_one: bool,
     ) -> None:
-        self._requests = requests
+        self._requests = tables.requests
+        self._conditions = tables.conditions
         self._supervisor = supervisor
         self._poller = poller
-        self._intake = intake
+        self._bell = poller.bell
+        self.intake = intake
+        self._completions = tables.completions
         self._watcher = watcher
+        self._one_by_one = one_by_one
         self.wanted: list[int] = []
 
     def poll(self) -> None:
-        """Read and apply the replies that are ready."""
-        self._poller.poll()
-        self._drain()
-
-    def _drain(self) -> None:
-        """Apply queued completions.
+        """Read and apply the replies that are ready.
 
         Invariant: a waiting call checks its replies and arms the bell again after every reply that
         is applied, also if another call applies it here.
         """
-        self._intake.drain()
-        if self._requests.has_news:
-            self._requests.has_news = False
-            self.wake()
+        if self._completions:
+            self.intake.drain()
+        requests, bell = self._requests, self._bell
+        if self._conditions.unusual or (
+            bell.counters != bell.read_by_worker and not requests.read(bell)
+        ):
+            self._poller.poll()
+            self.intake.drain()
+        if requests.has_news:
+            requests.has_news = False
+            if self.wanted:
+                self._watcher.wake()
 
     def wake(self) -> None:
         """Wake all waiting calls, to check their replies and arm the bell again.
@@ -71,50 +92,57 @@ class Waiting:
         if self.wanted:
             self._watcher.wake()
 
-    def check_liveness(self, now: float) -> Procedure[float]:
-        """Check all hosts from time to time; return the time.
+    def look(self) -> Procedure[float]:
+        """Check all hosts; return the time. It must be called by `Supervisor.look_by`.
 
         A caller that always finds enough results ready never waits, so it would miss dead and hung
         workers otherwise.
         """
-        if now >= self._supervisor.look_by:
-            now = yield Wait(0.0)
-            self.check(now)
+        now = yield Wait(0.0)
+        self.check(now)
         return now
 
     def check(self, now: float) -> None:
         """Check all hosts for deaths and hangs, and apply the outcome."""
-        self._intake.now = now
+        self.intake.now = now
         if self._supervisor.detector.timed:
             self.poll()  # An env that has replied is not hung.
         self._supervisor.check(now)
-        self._drain()
+        self.poll()
 
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
         """Wait once for `wanted` more replies, and return the time after it; the caller loops."""
+        poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
         self.wanted.append(wanted)
         try:
-            # Other calls may wait for fewer results.
-            poller, first = self._poller, min(self.wanted)
-            if poller.execute(wanted, until):
-                return (yield from self.check_liveness((yield Wait(0.0))))
-            if poller.spin(first):
-                return (yield from self.check_liveness((yield TURN)))
-            poller.arm(first)
-            until = self._supervisor.next_check(until)
-            if poller.is_reached():
-                return (yield from self.check_liveness((yield TURN)))
-            now = yield Wait(until)
-            poller.slept()
+            if poller.executing and poller.execute(1 if self._one_by_one else wanted, until):
+                now = yield TURN if len(poller.executing) == len(in_flight) else Wait(0.0)
+                is_due = now >= supervisor.look_by
+            else:
+                # Other calls may wait for fewer results.
+                first = wanted if len(self.wanted) == 1 else min(self.wanted)
+                may_spin = len(in_flight) - in_flight.count(0) < poller.num_cores
+                if (may_spin and poller.spin(first)) or poller.arm(first):
+                    now = yield TURN
+                    is_due = now >= supervisor.look_by
+                    if is_due:
+                        now = yield Wait(0.0)
+                else:
+                    is_due = until is not None or supervisor.detector.timed
+                    is_due = is_due or self._conditions.unusual != 0
+                    now = yield Wait(supervisor.next_check(until)) if is_due else ANY
+                    if may_spin:
+                        poller.slept()
+                    if not is_due:
+                        supervisor.look_by = now + LOOK_SECONDS
+                        is_due = self._conditions.unusual != 0
         finally:
             self.wanted.remove(wanted)
-        self.check(now)
+            if not self.wanted:
+                self._bell.disarm()
+        if is_due:
+            self.check(now)
         return now
-
-    def end(self) -> None:
-        """Disarm the bell if no call waits now."""
-        if not self.wanted:
-            self._poller.disarm()
 
     def ask(
         self,
@@ -133,16 +161,17 @@ class Waiting:
             send: submits all of them for the ticket that it gets, or raises before the first.
             method: see `Tickets.open`.
         """
-        ticket = self.begin(slots, send, method)
+        ticket = self._requests.tickets.open(slots, method=method)
         try:
+            send(ticket)
             if self._supervisor.members.possible:
                 self.poll()  # Replies of members that were read before cause no wake-up.
-            now = yield from self.until_replied(ticket, now)
+            while ticket.remaining > 0:
+                now = yield from self.turn(ticket.remaining, None)
+                self.poll()
         except BaseException:
-            self.give_up(ticket)
+            self._give_up(ticket)
             raise
-        finally:
-            self.end()
         self._requests.settle(ticket)
         return ticket, now
 
@@ -154,18 +183,147 @@ class Waiting:
         try:
             send(ticket)
         except BaseException:
-            self.give_up(ticket)
+            self._give_up(ticket)
             raise
         return ticket
 
-    def give_up(self, ticket: Ticket) -> None:
+    def _give_up(self, ticket: Ticket) -> None:
         """Close a ticket that nobody waits for any more."""
         self._requests.give_up(ticket)
         self.wake()
 
-    def until_replied(self, ticket: Ticket, now: float) -> Procedure[float]:
-        """Wait for all replies of `ticket`; return the time after that."""
-        while ticket.remaining > 0:
-            now = yield from self.turn(ticket.remaining, None)
-            self.poll()
-        return now
+
+class Poller:
+    """Gets results from the hosts of one group with as few wake-ups as possible.
+
+    It spins briefly, arms the bell of the workers, polls hosts that ring no bell, and executes the
+    requests of inline hosts.
+
+    Args:
+        requests: counts the requests in flight at each host.
+        bell: of the workers.
+        num_cores: cores that this process and its workers may use.
+        clock: monotonic seconds; read only between the envs of inline hosts.
+
+    Attributes:
+        bell, num_cores: as given.
+        executing: the inline hosts; the next is the first.
+    """
+
+    def __init__(
+        self,
+        requests: Requests,
+        bell: TrainerBell,
+        num_cores: int,
+        clock: Callable[[], float],
+    ) -> None:
+        self.bell = bell
+        self.num_cores = num_cores
+        self.executing: deque[tuple[int, Executing]] = deque()
+        self._requests = requests
+        self._clock = clock
+        self._workers: dict[int, Polled] = {}
+        self._on_loop: list[int] = []
+        self._memberships: dict[int, Membership] = {}
+        self._spinner = Spinner(enabled=True)
+        self._spun = False
+
+    def add(self, host: Host) -> None:
+        """Add a host of the group."""
+        if isinstance(host, Executing):
+            self.executing.append((host.host_id, host))
+        elif isinstance(host, Membership):
+            self._memberships[host.host_id] = host
+        elif isinstance(host, Polled):
+            self._workers[host.host_id] = host
+        if isinstance(host, SharesThread):
+            self._on_loop.append(host.host_id)
+
+    # -- reading results --------------------------------------------------------------
+
+    def poll(self) -> None:
+        """Read results that are ready without a wake-up."""
+        workers = self._workers
+        for host_id in self.bell.with_news() if workers else ():
+            workers[host_id].poll()
+        for host_id, server in self._memberships.items():
+            if self._requests.in_flight[host_id]:
+                server.poll()
+
+    def execute(self, wanted: int, until: float | None) -> bool:
+        """Execute requests of inline hosts: one, or `wanted` if no other host has any in flight.
+
+        Args:
+            wanted: the largest number of requests to execute.
+            until: monotonic seconds at which to stop, between two envs.
+
+        Returns True if any request was executed.
+        """
+        hosts, in_flight = self.executing, self._requests.in_flight
+        if len(hosts) < len(in_flight):
+            own = sum([in_flight[host_id] for host_id, _ in hosts])
+            wanted = wanted if own == sum(in_flight) else 1
+        count = num_idle = 0
+        while count < wanted and num_idle < len(hosts):
+            _, host = hosts[0]
+            hosts.rotate(-1)  # In turn, so that none waits forever.
+            if not host.execute_next():
+                num_idle += 1
+                continue
+            count, num_idle = count + 1, 0
+            if until is not None and self._clock() >= until:
+                break
+        return count > 0
+
+    # -- waiting for workers ----------------------------------------------------------
+
+    def spin(self, wanted: int) -> bool:
+        """Spin briefly for `wanted` results; True if they are ready.
+
+        Spin only while there are more cores than busy workers and members (which may run on this
+        machine), and while no env that shares this thread is busy, as it couldn't make progress.
+        """
+        in_flight = self._requests.in_flight
+        self._spun = False
+        if any(in_flight[host_id] for host_id in self._on_loop):
+            return False
+        num_busy = 0
+        for host_id in self._workers:
+            if in_flight[host_id]:
+                num_busy += 1
+        servers: list[Membership] = []
+        for host_id, server in self._memberships.items():
+            if in_flight[host_id]:
+                num_busy += in_flight[host_id]
+                servers.append(server)
+        self._spun = 0 < num_busy < self.num_cores
+        if not self._spun:
+            return False
+        self.bell.disarm()
+        unread = self.bell.unread
+        if not servers:
+            return self._spinner.spin(lambda: unread() >= wanted)
+        return self._spinner.spin(
+            lambda: unread() >= wanted or any(server.is_readable() for server in servers)
+        )
+
+    def slept(self) -> None:
+        """Report to the spinner that a spin was followed by a sleep."""
+        if self._spun:
+            self._spinner.slept()
+
+    def arm(self, wanted: int) -> bool:
+        """Have the workers wake this process when `wanted` results are ready, or all in flight.
+
+        Args:
+            wanted: the number that the call with the fewest waits for.
+
+        Returns True if they are ready already, so no wake-up needs to be awaited.
+        """
+        bell, in_flight = self.bell, self._requests.in_flight
+        total = sum(map(in_flight.__getitem__, self._workers))
+        if not total:
+            bell.disarm()
+            return False
+        wanted = min(wanted, total)
+        return bell.arm(bell.read[-1] + wanted, at_last=wanted == total)

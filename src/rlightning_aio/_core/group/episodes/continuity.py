@@ -12,20 +12,21 @@ from __future__ import annotations
 import math
 import operator
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from rlightning_aio._core.group.state.conditions import CUT_BEFORE, LOST_EPISODE, Conditions
 from rlightning_aio.protocol.entries import Operation, op_of
 from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Sequence
-
-    from numpy.typing import NDArray
+    from collections.abc import Container, Iterable
 
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio.batch.columns import ResultColumns
@@ -118,7 +119,7 @@ class Report(NamedTuple):
     suspects: tuple[str, ...] = ()
 
 
-class Judged(NamedTuple):
+class Judged(msgspec.Struct):
     """What a batch of results changes, once it is returned to the caller.
 
     Attributes:

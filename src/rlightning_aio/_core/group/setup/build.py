@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rlightning_aio._core.group.engine.checked import DEBUG, CheckedRequests
-from rlightning_aio._core.group.engine.core import Core, Parts
-from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.engine.core import Core
+from rlightning_aio._core.group.engine.steps import Parts
+from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.setup.plan import host_class, place_of
 from rlightning_aio._core.group.setup.start_orders import start_orders
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.setup.plan import Plan
     from rlightning_aio._core.hosts.base import Watcher
     from rlightning_aio._core.hosts.messages import StartOrder
-    from rlightning_aio.protocol.exchange import Ring
 
 __all__ = ["assemble"]
 
@@ -84,14 +84,13 @@ def _assembled(
     tables.resources["bell"] = bell
     supervisor = Supervisor(tables)
     poller = Poller(tables.requests, bell, cores, clock=tables.clock)
-    rings: list[Ring | None] = [None] * len(orders)
     wiring = Wiring(
         completions=tables.completions,
         watcher=watcher,
         arena=arena,
         bell=bell,
         bell_offset=bell_offset,
-        rings=rings,
+        rings=tables.requests.rings,
         num_hosts=len(orders),
         configs=[order.config for order in orders],
         objection=lambda meta: supervisor.members.objection(meta, supervisor.metas),
@@ -105,7 +104,7 @@ def _assembled(
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = Parts(tables, supervisor, poller, bell, rings, tables.completions, watcher)
+    parts = Parts(tables, supervisor, poller, watcher)
     return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
 
 
@@ -127,7 +126,7 @@ def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
         layout=SlabLayout(len(envs)),
         continuity=Continuity(envs, conditions),
         conditions=conditions,
-        observed=Observed(conditions),
+        observed=Observed(),
         lifetime=Lifetime(conditions),
         arena=Arena(),
         clock=time.monotonic,

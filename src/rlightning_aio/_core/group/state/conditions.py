@@ -1,7 +1,7 @@
 """`Conditions`: whether anything is unlike an ordinary step.
 
-The ordinary step (`steps`) asks one question about everything else: is `unusual` 0? The component
-that knows of a condition sets it and clears it; while any is set, the general path is taken.
+The ordinary step (`steps`, `waiting`) asks one question about most that is rare: is `unusual` 0?
+The component that knows of a condition sets it and clears it; while any is set, nothing is skipped.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 from typing import Final
 
 __all__ = [
+    "ABORTING",
     "BESIDE_ROWS",
     "CLOSED",
     "CUT_BEFORE",
     "DEATH",
     "FAULT",
-    "FIRST_RESULTS",
     "LOST_EPISODE",
-    "RECORDING",
     "UNLIKE_ENVS",
     "Conditions",
 ]
@@ -36,12 +35,8 @@ BESIDE_ROWS: Final = 1 << 5
 """A result that is ready is not, or not only, what its row holds."""
 FAULT: Final = 1 << 6
 """An error waits for the collector."""
-FIRST_RESULTS: Final = 1 << 7
-"""Observations are still being compared with the bounds of their spaces."""
-ABORTING: Final = 1 << 9
+ABORTING: Final = 1 << 7
 """A request is to end without its reply."""
-RECORDING: Final = 1 << 8
-"""A timeline is being recorded."""
 
 
 class Conditions:
@@ -54,7 +49,7 @@ class Conditions:
     __slots__ = ("unusual",)
 
     def __init__(self) -> None:
-        self.unusual = CLOSED | FIRST_RESULTS
+        self.unusual = CLOSED
 
     def note(self, condition: int, holds: bool) -> None:
         """Set or clear a condition."""

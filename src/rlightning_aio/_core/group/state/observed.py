@@ -1,14 +1,12 @@
-"""`Observed`: reports events of the general path to an observer while one is attached."""
+"""`Observed`: reports events of a group to an observer while one is attached."""
 
 from __future__ import annotations
 
 import contextlib
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
 
-from rlightning_aio._core.group.state.conditions import RECORDING, Conditions
-
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["NO_SPAN", "Fate", "Observed", "Observer"]
 
 NO_SPAN: Final = contextlib.nullcontext()
-"""The span of an operation while no observer is attached."""
+"""The span of other work while no observer is attached."""
 Fate: TypeAlias = Literal["hung", "died", "given up", "up"]
 """What may happen to a host after its first start."""
 
@@ -26,8 +24,8 @@ Fate: TypeAlias = Literal["hung", "died", "given up", "up"]
 class Observer(Protocol):
     """Receives the events of a group. Times are monotonic seconds."""
 
-    def call(self, name: str, began: float) -> contextlib.AbstractContextManager[Any]:
-        """A context manager around an operation of the core that was called at `began`."""
+    def note_call(self, name: str, began: float) -> None:
+        """Record that an operation of the core has ended that was called at `began`."""
         ...
 
     def before_results(self, slots: NDArray[np.intp]) -> Any:
@@ -50,15 +48,18 @@ class Observed:
         observer: None while no observer is attached.
     """
 
-    def __init__(self, conditions: Conditions) -> None:
-        self._conditions = conditions
+    def __init__(self) -> None:
         self.observer: Observer | None = None
 
     def attach(self, observer: Observer | None) -> None:
         """Report events to `observer` from now on; None detaches the current one."""
         self.observer = observer
-        self._conditions.note(RECORDING, observer is not None)
 
-    def call(self, name: str, began: float) -> contextlib.AbstractContextManager[Any]:
-        """Report an operation of the core; the span does nothing without an observer."""
-        return NO_SPAN if self.observer is None else self.observer.call(name, began)
+    @contextlib.contextmanager
+    def call(self, name: str, began: float) -> Generator[None]:
+        """Report an operation of the core that was called at `began`, when the context ends."""
+        try:
+            yield
+        finally:
+            if self.observer is not None:
+                self.observer.note_call(name, began)

@@ -36,8 +36,7 @@ class Event(Enum):
     SENT = auto()
     SENT_FOR_CALL = auto()
     JOINED = auto()
-    STEPPED_AT_ONCE = auto()
-    """The only env, in this process, was stepped without a request."""
+    """A result came without a request: an env joined, or the only one here was stepped."""
     CLAIMED = auto()
     """A call takes a first result that waited for the collector."""
     DROPPED = auto()
@@ -70,7 +69,6 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_IDLE, _C, Event.SENT): (_BUSY, _C),
     (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
     (_IDLE, _C, Event.JOINED): (_READY, _C),
-    (_IDLE, _C, Event.STEPPED_AT_ONCE): (_READY, _C),
     (_IDLE, _C, Event.KEPT): (_SPENT, _C),
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),

@@ -11,47 +11,34 @@ The table consists of arrays, so that a batch of thousands costs a few vector op
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from rlightning_aio._core.group.state.conditions import ABORTING, Conditions
+from rlightning_aio._core.group.state.numbering import Numbering
 from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio._core.group.state.uncollected import UncollectedErrors
-from rlightning_aio.protocol.entries import (
-    ANSWERS_WITH_VALUE,
-    NUMBER_SHIFT,
-    OP_BITS,
-    OP_BITS_ARRAY,
-    OP_MASK,
-    SLOT_MASK_ARRAY,
-    WITHOUT_OP,
-    Operation,
-    slot_of,
-)
+from rlightning_aio.errors import EnvFault
+from rlightning_aio.protocol import exchange, kernel
+from rlightning_aio.protocol.entries import OP_BITS_ARRAY, SLOT_MASK_ARRAY, Operation, slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from rlightning_aio.protocol.rings import TrainerBell
 
-    from rlightning_aio.errors import EnvFault
-
-__all__ = ["Aborted", "CollectorQueue", "Numbering", "Requests", "Ticket", "Tickets"]
+__all__ = ["Aborted", "CollectorQueue", "Requests", "Ticket", "Tickets"]
 
 
 # Plain ints: NumPy takes several times as long over members of an enum.
 _IDLE_CODE, _BUSY_CODE, _READY_CODE, _SPENT_CODE = map(int, State)
-_STEP, _RESET, _JOIN = map(int, (Operation.STEP, Operation.RESET, Operation.JOIN))
-
-_OP: Final = np.array(OP_MASK)
-_NEXT: Final = {op: np.array((1 << NUMBER_SHIFT) + op) for op in map(int, Operation)}
-"""Numbers to add to an entry without an operation."""
+_RESET, _JOIN = int(Operation.RESET), int(Operation.JOIN)
 
 
-@dataclass(slots=True)
-class Ticket:
+class Ticket(msgspec.Struct):
     """A call that waits for its own requests, independently of `collect`.
 
     Attributes:
@@ -65,8 +52,8 @@ class Ticket:
     slots: NDArray[np.intp]
     remaining: int
     method: str
-    failed: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
-    values: dict[int, Any] = field(default_factory=dict[int, Any])
+    failed: dict[int, EnvFault] = {}
+    values: dict[int, Any] = {}
 
     def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
         """Return the slots whose requests are its own, by the `owner` of each request."""
@@ -119,62 +106,6 @@ class Tickets:
         """Return the method that the call `owner` calls, or an empty string."""
         ticket = self.waiting.get(owner)
         return "" if ticket is None else ticket.method
-
-
-class Numbering:
-    """The number and the operation of each slot's current request, or its last.
-
-    Attributes:
-        entry: number, slot and operation, by slot.
-        num_values: by slot, the number of its requests that are answered by a value.
-    """
-
-    def __init__(self, size: int) -> None:
-        self.entry = np.arange(size) << OP_BITS
-        self.num_values = np.zeros(size, np.int64)
-
-    def number(self, slot: int) -> int:
-        """Number of the current request; 0 before the first."""
-        return int(self.entry[slot]) >> NUMBER_SHIFT
-
-    def numbers(self, slots: Any = ...) -> NDArray[np.int64]:
-        """Numbers of the current requests."""
-        return self.entry[slots] >> NUMBER_SHIFT
-
-    def of_results(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Return the number of requests of `slots` that are answered by a result."""
-        return (self.entry[slots] >> NUMBER_SHIFT) - self.num_values[slots]
-
-    def op(self, slot: int) -> int:
-        """Operation of the current request; 0 before the first."""
-        return int(self.entry[slot]) & OP_MASK
-
-    def ops(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Operations of the current requests of `slots`."""
-        return self.entry[slots] & _OP
-
-    def awaits_value(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which of `slots` have requests that are answered by a value, not a result."""
-        return ANSWERS_WITH_VALUE[self.ops(slots)]
-
-    def renew(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
-        """Number the next request of each of `slots`, and return their entries."""
-        if len(slots) == 1:  # As most results come one by one: in a third of the time.
-            slot = slots.item()
-            self.entry[slot] = (self.entry.item(slot) & ~OP_MASK) + (1 << NUMBER_SHIFT) + op
-            return self.entry[slots]
-        entries = self.entry[slots]
-        entries &= WITHOUT_OP
-        entries += _NEXT[op]
-        self.entry[slots] = entries
-        return entries
-
-    def into_resets(
-        self, slots: NDArray[np.intp], entries: NDArray[np.int64], which: NDArray[np.bool_]
-    ) -> None:
-        """Make resets of those steps, submitted and not yet handed over, that `which` marks."""
-        entries += which  # RESET == STEP + 1
-        self.entry[slots] = entries
 
 
 class CollectorQueue(UncollectedErrors):
@@ -274,6 +205,8 @@ class Requests:
         state: `State`; owner: of the current request.
         sent_ns: when it was sent.
         in_flight: requests of each host that are not answered; the only count of them.
+        rings: of each host, if it is a live worker of this machine; kept up by the hosts.
+        in_rings: all hosts had rings when the group started.
         aborted: requests that end without a reply.
         has_news: something has ended since this was set to False.
     """
@@ -293,6 +226,9 @@ class Requests:
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
         self.in_flight = [0] * num_hosts
+        self.rings: list[exchange.Ring | None] = [None] * num_hosts
+        self.in_rings = False
+        self._fence = exchange.new_fence()
         self.has_news = False
 
     # -- what is known ------------------------------------------------------------
@@ -341,6 +277,36 @@ class Requests:
         self.state[slots] = _BUSY_CODE
         return entries
 
+    def publish(
+        self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
+    ) -> list[exchange.Ring]:
+        """Number the next step of each of `slots`, all idle, and put it into the ring of its host.
+
+        Args:
+            slots: of envs whose hosts all have rings, and are up.
+            resets: ``[n]``, which are reset instead.
+            owner: of the requests.
+            now: monotonic seconds.
+
+        Returns the rings of the workers that sleep.
+        """
+        if owner:
+            self.owner[slots] = owner
+        else:
+            self.collector.num_awaited += len(slots)
+        return kernel.submit(
+            slots,
+            resets,
+            int(now * 1e9),
+            self.numbering.entry,
+            self.state,
+            self.sent_ns,
+            self.hosts,
+            self.in_flight,
+            self.rings,
+            self._fence,
+        )
+
     def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
         """Each host with its part of submitted `slots`: in flight from now on.
 
@@ -349,6 +315,9 @@ class Requests:
         count = len(slots)
         if not count:
             return []
+        if len(self.in_flight) == 1:
+            self.in_flight[0] += count
+            return [(0, slice(None))]
         hosts = self.hosts[slots]
         first = hosts.item(0)
         if count == 1 or (first == hosts.item(-1) and not np.count_nonzero(hosts != first)):
@@ -362,15 +331,6 @@ class Requests:
             parts.append((host_id, slice(start, end)))
             start = end
         return parts
-
-    def number_step_at_once(self, slot: int, now: float) -> None:
-        """Number a step that is about to be executed without being submitted."""
-        self.numbering.renew(self.alone(slot), _STEP)
-        self.sent_ns[slot] = int(now * 1e9)
-
-    def answer_at_once(self, slot: int) -> None:
-        """Take note that the result of such a step lies in its row, to be handed out."""
-        self.state[slot] = _READY_CODE
 
     def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
         """Number outstanding steps and resets of a host again, as resets; return their entries.
@@ -389,6 +349,19 @@ class Requests:
         return self._each[slot : slot + 1]
 
     # -- ending -------------------------------------------------------------------
+
+    def read(self, bell: TrainerBell) -> bool:
+        """Read the reports in the rings, and record the results that are in their rows.
+
+        Returns False, without reading anything, if other reports come first, or any is late.
+        """
+        slots = kernel.complete(
+            bell.counters, bell.read, self.numbering.entry, self.in_flight, self.rings, self._fence
+        )
+        if slots is None:
+            return False
+        self.deliver(slots)
+        return True
 
     def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
         """Record results that are in their rows; return their slots.
@@ -454,11 +427,15 @@ class Requests:
             self.has_news = True
         return slots[~aborted]
 
-    def join(self, slot: int, now: float) -> None:
-        """Record a first result without a request; the slot is idle."""
+    def join(self, slot: int, now: float, op: int = _JOIN) -> None:
+        """Record a result that lies in its row without a request; the slot is idle."""
         slots = self.alone(slot)
-        self.submit(slots, _JOIN, COLLECTOR, now)
-        self.deliver(slots)
+        self.numbering.renew(slots, op)
+        self.sent_ns[slot] = int(now * 1e9)
+        self.state[slot] = _READY_CODE
+        self.collector.ready.append(slots)
+        self.collector.num_ready += 1
+        self.has_news = True
 
     def deliver(self, slots: NDArray[np.intp]) -> None:
         """Deliver the results of `slots`, which are no longer in flight, to their owners."""

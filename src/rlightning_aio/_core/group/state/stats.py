@@ -12,14 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from rlightning_aio.protocol.slab import IS_RESET, TERMINATED, TRUNCATED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Requests
@@ -35,8 +35,7 @@ _HOLDERS: Final = (*_VERDICTS, "final_info")
 """Keys of infos that may have them."""
 
 
-@dataclass(slots=True)
-class _Sample:
+class _Sample(msgspec.Struct):
     """The results with one layout of a returned batch. Times in ns of the monotonic clock.
 
     Attributes:

@@ -3,8 +3,7 @@
 Each result carries the time at which it was ready and the duration in the env, on a clock that all
 processes of a machine share. So the trainer records everything when it returns results, and workers
 need no code for it.
-Rule: a trace is an observer (see `observed`) and changes nothing. While it records, steps take the
-general path.
+Rule: a trace is an observer (see `observed`) and changes nothing.
 """
 
 from __future__ import annotations
@@ -108,10 +107,13 @@ class Trace(Scope):
 
     def span(self, name: str) -> AbstractContextManager[Any]:
         """A span of the trainer, recorded when its ``with`` ends."""
-        return _Span(self._records, self._lanes, self._records.name(name), None)
+        return _Span(self._records, self._lanes, self._records.name(name))
 
-    def call(self, name: str, began: float) -> AbstractContextManager[Any]:
-        return _Span(self._records, self._lanes, self._records.name(name), int(began * 1e9))
+    def note_call(self, name: str, began: float) -> None:
+        # From its very beginning, so that its requests are within its span.
+        if (began_ns := int(began * 1e9)) >= self._began:
+            number, lane = self._records.name(name), self._lanes.current()
+            self._records.add_span((number, lane, began_ns, time.monotonic_ns()))
 
     def before_results(self, slots: NDArray[np.intp]) -> _Noted:
         requests = self._core.requests
@@ -199,23 +201,18 @@ class Trace(Scope):
 
 
 class _Span:
-    """Records a span for each ``with``.
+    """Records a span for each ``with``."""
 
-    Args:
-        began: the start in ns, so that the call's requests are within its span; None for entry.
-    """
+    __slots__ = ("_began", "_lane", "_lanes", "_number", "_records")
 
-    __slots__ = ("_began", "_given", "_lane", "_lanes", "_number", "_records")
-
-    def __init__(self, records: Records, lanes: _Lanes, number: int, began: int | None) -> None:
+    def __init__(self, records: Records, lanes: _Lanes, number: int) -> None:
         self._records = records
         self._lanes = lanes
         self._number = number
-        self._given = began
 
     def __enter__(self) -> None:
         self._lane = self._lanes.current()
-        self._began = time.monotonic_ns() if self._given is None else self._given
+        self._began = time.monotonic_ns()
 
     def __exit__(self, *error: object) -> None:
         self._records.add_span((self._number, self._lane, self._began, time.monotonic_ns()))

@@ -1,7 +1,7 @@
 """`InlineHost`: envs in the process of the trainer, with the same rows and rules.
 
 Requests wait in a queue, so sending never blocks; while a driver waits, it executes the next one
-(`group.poller`, `group.steps`). An env blocks the process while it steps, unless its own thread
+(`Poller.execute`). An env blocks the process while it steps, unless its own thread
 computes the step and an event loop waits for it (`_Threads`). An env that crashes ends the trainer.
 """
 
@@ -11,8 +11,6 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
-import numpy as np
-
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.messages import (
@@ -20,24 +18,24 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     ErrorText,
     NotBuilt,
-    Reported,
+    Result,
     Withdrawn,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Watcher, Wiring
     from rlightning_aio._core.hosts.messages import (
         AttachOrder,
-        Completion,
         EnvStarted,
         OutOfBand,
         StartOrder,
@@ -52,7 +50,7 @@ _STEP: Final = int(Operation.STEP)
 
 
 class InlineHost:
-    """Runs envs in this process; see `base.Host`, `Aborting`, `Executing` and `Polled`."""
+    """Runs envs in this process; see `base.Host`, `Aborting` and `Executing`."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -63,8 +61,6 @@ class InlineHost:
         self._post = wiring.completions.append
         self._runners: list[EnvRunner] = []
         self._queue: deque[_Waiting] = deque()
-        # Entries of results in rows that were not reported yet.
-        self._done: list[int] = []
         self._watcher = wiring.watcher
         self._shares_thread = wiring.shares_thread
         self._threads: _Threads | None = None
@@ -131,50 +127,20 @@ class InlineHost:
         if not self._queue:
             return False
         entry, execute = self._queue.popleft()
+        outcome = error = None
         try:
             outcome = self._watcher.interruptible(execute)
-        except BaseException as error:
-            self._raised(entry, error)
-            return True
-        self._report(entry, completion_of(self.host_id, entry, outcome))
-        return True
-
-    def _report(self, entry: int, completion: Completion | None) -> None:
-        """Post a completion after all earlier ones; None: the row holds the whole result."""
-        if completion is None:
-            self._done.append(entry)
-        else:
-            self.poll()
-            self._post(completion)
-
-    def _raised(self, entry: int, error: BaseException) -> None:
-        self._report(entry, completion_of(self.host_id, entry, None, error))
+        except BaseException as raised:
+            error = raised
+        completion = completion_of(self.host_id, entry, outcome, error)
+        self._post(completion or Result(self.host_id, entry, {}))
         if isinstance(error, KeyboardInterrupt):
             raise error  # It is meant for the program, but the request ends, too.
-
-    def poll(self) -> None:
-        if self._done:
-            self._post(Reported(self.host_id, np.array(self._done, np.int64)))
-            self._done.clear()
+        return True
 
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row; the queue must have no request to it."""
         return self._watcher.interruptible(self._runners[0].step)
-
-    def step_next(self) -> tuple[int, OutOfBand | None] | None:
-        """Execute the next request if it is a step or a reset, without a completion.
-
-        Returns its entry, and what of the result is out of band. None if there is no such request,
-        or after an error, which is posted.
-        """
-        if not self._queue or self._done or answers_with_value(op_of(self._queue[0][0])):
-            return None
-        entry, execute = self._queue.popleft()
-        try:
-            return entry, self._watcher.interruptible(execute)
-        except BaseException as error:
-            self._raised(entry, error)
-            return None
 
     def close(self) -> None:
         """Close the envs immediately."""
