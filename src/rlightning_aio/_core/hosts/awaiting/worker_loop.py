@@ -9,7 +9,7 @@ for longer than the limit. Requests that only wait too long are cancelled here (
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
@@ -35,6 +35,9 @@ class Awaiting:
         report: takes the entries of requests whose results are all in their rows.
         post: sends a completion.
         enter: says that an env's code runs now, by an entry; 0: none does.
+
+    Attributes:
+        envs: execute requests.
     """
 
     def __init__(
@@ -47,7 +50,7 @@ class Awaiting:
         enter: Callable[[int], None],
     ) -> None:
         self._enter = enter
-        self._envs = AwaitedEnvs(
+        self.envs = AwaitedEnvs(
             0,
             first_slot,
             order,
@@ -58,13 +61,6 @@ class Awaiting:
         )
         self._runners = cast("Sequence[AwaitedRunner]", runners)
         self._beat_seconds = min(limits_of(order.config).values(), default=0.0) / 4
-
-    def submit(self, entry: int, arguments: Any) -> None:
-        self._envs.submit(entry, arguments)
-
-    def abort(self, entry: int) -> None:
-        """End a request without its result, if it has not ended."""
-        self._envs.abort(entry)
 
     def serve(
         self, channel: socket.socket, take_requests: Callable[[], bool]
@@ -84,7 +80,7 @@ class Awaiting:
         self, channel: socket.socket, take_requests: Callable[[], bool]
     ) -> list[tuple[int, ErrorText]]:
         loop = asyncio.get_running_loop()
-        self._envs.adopt(self._runners)
+        self.envs.adopt(self._runners)
         ended: asyncio.Future[None] = loop.create_future()
 
         def look() -> None:
@@ -110,9 +106,9 @@ class Awaiting:
         try:
             await ended
         except BaseException:
-            self._envs.disconnect()
-            await self._envs.close()
+            self.envs.disconnect()
+            await self.envs.close()
             raise
         finally:
             loop.remove_reader(channel)
-        return await self._envs.close()
+        return await self.envs.close()

@@ -124,7 +124,7 @@ class Worker:
             self._post,
             lambda entry: rings.begin(entry, time.monotonic_ns()),
         )
-        self._submit, self._abort_awaited = awaiting.submit, awaiting.abort
+        self._submit, self._abort_awaited = awaiting.envs.submit, awaiting.envs.abort
         try:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:

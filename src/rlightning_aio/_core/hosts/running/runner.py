@@ -100,12 +100,13 @@ class EnvRunner:
 
     Attributes:
         restarts: how many workers had this env before.
+        checkpoints: of the env.
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
             that ends it. None if the env has no such step.
         is_awaitable: its requests are awaited, together with those of other envs.
 
-    Raises what `recording.Camera` raises.
+    Raises what `filming.Camera` raises.
     """
 
     is_awaitable: ClassVar[bool] = False
@@ -127,7 +128,7 @@ class EnvRunner:
         self._bare_reset = env.bare_reset() if self._is_bare else None
         self._input = input_of(env)
         self._read_action: Callable[[], Any] = _no_action
-        self._checkpoints: Checkpoints
+        self.checkpoints: Checkpoints
         self._saver: Saver | None = None
         self._camera = None if video is None else _camera(env, video)
 
@@ -165,12 +166,12 @@ class EnvRunner:
             partial_of=num_envs if num_envs > self.meta.num_envs else 0,
             stays_here=self._inline,
         )
-        self._checkpoints = Checkpoints(self.env, slab, row, self._writer)
+        self.checkpoints = Checkpoints(self.env, slab, row, self._writer)
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         every = self.env.config.snapshot_every
         if every is not None and send_checkpoint is not None:
-            self._saver = Saver(self._checkpoints, slab.over[row, ...], every, send_checkpoint)
+            self._saver = Saver(self.checkpoints, slab.over[row, ...], every, send_checkpoint)
         if self._camera is not None:
             self._watch(self._camera)
         self._bind()
@@ -229,17 +230,13 @@ class EnvRunner:
         return partial(call_env, self.env, *arguments), _outcome
 
     def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
-        return versions_of(self.env), self._checkpoints.has_result, self._checkpoints.take()
+        return versions_of(self.env), self.checkpoints.has_result, self.checkpoints.take()
 
     def _restore(self, checkpoint: bytes, show: bool) -> None:
-        self._checkpoints.load(checkpoint, show=show)
+        self.checkpoints.load(checkpoint, show=show)
         if self._saver is not None:
             # Where nothing is to be shown, it goes back to where the trainer knows it to be.
             self._saver.save(before=not show)
-
-    def resume(self, checkpoint: bytes) -> None:
-        """Continue where the env of a replaced worker was."""
-        self._checkpoints.resume(checkpoint)
 
     def close(self) -> Awaitable[None] | None:
         """Close the env, and the film of an episode that is under way."""
@@ -315,11 +312,11 @@ class EnvRunner:
 
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
         """Start a new episode, or show the restored result if the reset in the row asks for it."""
-        if arguments is None and self._checkpoints.must_show():
+        if arguments is None and self.checkpoints.must_show():
             return _no_call, self._finish_shown
         if self._saver is not None:
             self._saver.before_reset()
-        self._checkpoints.forget_result()
+        self.checkpoints.forget_result()
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
@@ -336,7 +333,7 @@ class EnvRunner:
         del returned, busy_ns
         if self._camera is not None:
             self._camera.close()
-        out_of_band = self._checkpoints.show()
+        out_of_band = self.checkpoints.show()
         self._note_reset()
         return out_of_band
 
@@ -373,7 +370,7 @@ class EnvRunner:
 
     def _note_reset(self) -> None:
         """Record that the row holds the first result of an episode."""
-        self._checkpoints.note_result()
+        self.checkpoints.note_result()
         if self._writer.is_bypassed and self._writer.whole is not None:
             # The results hold tensors that stay here, so the writer is needed from now on.
             self._writer.is_bypassed = False
@@ -468,7 +465,7 @@ def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
         runner.restarts = order.restarts
     for runner, checkpoint in zip(runners, order.checkpoints, strict=False):
         if checkpoint is not None:
-            runner.resume(checkpoint)
+            runner.checkpoints.resume(checkpoint)
 
 
 def close_all(
