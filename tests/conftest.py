@@ -34,7 +34,7 @@ uvloop.new_event_loop().close()
 # For loops that tests make themselves; pytest-asyncio has an option for its own loops.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
-# Every group that a test builds checks what happens to its requests: `group/engine/checked.py`.
+# Every group that a test builds checks what happens to its requests: `group/state/checked.py`.
 os.environ["RLIGHTNING_AIO_DEBUG"] = "1"
 
 # A group continues with the fork server of the one before only if the environment is the same, and

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlightning_aio._core.group.engine.checked import CheckedRequests
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.state.checked import CheckedRequests
 from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.lifetime import Lifetime

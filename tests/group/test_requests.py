@@ -19,7 +19,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rlightning_aio._core.group.engine.checked import CheckedRequests
+from rlightning_aio._core.group.state.checked import CheckedRequests
 from rlightning_aio._core.group.state.request_states import (
     COLLECTOR,
     LEGAL,

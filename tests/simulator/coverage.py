@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 from simulator.program import OPS
 
 from rlightning_aio import errors
-from rlightning_aio._core.group.engine import checked
 from rlightning_aio._core.group.episodes import continuity
+from rlightning_aio._core.group.state import checked
 from rlightning_aio._core.group.state.request_states import LEGAL, Owner, State
 
 if TYPE_CHECKING:

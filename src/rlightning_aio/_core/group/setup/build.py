@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rlightning_aio._core.group.engine.checked import DEBUG, CheckedRequests
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.setup.plan import host_class, place_of
 from rlightning_aio._core.group.setup.start_orders import start_orders
+from rlightning_aio._core.group.state.checked import DEBUG, CheckedRequests
 from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.lifetime import Lifetime
