@@ -21,7 +21,7 @@ MOST = {
     "the same, asynchronous": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
     "step": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
     "VectorEnv.step": {"calls": 80},
-    "Collector.collect, 16 transitions": {"calls": 400},
+    "Collector.collect, 16 transitions": {"calls": 300},
     "death with resume: files": {"files of src": 23},
 }
 
