@@ -44,7 +44,9 @@ def test_a_defect_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:
     original = Continuity.judge
 
     def forgetful(self: Continuity, slots: Any, flagged: Any) -> Any:
-        return original(self, slots, flagged)._replace(is_cut=None)
+        judged = original(self, slots, flagged)
+        judged.is_cut = None
+        return judged
 
     monkeypatch.setattr(Continuity, "judge", forgetful)
     runs = (run(draw(seed)) for seed in range(200))
