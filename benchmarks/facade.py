@@ -85,7 +85,7 @@ class Raw(Stepped):
         core, run = self._core, self._driver.run
         batch, _ = run(core.reset(time.monotonic(), None, None, None))
         response = batch.respond(action=next(self._actions))
-        return median_us(lambda: run(core.step(response, time.monotonic())), seconds)
+        return median_us(lambda: run(core.steps.step(response, time.monotonic())), seconds)
 
     def teardown(self) -> None:
         if hasattr(self, "_core"):

@@ -175,7 +175,6 @@ class _Actor(Process):
         self._waiting: deque[_Call] = deque()
         self._unanswered: list[_Call] = []
         self._threads: list[_Thread] = []
-        self._answered_ns = 0
 
     def call(self, call: _Call, *, is_concurrent: bool) -> None:
         """Take a call; a concurrent one has a thread of its own."""
@@ -215,11 +214,8 @@ class _Actor(Process):
         self._answer(call, value)
 
     def _answer(self, call: _Call, value: Any) -> None:
-        """Send what became of a call; outcomes arrive in order."""
-        world = self.world
-        at = max(self._answered_ns, world.now_ns + int(world.delay() * 1e9))
-        self._answered_ns = at
-        world.after((at - world.now_ns) / 1e9, partial(call.outcome.complete, value))
+        """Send what became of a call, which may arrive before earlier outcomes."""
+        self.world.after(self.world.delay(), partial(call.outcome.complete, value))
 
     def _on_end(self, code: int, stderr: str) -> None:
         del stderr

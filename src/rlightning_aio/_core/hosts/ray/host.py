@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections import deque
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -64,6 +65,19 @@ the cluster, over sockets that the parent uses.
 """
 
 
+@dataclass
+class _Sent:
+    """A batch of requests that was sent to an actor.
+
+    Attributes:
+        entries: of the requests.
+        outcome: what came back; None until then.
+    """
+
+    entries: NDArray[np.int64]
+    outcome: Reply | Exception | None = None
+
+
 class _Life:
     """One actor, from its start to its end.
 
@@ -72,7 +86,7 @@ class _Life:
         inbox: for its replies.
         has_place: a node has started it.
         is_built: its envs are built.
-        sent: entries of unanswered batches, in the order of execution.
+        sent: unanswered batches, in the order of execution.
         began_ns: estimated start of the first of them.
         late: a request that it reported as late, and the start of that request.
         stacks: of all its threads when it reported that.
@@ -82,7 +96,7 @@ class _Life:
         self.actor = actor
         self.inbox = Inbox()
         self.has_place = self.is_built = False
-        self.sent: deque[NDArray[np.int64]] = deque()
+        self.sent: deque[_Sent] = deque()
         self.began_ns = 0
         self.late: tuple[int, int] | None = None
         self.stacks = ""
@@ -207,7 +221,7 @@ class RayHost:
         if life is None:
             return
         # It was executing the first batch.
-        requests: list[int] = [entry for entries in life.sent for entry in entries.tolist()]
+        requests: list[int] = [entry for sent in life.sent for entry in sent.entries.tolist()]
         self.release()
         if self._closing:
             text = ErrorText("WorkerDied", f"its worker {cause}", life.stacks)
@@ -230,8 +244,10 @@ class RayHost:
         columns = self._table.requests(entries, seeds=arguments is None)
         if not life.sent:
             life.began_ns = time.monotonic_ns()
-        life.sent.append(entries)
-        life.call(life.actor.execute, self._on_reply, Batch(entries, columns, arguments))
+        sent = _Sent(entries)
+        life.sent.append(sent)
+        then = partial(self._on_reply, sent)
+        life.call(life.actor.execute, then, Batch(entries, columns, arguments))
 
     def executing(self) -> tuple[int, int]:
         """Return the entry being executed and its start, as of `base.Killable`.
@@ -244,7 +260,7 @@ class RayHost:
             return 0, 0
         if life.late is not None:
             return life.late
-        entries: list[int] = life.sent[0].tolist()
+        entries: list[int] = life.sent[0].entries.tolist()
         now_ns, since_ns = time.monotonic_ns(), life.began_ns + _ON_THE_WAY_NS
         for entry in entries[:-1]:
             limit = self._limits.get(op_of(entry))
@@ -308,12 +324,19 @@ class RayHost:
             life.late = outcome.entry, time.monotonic_ns() - outcome.taken_ns
             life.stacks = outcome.stacks
 
-    def _on_reply(self, life: _Life, outcome: Reply | Exception) -> None:
-        if self._has_returned(outcome):
-            assert isinstance(outcome, Reply)
+    def _on_reply(self, sent: _Sent, life: _Life, outcome: Reply | Exception) -> None:
+        """Apply replies in the order of execution: results need the schemas of earlier ones.
+
+        Ray may deliver a large reply later than a small one that came after it.
+        """
+        sent.outcome = outcome
+        while life.sent and (first := life.sent[0].outcome) is not None:
+            if not self._has_returned(first):
+                return
+            assert isinstance(first, Reply)
             life.sent.popleft()
             life.began_ns = time.monotonic_ns()
-            self._apply(outcome)
+            self._apply(first)
 
     def _apply(self, reply: Reply) -> None:
         """Write results into their rows, and post the completions of a batch."""
