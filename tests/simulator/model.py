@@ -272,7 +272,8 @@ class Env:
         dirty: its last result could not be read, so its episode must end.
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
         seen: `deaths` that its results have shown.
-        saves: states to which it may be put back after a death.
+        saves: states to which it may be put back after a death; before_reset: those of them that
+            were saved as the reset was sent that is in flight.
         loose: states of which it may have one, because a call was given up; torn: the same of a
             restore, after which only a marked result, or one of a reset, may come from them.
         episodes: return and length of each that has ended.
@@ -293,6 +294,7 @@ class Env:
     hangs: int = 0
     seen: int = 0
     since_save: int = 0
+    before_reset: list[State] = field(default_factory=list)
     saves: list[State] = field(default_factory=list)
     loose: list[State] = field(default_factory=list)
     torn: list[State] = field(default_factory=list)
@@ -419,7 +421,8 @@ class Model:
             else:
                 request.due = env.state.cut or (context.on_done and env.state.ended)
         if request.resets and env.saves and env.since_save:  # That is saved before a reset.
-            env.saves.append(env.state.copy())
+            env.before_reset = [state.copy() for state in env.possible()]
+            env.saves += env.before_reset
         effects = [effect for effect, _ in env.state.copy().faults(request)]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
         env.deadly |= request.kills
@@ -631,7 +634,7 @@ class Model:
             env.dirty = True
             return
         if request.resets and env.since_save:
-            env.saves, env.since_save = env.saves[-1:], 0
+            env.saves, env.since_save = env.before_reset, 0
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
         acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
