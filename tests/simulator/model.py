@@ -527,7 +527,8 @@ class Model:
             for sub, final in zip(env.state.scripts.subs, env.state.finals, strict=True)
         )
         if not env.since_save or env.since_save >= env.entry.every or ended:
-            env.saves, env.since_save = [env.state.copy()], 0
+            env.saves = [state.copy() for state in (env.state, *env.loose)]
+            env.since_save = 0
 
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
         if not env.torn:

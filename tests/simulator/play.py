@@ -140,10 +140,13 @@ class Play(Session):
         if self.context is not None:
             self.leave()
         for env in self.model.envs.values():
-            for k in range(6):  # Errors of the env, or of a call that was given up, may come first.
+            # Errors of the env, or of a call that was given up, may come first; and each call may
+            # send no more of the order to start than a narrow channel takes.
+            for k in range(30):
                 if env.gone or await self.interruptible(self.use(env)):
                     break
-                await self.rest(1 if self.world is None else 10**k)  # It may still be starting.
+                # It may still be starting.
+                await self.rest(1 if self.world is None else 10 ** min(k, 5))
             else:
                 raise Violation(f"env {env.env_id} can't be used any more")
         self.check_stats()
