@@ -108,7 +108,7 @@ def _repeats(item: pytest.Item) -> bool:
     return synchronous and on_uvloop
 
 
-def _spares() -> list[spares.Spare]:
+def _spares() -> list[spares.RunningForkServer]:
     """Return the fork servers that are kept for the next group."""
     from rlightning_aio._core.hosts.process import spares
 

@@ -405,7 +405,7 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
     group, tokens = start(two_workers()), Tokens()
     server = fork_server_of(group.group)
     group.step_async(tokens.steps(["faulty-1"]))
-    kill(server._process.pid)
+    kill(server._server.process.pid)
     batch, _ = group.collect_async()
     assert batch.ids() == ["faulty-1"]
     if not marked(batch["faulty-1"]):  # This env had stepped before the kill.
@@ -423,7 +423,11 @@ def test_one_restart_outlasts_a_shortage_of_descriptors(
 ) -> None:
     """Attempts become rarer; the other envs step meanwhile."""
     group, tokens = start(two_workers(max_restarts=1)), Tokens()
-    pid = fork_server_of(group.group)._process.pid if whose == "the fork server's" else os.getpid()
+    pid = (
+        fork_server_of(group.group)._server.process.pid
+        if whose == "the fork server's"
+        else os.getpid()
+    )
     kept = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     listed = list(Path(f"/proc/{pid}/fd").iterdir())
     held = {int(path.name) for path in listed if path.is_symlink()}  # Not that of the listing.

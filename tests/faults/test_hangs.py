@@ -136,7 +136,7 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     monkeypatch.setattr(hang_detector, "_OBEY_SECONDS", LIMIT)
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     stop(pid_of(group, "faulty-0"))
-    stop(fork_server_of(group.group)._process.pid)
+    stop(fork_server_of(group.group)._server.process.pid)
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
     assert batch["faulty-0"].info["worker_restarted"] == "hung in a step and was killed"

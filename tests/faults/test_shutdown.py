@@ -70,7 +70,7 @@ def descendants(pid: int) -> set[int]:
 
 def processes_of(group: rlightning_aio.EnvGroup) -> set[int]:
     """Return the group's workers and their fork server."""
-    server: int = fork_server_of(group)._process.pid
+    server: int = fork_server_of(group)._server.process.pid
     return {server} | descendants(server)
 
 
@@ -470,7 +470,7 @@ def test_stopped_fork_server_does_not_delay_close(start: Start) -> None:
     group = start(two_workers())
     server = fork_server_of(group.group)
     stop(pid_of(group, "faulty-0"))
-    stop(server._process.pid)
+    stop(server._server.process.pid)
     with watched(processes_of(group.group)) as ended:
         group.close()
         ended()
@@ -556,7 +556,7 @@ def test_replaced_workers_leave_no_zombies(start: Start) -> None:
         return (
             len(processes_of(group.group)),
             len(list(Path("/proc/self/fd").iterdir())),
-            len(list(Path(f"/proc/{server._process.pid}/fd").iterdir())),
+            len(list(Path(f"/proc/{server._server.process.pid}/fd").iterdir())),
         )
 
     before = held()

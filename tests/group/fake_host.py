@@ -28,7 +28,7 @@ from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
-from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.messages import (
     NO_ACTION,
     Attached,
@@ -162,7 +162,7 @@ class FakeHost:
 
     def attach(self, order: AttachOrder) -> None:
         (offset, rows), *_ = order.slabs
-        memory = map_shared(self.shared.arena.descriptor, offset, LAYOUT.size(rows))
+        memory = self.shared.arena.map(offset, LAYOUT.size(rows))
         self.slab = Slab(LAYOUT, memory, rows)
         self.row_of = [row for _, row in order.rows]
         self.post(Attached(self.host_id))

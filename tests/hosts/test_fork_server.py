@@ -43,8 +43,8 @@ def lost(interpreter: str) -> str:
     channel, worker = socket.socketpair()
     arena = Arena()
     server.fork(asker, worker, arena, Fork(WorkerPlace(0, 1, 0, 1, 0, 0)))
-    assert server._process is not None
-    os.waitid(os.P_PID, server._process.pid, os.WEXITED | os.WNOWAIT)
+    assert server._server is not None
+    os.waitid(os.P_PID, server._server.process.pid, os.WEXITED | os.WNOWAIT)
     server.on_readable()
     channel.close()
     arena.close()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from protocol.memory_of_rings import unused
 
-from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
 from rlightning_aio._core.hosts.messages import (
     Attached,
@@ -88,7 +88,7 @@ class Scene:
         self.completions: Any = deque()
         self.arena = Arena()
         self.bell_offset = self.arena.append(bell_size(1))
-        memory = map_shared(self.arena.descriptor, self.bell_offset, bell_size(1))
+        memory = self.arena.map(self.bell_offset, bell_size(1))
         self.bell = TrainerBell(memory, 1)
         self.fork_server = StandIn()
         self.watched: list[Any] = []
@@ -129,9 +129,9 @@ class Scene:
     def start(self) -> None:
         self.host.start()
         place = self.fork_server.orders[-1].place
-        bell_memory = map_shared(self.arena.descriptor, place.bell_offset, bell_size(1))
+        bell_memory = self.arena.map(place.bell_offset, bell_size(1))
         size = rings_size(place.num_envs)
-        memory = map_shared(self.arena.descriptor, place.rings_offset, size)
+        memory = self.arena.map(place.rings_offset, size)
         self.rings = WorkerRings(memory, place.num_envs, WorkerBell(bell_memory, 1, place.host_id))
         self.frames = FrameReader()
 

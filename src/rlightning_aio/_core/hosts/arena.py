@@ -60,6 +60,10 @@ class Arena:
         os.ftruncate(self.descriptor, self._size)
         return offset
 
+    def map(self, offset: int, size: int) -> memoryview:
+        """Map a part, as `map_shared` does."""
+        return map_shared(self.descriptor, offset, size)
+
     def close(self) -> None:
         """Close the descriptor; mapped parts stay mapped."""
         if self.descriptor >= 0:

@@ -22,7 +22,7 @@ from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
-from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.rings import TrainerBell, bell_size
@@ -79,7 +79,7 @@ def _assembled(
 ) -> Core:
     arena = tables.arena
     bell_offset = arena.append(bell_size(len(orders)))
-    bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
+    bell_memory = arena.map(bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
     tables.resources["bell"] = bell
     supervisor = Supervisor(tables)

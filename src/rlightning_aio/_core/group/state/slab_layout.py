@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import AttachOrder
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.columns import leaves
@@ -98,7 +97,7 @@ class SlabLayout:
             size = layout.size(rows)
             offset = arena.append(size)
             self._places.append((offset, rows))
-            self.slabs.append(Slab(layout, map_shared(arena.descriptor, offset, size), rows))
+            self.slabs.append(Slab(layout, arena.map(offset, size), rows))
         self._note_rows()
 
     def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:

@@ -11,7 +11,6 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.messages import (
     Built,
@@ -85,8 +84,7 @@ class InlineHost:
         return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
-        map_part = partial(map_shared, self._arena.descriptor)
-        attach_all(self._runners, order, map_part, self.host_id, self._post)
+        attach_all(self._runners, order, self._arena.map, self.host_id, self._post)
 
     def packed(self, arguments: Any) -> Any:
         return copied(arguments)

@@ -8,12 +8,10 @@ Left out: what becomes of a request (see `AwaitedEnvs`).
 from __future__ import annotations
 
 import asyncio
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.messages import Built, Closed, Reported, Result
@@ -46,7 +44,7 @@ class LoopHost:
             host_id, first_slot, order, inline=True, post=self._post, done=self._note_done
         )
         offset, size = wiring.bell_offset, bell_size(wiring.num_hosts)
-        memory = map_shared(wiring.arena.descriptor, offset, size)
+        memory = wiring.arena.map(offset, size)
         self._bell: WorkerBell | None = WorkerBell(memory, wiring.num_hosts, host_id)
         # Results that were not reported, those in rows by their entries; how many there ever were.
         self._done: list[int | Result] = []
@@ -67,8 +65,8 @@ class LoopHost:
             self._post(Built(self.host_id, started))
 
     def attach(self, order: AttachOrder) -> None:
-        map_part = partial(map_shared, self._wiring.arena.descriptor)
-        attach_all(self._envs.runners, order, map_part, self.host_id, self._post)
+        arena = self._wiring.arena
+        attach_all(self._envs.runners, order, arena.map, self.host_id, self._post)
 
     def close(self) -> None:
         """See `base.Host.close`. Requests that are being executed are cancelled."""

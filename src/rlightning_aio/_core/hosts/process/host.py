@@ -17,7 +17,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -33,6 +32,7 @@ from rlightning_aio._core.hosts.process.fork_messages import (
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
 from rlightning_aio._core.hosts.process.processor_times import processor_times
+from rlightning_aio._core.hosts.process.spares import RunningForkServer
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
@@ -106,8 +106,7 @@ class ForkServerHandle:
         self._preload = preload
         self._watcher = watcher
         self._hosts: dict[int, ProcessHost] = {}
-        self._messages: MessageSocket | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._server: RunningForkServer | None = None
         self._key: spares.Key = ()
         self._ready = False
         # The reason of its exit, if that says more than the exit code.
@@ -115,8 +114,8 @@ class ForkServerHandle:
 
     def fileno(self) -> int:
         """Return the descriptor of the socket to the fork server."""
-        assert self._messages is not None
-        return self._messages.fileno()
+        assert self._server is not None
+        return self._server.messages.fileno()
 
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
         """Start a worker for `host`, and first a fork server if none is running.
@@ -127,44 +126,47 @@ class ForkServerHandle:
             arena: of the group.
             order: for the fork server.
         """
-        messages = self._messages or self._launch()
+        messages = (self._server or self._launch()).messages
         self._hosts[order.place.host_id] = host
         messages.send(order, channel, (arena.descriptor,))
         self._watcher.watch_writable(self, messages.waiting)
 
     def on_writable(self) -> None:
         """Send waiting messages; a fork server reads nothing while it imports modules."""
-        if self._messages is not None:
-            self._messages.flush()
-            self._watcher.watch_writable(self, self._messages.waiting)
+        if self._server is not None:
+            messages = self._server.messages
+            messages.flush()
+            self._watcher.watch_writable(self, messages.waiting)
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
         """Kill the worker of `host`, if it still runs."""
-        if not self._ready and self._process is not None:
+        if self._server is None:
+            return
+        messages, process = self._server
+        if not self._ready:
             self._failure = f"it was killed while it was importing {self._imports}"
-            self._process.kill()  # It hangs in an import and reads no messages.
-        elif self._messages is not None:
-            self._messages.send(Kill(host.host_id, dump))
-            self._watcher.watch_writable(self, self._messages.waiting)
+            process.kill()  # It hangs in an import and reads no messages.
+        else:
+            messages.send(Kill(host.host_id, dump))
+            self._watcher.watch_writable(self, messages.waiting)
 
     def destroy(self) -> None:
         """Kill the fork server itself; the kernel then kills its workers."""
-        if self._process is not None:
+        if self._server is not None:
             self._failure = "it didn't react to any request, and was killed"
-            self._process.kill()
+            self._server.process.kill()
 
     @property
     def _imports(self) -> str:
         return ", ".join(self._preload) or "its modules"
 
-    def _launch(self) -> MessageSocket:
+    def _launch(self) -> RunningForkServer:
         self._failure = None
         self._key = (self._preload, self._interpreter, *self._env_vars.items())
-        self._key += spares.surroundings()
+        self._key += spares.inherited()
         spare = spares.take(self._key)
         self._ready = spare is not None
-        messages, self._process = self._started() if spare is None else spare
-        self._messages = messages
+        server = self._server = spare or self._started()
         try:
             self._watcher.watch(self)
         except BaseException:
@@ -172,10 +174,10 @@ class ForkServerHandle:
             raise
         if spare is None:
             path = None if self._interpreter else list(sys.path)
-            messages.send(Preload(path, self._preload))
-        return messages
+            server.messages.send(Preload(path, self._preload))
+        return server
 
-    def _started(self) -> spares.Spare:
+    def _started(self) -> RunningForkServer:
         package = str(Path(__file__).parents[3])
         command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, package]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -193,12 +195,12 @@ class ForkServerHandle:
             raise
         finally:
             theirs.close()
-        return spares.Spare(MessageSocket(ours), process)
+        return RunningForkServer(MessageSocket(ours), process)
 
     def on_readable(self) -> None:
         """Read messages of the fork server, and pass them to the hosts of its workers."""
         try:
-            while self._messages is not None and (received := self._messages.receive()) is not None:
+            while self._server is not None and (received := self._server.messages.receive()):
                 self._handle(received.message)
         except EOFError:
             self._lost()
@@ -234,37 +236,27 @@ class ForkServerHandle:
         """Keep the fork server for another group if it has no workers and is well; otherwise end
         it, which ends its workers within `seconds`.
         """
-        messages, process = self._messages, self._process
+        server = self._server
         is_well = self._ready and self._failure is None and not self._hosts
-        if messages is None or process is None or not is_well or messages.waiting:
+        if server is None or not is_well or server.messages.waiting:
             self._end(seconds)
             return
         self._watcher.unwatch(self)
-        self._messages = self._process = None
-        spares.keep(self._key, spares.Spare(messages, process))
+        self._server = None
+        spares.keep(self._key, server)
 
     def disown(self) -> None:
-        if self._messages is not None:
-            self._messages.close()
-            self._messages = None
-        if self._process is not None:
-            self._process.returncode = 0  # The child of another process, so no warning is due.
-            self._process = None
+        if self._server is not None:
+            self._server.disown()
+            self._server = None
 
     def _end(self, seconds: float) -> int:
         """End it, as `release` does; return its exit code, or 0 if it wasn't running."""
-        if self._messages is not None:
-            self._watcher.unwatch(self)
-            self._messages.close()
-            self._messages = None
-        process, self._process = self._process, None
-        if process is None:
+        server, self._server = self._server, None
+        if server is None:
             return 0
-        try:
-            return process.wait(seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()  # The kernel then kills its workers.
-            return process.wait()
+        self._watcher.unwatch(self)
+        return server.end(seconds)
 
 
 def _surroundings(config: EnvConfig) -> tuple[object, ...]:
@@ -307,9 +299,7 @@ class ProcessHost:
             ours.setblocking(False)
             if self._rings is None:
                 size = rings_size(self.num_envs)
-                self._rings = map_shared(
-                    self._wiring.arena.descriptor, self._place.rings_offset, size
-                )
+                self._rings = self._wiring.arena.map(self._place.rings_offset, size)
             self._link = Link(self._place, self._rings, self._wiring, ours)
             self._fork_server.fork(self, theirs, self._wiring.arena, Fork(self._place))
         except BaseException:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import MessageSocket
 
-__all__ = ["Key", "Spare", "end_all", "keep", "kept", "surroundings", "take"]
+__all__ = ["Key", "RunningForkServer", "end_all", "inherited", "keep", "kept", "take"]
 
 Key: TypeAlias = tuple[object, ...]
 
@@ -32,17 +32,31 @@ _INHERITED: Final = (
 """Lines of /proc/self/status about what a new process inherits."""
 
 
-class Spare(NamedTuple):
-    """A fork server that is ready: the trainer's end of its socket, and its process."""
+class RunningForkServer(NamedTuple):
+    """A fork server that was started: the trainer's end of its socket, and its process."""
 
     messages: MessageSocket
     process: subprocess.Popen[bytes]
 
+    def end(self, seconds: float) -> int:
+        """End it, which ends its workers within `seconds`, and return its exit code."""
+        self.messages.close()
+        try:
+            return self.process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.process.kill()  # The kernel then kills its workers.
+            return self.process.wait()
 
-_spares: dict[Key, Spare] = {}
+    def disown(self) -> None:
+        """Drop it in a process that was forked; the parent continues to use it."""
+        self.messages.close()
+        self.process.returncode = 0  # The child of another process, so no warning is due.
 
 
-def surroundings() -> Key:
+_spares: dict[Key, RunningForkServer] = {}
+
+
+def inherited() -> Key:
     """Return what a process would inherit that this thread starts now."""
     thread = Path("/proc/thread-self")
     status = (thread / "status").read_text().splitlines()
@@ -66,26 +80,26 @@ def surroundings() -> Key:
     )
 
 
-def keep(key: Key, spare: Spare) -> None:
+def keep(key: Key, spare: RunningForkServer) -> None:
     """Keep a fork server that was started in the surroundings `key`; it belongs to this module."""
     if key in _spares:
-        _end(spare)
+        spare.end(_END_SECONDS)
         return
     _spares[key] = spare
     while len(_spares) > _MOST:
-        _end(_spares.pop(next(iter(_spares))))
+        _spares.pop(next(iter(_spares))).end(_END_SECONDS)
 
 
-def take(key: Key) -> Spare | None:
+def take(key: Key) -> RunningForkServer | None:
     """Hand out a fork server that still runs; None if there is none."""
     spare = _spares.pop(key, None)
     if spare is None or spare.process.poll() is None:
         return spare
-    _end(spare)
+    spare.end(_END_SECONDS)
     return None
 
 
-def kept() -> list[Spare]:
+def kept() -> list[RunningForkServer]:
     """Return all spares."""
     return list(_spares.values())
 
@@ -93,25 +107,13 @@ def kept() -> list[Spare]:
 def end_all() -> None:
     """End all spares."""
     while _spares:
-        _end(_spares.popitem()[1])
+        _spares.popitem()[1].end(_END_SECONDS)
 
 
-def _end(spare: Spare) -> None:
-    spare.messages.close()
-    try:
-        spare.process.wait(_END_SECONDS)
-    except subprocess.TimeoutExpired:
-        spare.process.kill()
-        spare.process.wait()
-
-
-def _forget() -> None:
-    """Drop the spares of the parent in a process that was forked."""
+def _disown_all() -> None:
     while _spares:
-        messages, process = _spares.popitem()[1]
-        messages.close()
-        process.returncode = 0  # The child of another process, so no warning is due.
+        _spares.popitem()[1].disown()
 
 
 atexit.register(end_all)
-os.register_at_fork(after_in_child=_forget)
+os.register_at_fork(after_in_child=_disown_all)

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.limits import limits_of
@@ -172,8 +171,8 @@ class RayHost:
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""
         if self._table is None:
-            map_part = partial(map_shared, self._wiring.arena.descriptor)
-            places = [(slab, row) for _, slab, row in placed(self._started, order, map_part)]
+            found = placed(self._started, order, self._wiring.arena.map)
+            places = [(slab, row) for _, slab, row in found]
             self._table = RowTable(self.first_slot, places)
         elif self._life is not None and order.restarts:
             self._life.call(self._life.actor.resume, self._on_resumed, order)
