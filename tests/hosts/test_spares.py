@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rlightning_aio import EnvConfig, sync
+from rlightning_aio import EnvConfig, StartFailed, sync
 from rlightning_aio._core.hosts.process import spares
 
 if TYPE_CHECKING:
@@ -76,6 +76,17 @@ def test_a_few_are_kept() -> None:
     used = [parent_of_a_worker(env_vars={"A_VARIABLE": str(k)}) for k in range(4)]
     assert [spare.process.pid for spare in spares.kept()] == used[1:]
     assert not Path(f"/proc/{used[0]}").exists()
+
+
+@pytest.mark.parametrize("continues", [False, True])
+def test_a_start_that_fails_leaves_none(continues: bool) -> None:
+    """Nor does one that continues with the fork server of a group before."""
+    if continues:
+        parent_of_a_worker()
+    config = EnvConfig(name="e", backend="gymnasium", task="CartPole-v1", env_kwargs={"no": 1})
+    with pytest.raises(StartFailed):
+        sync.build_env_group([config]).init()
+    assert not spares.kept()
 
 
 def test_one_that_has_died_is_not_used() -> None:

@@ -109,6 +109,8 @@ class ForkServerHandle:
         self._server: RunningForkServer | None = None
         self._key: spares.Key = ()
         self._ready = False
+        # The group has started: a start that fails must leave no process.
+        self._is_used = False
         # The reason of its exit, if that says more than the exit code.
         self._failure: str | None = None
 
@@ -149,6 +151,10 @@ class ForkServerHandle:
         else:
             messages.send(Kill(host.host_id, dump))
             self._watcher.watch_writable(self, messages.waiting)
+
+    def note_used(self) -> None:
+        """Note that the envs of all workers were built."""
+        self._is_used = True
 
     def destroy(self) -> None:
         """Kill the fork server itself; the kernel then kills its workers."""
@@ -233,11 +239,11 @@ class ForkServerHandle:
             host.on_fork_server_lost(why.rstrip())
 
     def release(self, seconds: float) -> None:
-        """Keep the fork server for another group if it has no workers and is well; otherwise end
-        it, which ends its workers within `seconds`.
+        """Keep the fork server for another group if this one had started, and it has no workers and
+        is well; otherwise end it, which ends its workers within `seconds`.
         """
         server = self._server
-        is_well = self._ready and self._failure is None and not self._hosts
+        is_well = self._is_used and self._ready and self._failure is None and not self._hosts
         if server is None or not is_well or server.messages.waiting:
             self._end(seconds)
             return
@@ -312,6 +318,7 @@ class ProcessHost:
         self._link.send(FrameKind.START, payload=self._start_payload)
 
     def attach(self, order: AttachOrder) -> None:
+        self._fork_server.note_used()
         if self._link is not None:
             self._link.send(FrameKind.ATTACH, payload=pickle.dumps(order))
 
