@@ -73,6 +73,7 @@ class Training(InContext):
         self.raised = dict.fromkeys(self.by_id, 0)
         self.kept: list[tuple[Any, Any]] = []
         self.disturbed = False
+        self.raised_deaths: set[int] = set()
         rng = Random(self.program.seed)
         self.options = self._options(rng)
         self.recorded = RecordedGroup(self.group)
@@ -151,6 +152,7 @@ class Training(InContext):
     def restore_order(self, fault: EnvFault) -> None:
         """Reset the env that raised, as the error says; those of a worker that is gone are lost."""
         if isinstance(fault, WorkerDied):
+            self.check_first(fault)
             self.lose(fault)
             return
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
@@ -161,6 +163,19 @@ class Training(InContext):
             self.group.reset_async(env_ids=[fault.env_id])
         except WorkerDied as died:
             self.lose(died)
+
+    def check_first(self, fault: WorkerDied) -> None:
+        """Check that no death is raised twice while envs of other workers are left.
+
+        A start, and a block, need all envs.
+        """
+        dead = {id(env.host) for env in self.envs if env.gone}
+        own = {id(self.by_id[env_id].host) for env_id in fault.env_ids}
+        left = any(id(env.host) not in dead | own for env in self.envs)
+        needs_all = "wait_all" in self.options or not self.counts["rollouts"]
+        again = not own.isdisjoint(self.raised_deaths)
+        require(needs_all or not (again and left), "a death is raised again", repr(fault))
+        self.raised_deaths |= own
 
     async def op_learn(self, rng: Random) -> None:
         """Time passes, and the policy is another one."""

@@ -171,6 +171,8 @@ class Collector(Generic[G, R]):
         self._unstored: list[Part] = []
         self._unanswered: list[Part] = []
         self._expecting = False
+        # Envs of workers whose error was raised.
+        self._was_raised: set[str] = set()
 
     @overload
     def collect(self: Collector[SyncEnvGroup, R]) -> R: ...
@@ -231,13 +233,20 @@ class Collector(Generic[G, R]):
                     self._plan()
                 while self._unanswered:
                     yield from self._answer(self._unanswered[0])
-                    del self._unanswered[0]
-                self._expecting = True
-                self._received, _ = yield self._receive
-                self._expecting = False
+                yield from self._wait()
         finally:
             self._collecting = False
             self._clock.leave()
+
+    def _wait(self) -> Procedure[None]:
+        """Wait for the next results."""
+        self._expecting = True
+        try:
+            self._received, _ = yield self._receive
+        except WorkerDied as error:
+            self._note_raised(error)
+            raise
+        self._expecting = False
 
     def _start(self) -> Procedure[None]:
         """Reset all envs, and wait for all of them."""
@@ -457,15 +466,26 @@ class Collector(Generic[G, R]):
                 part.kind.staging.note_sent()
             raise
         except WorkerDied as error:
+            if self._block:  # It needs all envs.
+                raise
+            was_raised = self._was_raised.issuperset(error.env_ids)
+            self._note_raised(error)
             self._leave_out(part, error.env_ids)
-            raise
+            if not (was_raised and (self._unanswered or self._expecting)):
+                raise
+            return
         part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
+        del self._unanswered[0]
+
+    def _note_raised(self, error: WorkerDied) -> None:
+        """Note that an error of a worker is raised: some of its envs may have replied before."""
+        for worker in self._group.get_workers():
+            if not set(error.env_ids).isdisjoint(worker["given_up"]):
+                self._was_raised.update(worker["given_up"])
 
     def _leave_out(self, part: Part, given_up: Sequence[str]) -> None:
-        """Go on without envs whose error is about to be raised, unless a block needs them."""
-        if self._block:
-            return
+        """Go on without envs that were given up."""
         is_left_out = np.isin(part.batch.env_ids(), given_up)
         part.cut(is_left_out)
         left = part.only(~is_left_out)
