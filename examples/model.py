@@ -66,7 +66,8 @@ class Model:
         token_ids: list[int] = []
         if self._request["stream"]:
             state = ChatCompletionStreamState()
-            async for chunk in answer:
+            # A stream that is left before its end is closed late, and with complaints.
+            for chunk in [chunk async for chunk in answer]:
                 state.handle_chunk(chunk)
                 for choice in chunk.choices:
                     token_ids += getattr(choice, "token_ids", None) or []

@@ -53,7 +53,7 @@ async def run_agent(url: str, *options: str | Path) -> str:
     printed, written = await process.communicate()
     assert process.returncode == 0, written.decode()
     complaints = [line for line in written.decode().splitlines() if not line.startswith("http")]
-    assert not complaints
+    assert not complaints, written.decode()
     return printed.decode()
 
 
