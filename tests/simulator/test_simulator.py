@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,6 +21,20 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 CHUNKS, SEEDS = 20, 15
+ROOT = Path(__file__).parents[2]
+IN_ANOTHER_FOLDER = """
+import sys
+sys.path[:0] = sys.argv[1:]
+from simulator.runs import prepare
+from simulator.test_simulator import trace_of
+prepare()
+print(*map(trace_of, (2, 5, 7, 12)))
+"""
+
+
+def trace_of(seed: int) -> str:
+    """A hash of what happens in the world of a program."""
+    return hashlib.sha256("\n".join(run(draw(seed)).trace).encode()).hexdigest()
 
 
 @pytest.fixture(autouse=True)
@@ -37,6 +56,18 @@ def test_programs_do_what_the_model_says(chunk: int) -> None:
         program = draw(seed)
         found = run_twice(program) if seed % 5 == 0 else run(program)
         assert not found.error, shown(shrunk(found, run_twice))
+
+
+def test_the_same_happens_in_another_folder(tmp_path: Path) -> None:
+    """Envs raise errors, whose tracebacks name files; another process has another pid."""
+    folder = tmp_path / "a folder of another length"
+    for path in ("src/rlightning_aio", "tests/simulator"):
+        shutil.copytree(ROOT / path, folder / path, ignore=shutil.ignore_patterns("__pycache__"))
+    code, paths = IN_ANOTHER_FOLDER, (str(folder / "src"), str(folder / "tests"))
+    there = subprocess.run(
+        [sys.executable, "-c", code, *paths], stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert there.stdout.split() == [trace_of(seed) for seed in (2, 5, 7, 12)]
 
 
 def test_a_defect_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,11 +34,13 @@ import socket
 import subprocess
 import sys
 import time
+import traceback
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from random import Random
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from simulator import rays
@@ -49,10 +51,11 @@ from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
 from rlightning_aio import sharing
 from rlightning_aio._core.group.engine import first_observations
+from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
-from rlightning_aio.protocol import exchange, kernel, rings
+from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -99,6 +102,12 @@ class Faults:
 
 
 CALM: Final = Faults()
+
+_TRACEBACKS: Final = SimpleNamespace(
+    format_exception=lambda error: ["Traceback: …\n", *traceback.format_exception_only(error)],
+    format_tb=lambda _: ["Traceback: …\n"],
+)
+"""Does what `error_text` uses of `traceback`, without the names of files and their lines."""
 
 
 class World:
@@ -213,6 +222,9 @@ class World:
                 rays.SimulatedRay(self),
             ),
             (secrets, "randbits", self.rng.getrandbits),
+            # The sizes of messages decide where they are cut, so none depends on the machine.
+            (error_text, "traceback", _TRACEBACKS),
+            (start_orders, "StartOrder", partial(start_orders.StartOrder, trainer_pid=1)),
             *self.network.replacements(),
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),
             *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
