@@ -99,7 +99,6 @@ def main() -> None:
         for turn in range(BEFORE + FRAMES):
             actions = [spaces[env_id].sample() for env_id in batch.ids()]
             group.step_async(batch.respond(action=actions))
-            # The second value says which episodes the step limit ended; nothing here asks.
             batch, _ = group.collect_async(min_results=3)
             for env_id in batch.ids():
                 tiles[env_id] = tile(group[env_id].render())

@@ -49,7 +49,6 @@ async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, An
     async with asyncio.TaskGroup() as tasks:
         while True:
             try:
-                # The second value says of each result whether the step limit cut its episode.
                 batch, _ = await group.collect_async()
             except rl.NothingPending:  # All environments that are left wait for the model.
                 if not thinking:

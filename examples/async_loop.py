@@ -13,7 +13,6 @@ async def main() -> None:
         with group.auto_reset():
             group.step_async(batch.respond(action=rng.integers(2, size=len(batch))))
             while transitions < 20_000:
-                # The second value says of each result whether the step limit cut its episode.
                 batch, _ = await group.collect_async(min_results=32, max_results=32)
                 transitions += np.count_nonzero(~batch.is_reset)
                 group.step_async(batch.respond(action=rng.integers(2, size=len(batch))))

@@ -211,7 +211,6 @@ async def train(args: Args) -> Run:
             saved_at = run.steps
             group.step_async(batch.respond(action=act(batch.observation)))
             while run.goes_on():
-                # The second value says of each result whether the step limit cut its episode.
                 batch, _ = await group.collect_async(min_results=args.min_results)
                 group.step_async(batch.respond(action=act(batch.observation)))
                 steps = ~batch.is_reset

@@ -395,6 +395,8 @@ def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
     resets = bits((n, *sub_envs))
     all_flags[..., IS_RESET] = resets[:, None] if agents else resets
     limits = draw(st.none() | st.just(bits((n,))))
+    if limits is not None:
+        all_flags[limits, ..., TRUNCATED] = True
     restarted = draw(st.none() | st.just(bits((n,))))
     part_of = draw(st.lists(st.integers(0, 2), min_size=n, max_size=n))
     parts: list[ResultColumns] = []
@@ -425,11 +427,7 @@ def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
             "limit_reached": spread((no if limits is None else limits)[k]),
             "restarted": spread((no if restarted is None else restarted)[k]),
             "index": (slots[k] * count + np.arange(count)).reshape(sub_envs).tolist(),
-            "done": (
-                all_flags[k, ..., TERMINATED]
-                | all_flags[k, ..., TRUNCATED]
-                | (no if limits is None else limits)[k]
-            ).tolist(),
+            "done": (all_flags[k, ..., TERMINATED] | all_flags[k, ..., TRUNCATED]).tolist(),
             "place": k,
         }
         for k in range(n)
@@ -506,19 +504,18 @@ def test_plain_values_have_no_columns_of_a_group(name: str) -> None:
 
 
 def test_an_episode_cut_by_the_step_limit_is_done() -> None:
-    """It has its sums, and the flags of the env are unchanged."""
+    """It has its sums."""
     batch = results(
         columns(
             [0, 1, 2],
             np.zeros((3, 1)),
-            flags=flags((3,), truncated=[True, False, False]),
+            flags=flags((3,), truncated=[True, True, False]),
             limit_reached=np.array([False, True, False]),
             episode_return=np.array([1.0, 2.0, 3.0]),
             episode_length=np.array([4, 5, 6]),
         )
     )
     assert batch.done.tolist() == [True, True, False]
-    assert batch.truncated.tolist() == [True, False, False]
     assert batch.info("episode", None) == [{"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
 
 
@@ -532,7 +529,7 @@ def test_results_passed_as_objects_can_be_done() -> None:
         columns(
             [0, 1],
             None,
-            flags=flags((2,), terminated=[True, False]),
+            flags=flags((2,), terminated=[True, False], truncated=[False, True]),
             limit_reached=np.array([False, True]),
             out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
             whole_results=True,
@@ -1162,14 +1159,13 @@ def test_the_step_limit_cuts_results_of_tensors() -> None:
             [0, 1],
             None,
             reward=np.zeros((2, 3)),
-            flags=flags((2, 3)),
+            flags=flags((2, 3), truncated=[[False] * 3, [True] * 3]),
             limit_reached=np.array([False, True]),
             out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
             whole_results=True,
         )
     )
-    assert batch.truncated.tolist() == [[False] * 3] * 2
-    assert batch.done.tolist() == [[False] * 3, [True] * 3]
+    assert batch.truncated.tolist() == batch.done.tolist() == [[False] * 3, [True] * 3]
 
 
 def test_tensors_that_do_not_stack_can_be_attached_to_responses() -> None:

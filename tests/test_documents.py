@@ -279,16 +279,3 @@ def test_every_make_target_is_described() -> None:
     assert {
         target for target in make_targets() - {"help"} if f"`make {target}`" not in text
     } == set()
-
-
-def test_each_page_explains_the_second_value_of_collect_async_where_it_first_ignores_it() -> None:
-    """So does each example."""
-    pages = [*PAGES, *(ROOT / "examples").glob("*.py"), *(ROOT / "examples").glob("*.ipynb")]
-    texts = {
-        named(page): found[0]
-        for page in pages
-        if (found := re.split(r"_ = .*collect_async\(", page.read_text(), maxsplit=1))[1:]
-    }
-    assert len(texts) > 8
-    unexplained = [page for page, text in texts.items() if "second" not in text]
-    assert unexplained == []

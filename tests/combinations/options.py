@@ -194,7 +194,7 @@ class Books:
             np.reshape(column, (-1, *np.shape(column)[len(shape) :]))
             for column in (batch.observation, batch.reward, batch.terminated, batch.truncated)
         ]
-        resets, limits = batch.is_reset.reshape(-1), batch.limit_reached.reshape(-1)
+        resets = batch.is_reset.reshape(-1)
         actions = None if resets.all() else np.reshape(batch.sent.action, (resets.size, -1))
         infos = batch.info()
         for row, index in enumerate(batch.index.reshape(-1).tolist()):
@@ -203,8 +203,10 @@ class Books:
             ended = bool(terminated or truncated)
             if ended and self._use.kind.mode == "same_step":
                 env, sub_env = divmod(row, max(self._use.kind.width, 1))
-                final = infos[env]["final_obs"]
-                after = final[sub_env] if self._use.kind.width > 1 else final
+                final = infos[env].get("final_obs")  # Not where the limit alone has cut it.
+                if final is not None and self._use.kind.width > 1:
+                    final = final[sub_env]
+                after = observation if final is None else final
             if resets[row]:
                 self._waits.discard(index)
                 self._first[index] = True
@@ -216,7 +218,7 @@ class Books:
                         as_tuple(actions[row]),
                         float(reward),
                         bool(terminated),
-                        bool(truncated or limits[row]),
+                        bool(truncated),
                         as_tuple(after),
                         self._first[index],
                     )

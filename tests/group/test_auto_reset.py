@@ -42,7 +42,8 @@ async def test_a_limit_of_three_has_a_period_of_four_calls(start: Any) -> None:
                 assert batch.observation[:, 1].tolist() == [period + 1 + (call == 4)] * 3
                 assert steps_of(batch) == [call % 4] * 3
                 assert batch.reward.tolist() == [float(call != 4)] * 3
-                assert not (batch.terminated | batch.truncated).any()
+                assert batch.truncated.tolist() == batch.limit_reached.tolist() == [flag] * 3
+                assert not batch.terminated.any()
                 # A reset in place of a step has no seed.
                 assert (batch.observation[:, 3] == -1).all() == (period > 0 or call == 4)
 

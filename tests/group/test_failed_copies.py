@@ -88,7 +88,7 @@ def finish_all(group: FakeGroup) -> None:
 def hard_to_collect() -> FakeGroup:
     """Make results wait that have infos out of band, an end, a limit, and a worker's death."""
     group = FakeGroup([2, 2])
-    group.core.continuity.begin(2, on_done=True, mark_truncated=True)
+    group.core.continuity.begin(2, on_done=True)
     for deeds in ((PLAIN, PLAIN, PLAIN, PLAIN), (SENDS_INFO, TERMINATES, SENDS_INFO, PLAIN)):
         if deeds[0] == SENDS_INFO:
             group.hosts[1].die()

@@ -223,17 +223,17 @@ class Twins(RuleBasedStateMachine):
     def pass_time(self, seconds: float) -> None:
         self.both(lambda group, _: group.pass_time(seconds))
 
-    @rule(limit=st.sampled_from((None, 1, 3)), marks=st.booleans(), on_done=st.booleans())
-    def auto_reset(self, limit: int | None, marks: bool, on_done: bool) -> None:
+    @rule(limit=st.sampled_from((None, 1, 3)), on_done=st.booleans())
+    def auto_reset(self, limit: int | None, on_done: bool) -> None:
         for group in self.groups:
             continuity = group.core.continuity
             if self.in_context:
                 continuity.end()
             elif limit is None or limit == group.config.max_episode_steps:
-                continuity.begin(None, on_done=on_done, mark_truncated=marks)
+                continuity.begin(None, on_done=on_done)
             else:
                 with pytest.warns(UserWarning, match="overrides"):
-                    continuity.begin(limit, on_done=on_done, mark_truncated=marks)
+                    continuity.begin(limit, on_done=on_done)
         self.in_context = not self.in_context
 
     @rule()

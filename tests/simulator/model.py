@@ -205,7 +205,7 @@ class State:
             return self.scripts.faults_of_reset(request.options)
         return self.scripts.faults_of_step(request.acts)
 
-    def play(self, request: Request, limit: float, *, marks: bool) -> Expected:
+    def play(self, request: Request, limit: float = math.inf) -> Expected:
         """Do what was asked, under the limit of the `auto_reset` context that is open."""
         subs, mode = self.scripts.subs, self.scripts.mode
         many = range(len(subs))
@@ -237,7 +237,7 @@ class State:
             self.count += 1
         cut = self.count >= limit
         self.cut |= cut
-        truncated = [t or (cut and marks) for t in outcome.truncated]
+        truncated = [t or cut for t in outcome.truncated]
         episodes = [
             (self.returns[k], self.lengths[k]) if (ends[k] or cut) and self.lengths[k] else None
             for k in many
@@ -368,7 +368,6 @@ class Context:
 
     limit: float | None
     on_done: bool
-    marks: bool
 
     def limit_of(self, env: Env) -> float:
         if self.limit is not None:
@@ -454,7 +453,7 @@ class Model:
         env.loose = list(before)
         for request, state in itertools.product(done, before):
             env.loose.append(state.copy())
-            env.loose[-1].play(request, math.inf, marks=False)
+            env.loose[-1].play(request)
         if env.request is not None:
             env.kept.append(env.request)
         env.request, env.limbo, env.dirty, env.deadly = None, False, True, True
@@ -493,9 +492,9 @@ class Model:
             return
         is_reset = request.kind == "reset"
         states = env.possible() if is_reset else [env.state, *env.loose]
-        limit, marks = self._limit_of(env)
+        limit = self._limit_of(env)
         now = [state.copy() for state in states]
-        played = [state.play(request, limit, marks=marks) for state in now]
+        played = [state.play(request, limit) for state in now]
         found = [k for k, expected in enumerate(played) if expected.outcome.words == row.words]
         require(found, f"another state than {self._played(env, request)}")
         endless = {*RAISING, *DYING, "hang", "rubbish"}
@@ -510,12 +509,11 @@ class Model:
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         self._save(env, request)
 
-    def _limit_of(self, env: Env) -> tuple[float, bool]:
-        context = self.context
-        return (math.inf, False) if context is None else (context.limit_of(env), context.marks)
+    def _limit_of(self, env: Env) -> float:
+        return math.inf if self.context is None else self.context.limit_of(env)
 
     def _played(self, env: Env, request: Request) -> list[Words]:
-        return env.state.copy().play(request, math.inf, marks=False).outcome.words
+        return env.state.copy().play(request).outcome.words
 
     def _save(self, env: Env, request: Request) -> None:
         """Note a state that the worker has saved."""
@@ -551,7 +549,7 @@ class Model:
             state
             for one in again
             for state in env.after_loss()
-            if state.play(one, math.inf, marks=False).outcome.words == row.words
+            if state.play(one).outcome.words == row.words
         ]
         require(found, "marked, in no state that it may have")
         state = found[0]
@@ -630,7 +628,7 @@ class Model:
             self.counts["Ctrl-C in an env"] += 1
             after = [state.copy() for state in (env.state, *env.loose)]
             for state in after:  # It may have been done with it.
-                state.play(request, math.inf, marks=False)
+                state.play(request)
             env.loose += after
             env.dirty = True
             return
@@ -773,8 +771,7 @@ def _rows_of(part: BatchedData, envs: dict[str, Env]) -> list[Row]:
             part.restarted, part.index,
         )
     ]  # fmt: skip
-    done = part.terminated | part.truncated | part.limit_reached
-    require((part.done == done).all(), "done is not what it is made of")
+    require((part.done == part.terminated | part.truncated).all(), "done is not what it is made of")
     observation, infos = part.observation, part.info()
     sent = {name: part.sent[name] for name in part.sent}
     rows: list[Row] = []

@@ -559,8 +559,8 @@ class Play(Session):
         entries = [env.entry for env in self.model.envs.values()]
         lacks = any(e.limit is None and e.mode == "disabled" for e in entries)
         limit = rng.choice([math.inf, math.inf, 1, 2, 3, 5, *[None] * (1 if lacks else 6)])
-        on_done, marks = rng.random() < 0.7, rng.random() < 0.3
-        context = self.group.auto_reset(limit, on_done, marks)
+        on_done = rng.random() < 0.7
+        context = self.group.auto_reset(limit, on_done)
         if self.context is not None:
             with self.expected(RuntimeError, "a nested auto_reset"):
                 context.__enter__()
@@ -570,7 +570,7 @@ class Play(Session):
                 context.__enter__()
             return
         context.__enter__()
-        self.context, self.model.context = context, Context(limit, on_done, marks)
+        self.context, self.model.context = context, Context(limit, on_done)
 
     async def op_leave(self, rng: Random) -> None:
         if self.context is not None and not self.nested:

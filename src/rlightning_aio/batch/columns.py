@@ -96,9 +96,8 @@ class ResultColumns(msgspec.Struct):
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """``[n, *head]``, terminated, truncated or cut by the step limit."""
-        ended = self.terminated | self.truncated
-        return ended if self.limit_reached is None else ended | self._spread(self.limit_reached)
+        """``[n, *head]``, terminated or truncated."""
+        return self.terminated | self.truncated
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:
@@ -126,9 +125,6 @@ class ResultColumns(msgspec.Struct):
         spread = np.empty(shape, column.dtype)
         spread[...] = column.reshape(len(self), *[1] * (len(shape) - 1))
         return spread
-
-    def _spread(self, column: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        return column.reshape(len(self), *[1] * (self.reward.ndim - 1))
 
     @property
     def index(self) -> NDArray[np.int64]:
@@ -209,8 +205,6 @@ class ResultColumns(msgspec.Struct):
             return {}  # The env has lost the episode, or continues it.
         flags = self.flags[row]
         ended = flags[..., TERMINATED] | flags[..., TRUNCATED]
-        if self.limit_reached is not None and self.limit_reached[row]:
-            ended = np.ones_like(ended)
         lengths = self.episode_length[row] * ended
         if not lengths.any():
             return {}
@@ -251,7 +245,6 @@ class ResultColumns(msgspec.Struct):
         if self.episode(row):
             changed["info"] = self.info_of(row)
         if self.limit_reached is not None and self.limit_reached[row]:
-            # `auto_reset` may have marked the cut.
             changed["last_truncated"] = _like(ret.last_truncated, self.head_of(self.truncated, row))
         return ret.model_copy(update=changed) if changed else ret
 

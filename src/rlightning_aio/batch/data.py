@@ -200,7 +200,7 @@ class BatchedData:
     def truncated(self) -> Any:
         """Truncations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent.
 
-        Set by the env, by the step limit if `auto_reset` marks that, and where `restarted` is True.
+        Set by the env, by the step limit of `auto_reset`, and where `restarted` is True.
         """
         return _head(self, "truncated", "last_truncated")
 
@@ -208,7 +208,7 @@ class BatchedData:
 
     @property
     def done(self) -> Any:
-        """Terminated, truncated, or cut by the step limit of `auto_reset`.
+        """Terminated or truncated: the episode is over.
 
         ``[n]`` bool, ``[n, num_envs]`` with sub-environments, or a dict of such by agent.
         """
@@ -216,9 +216,7 @@ class BatchedData:
             return self._parts[0].stacked_head("done")
         if not len(self):
             return self.limit_reached
-        limit_reached = self.limit_reached
-        ended = paired(np.bitwise_or, self.terminated, self.truncated)
-        return mapped(lambda leaf: leaf | limit_reached, ended)
+        return paired(np.bitwise_or, self.terminated, self.truncated)
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:

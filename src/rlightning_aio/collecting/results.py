@@ -29,8 +29,7 @@ class ResultRows:
         head: the shape of the batch: ``(n,)``, or ``(m, num_envs)``.
         index: ``[n]``, index of each env in the group; see `BatchedData.index`.
         observation: tree of ``[n, *obs]``.
-        outcome: reward, terminated and truncated by name: ``[n]``, or dicts of such by agent;
-            ``truncated`` includes truncation by the group's step limit.
+        outcome: reward, terminated and truncated by name: ``[n]``, or dicts of such by agent.
         done: ``[n]``, True if the episode is over for all of its agents.
         is_reset: ``[n]``.
         batch: the batch itself.
@@ -168,9 +167,6 @@ def result_rows(batch: BatchedData) -> ResultRows:
     done = terminated = truncated = source.done
     if isinstance(done, dict) or len(done.nonzero()[0]):  # Otherwise all flags are False.
         terminated, truncated = source.terminated, source.truncated
-        limit = batch.limit_reached
-        if len(limit.nonzero()[0]):
-            truncated = mapped(lambda leaf: leaf | limit, truncated)
     columns = {"reward": source.reward, "terminated": terminated, "truncated": truncated}
     outcome = rows_of({"observation": source.observation, **columns}, head)
     observation = outcome.pop("observation")

@@ -65,18 +65,13 @@ class AutoResetContext(Scope):
     It can be entered again after an exit.
     """
 
-    def __init__(
-        self, core: Core, max_episode_steps: float | None, on_done: bool, mark_truncated: bool
-    ) -> None:
+    def __init__(self, core: Core, max_episode_steps: float | None, on_done: bool) -> None:
         self._core = core
         self._limit = max_episode_steps
         self._on_done = on_done
-        self._mark_truncated = mark_truncated
 
     def _enter(self) -> None:
-        self._core.continuity.begin(
-            self._limit, on_done=self._on_done, mark_truncated=self._mark_truncated
-        )
+        self._core.continuity.begin(self._limit, on_done=self._on_done)
 
     def _leave(self) -> None:
         self._core.continuity.end()
@@ -275,30 +270,27 @@ class Facade:
         return self._steps.collect(time.monotonic(), rules)
 
     def auto_reset(
-        self,
-        max_episode_steps: float | None = None,
-        on_done: bool = True,
-        mark_truncated: bool = False,
+        self, max_episode_steps: float | None = None, on_done: bool = True
     ) -> AutoResetContext:
         """Reset envs at their step limit, in place of their next step.
 
-        The step that reaches the limit sets `BatchedData.limit_reached` and the flag returned with
-        the batch. The next step of that env performs a reset instead, which returns reward 0 and
-        sets `BatchedData.is_reset`. Works with ``with`` and ``async with``.
+        The step that reaches the limit sets `BatchedData.truncated`, `BatchedData.limit_reached`
+        and the flag returned with the batch. The next step of that env performs a reset instead,
+        which returns reward 0 and sets `BatchedData.is_reset`. Works with ``with`` and
+        ``async with``.
 
         Args:
             max_episode_steps: the limit for all envs; None uses the limit of each entry, or else
                 of its simulator; `math.inf` sets no limit, for envs that end their own episodes.
             on_done: also reset envs when their episode ends; an env with sub-environments or
                 agents when the episodes of all of them have ended.
-            mark_truncated: also set `BatchedData.truncated` at the limit.
 
         Raises:
             ValueError: the limit is neither a positive int nor `math.inf`, or it is None and an
                 env has no limit.
             RuntimeError: another `auto_reset` context is open; contexts don't nest.
         """
-        return AutoResetContext(self._core, max_episode_steps, on_done, mark_truncated)
+        return AutoResetContext(self._core, max_episode_steps, on_done)
 
     @property
     def resets_by_itself(self) -> bool:

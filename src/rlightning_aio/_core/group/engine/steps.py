@@ -441,11 +441,11 @@ class Steps:
         if synchronous and self.newest.keeps:
             self.newest.note_returned(batch)
 
-    def _mark_cut(self, part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:
+    @staticmethod
+    def _mark_cut(part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:
         """Mark where the step limit cuts an episode."""
         part.limit_reached = is_cut if part.positions is None else is_cut[part.positions]
-        if self._continuity.mark_truncated:
-            part.flags[part.limit_reached, ..., TRUNCATED] = True
+        part.flags[part.limit_reached, ..., TRUNCATED] = True
 
 
 class _Limits:

@@ -175,7 +175,6 @@ class Continuity:
         due: by slot, whether the env is reset in place of its next step; all False while no
             context is open.
         auto_reset_is_open: an `auto_reset` context is open.
-        mark_truncated: mark results at the step limit as truncated.
     """
 
     def __init__(self, envs: EnvTable, conditions: Conditions | None = None) -> None:
@@ -198,13 +197,10 @@ class Continuity:
         self._pending: dict[int, _Checkpoint] = {}
         self.exceptional = False
         self.auto_reset_is_open = False
-        self.mark_truncated = False
 
     # -- the context ------------------------------------------------------------------
 
-    def begin(
-        self, max_episode_steps: float | None, *, on_done: bool, mark_truncated: bool = False
-    ) -> None:
+    def begin(self, max_episode_steps: float | None, *, on_done: bool) -> None:
         """Open the `auto_reset` context.
 
         Raises:
@@ -218,7 +214,6 @@ class Continuity:
         self._uses_own_limits = max_episode_steps is None
         self._margin = 0
         self._resets_ended = on_done
-        self.mark_truncated = mark_truncated
         self.auto_reset_is_open = True
         self._conditions.note(CUT_BEFORE, False)
         self._update_due()
@@ -258,7 +253,7 @@ class Continuity:
     def end(self) -> None:
         """Close the context: steps are plain again."""
         self._limits = None
-        self.auto_reset_is_open = self.mark_truncated = False
+        self.auto_reset_is_open = False
         self._update_due()
 
     def note_joined(self, slot: int) -> None:

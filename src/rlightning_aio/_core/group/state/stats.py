@@ -148,8 +148,6 @@ class Stats:
     ) -> None:
         flags = part.flags
         ended = flags[..., TERMINATED] | flags[..., TRUNCATED]
-        if part.limit_reached is not None:
-            ended = part.done
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
