@@ -54,8 +54,7 @@ async def evaluation(args: Args) -> Evaluation:
                 return policy.probs.argmax(-1).numpy()
             return policy.mean.numpy().clip(actions.low, actions.high)
 
-        with group.auto_reset():
-            return await evaluate(group, act, args.episodes, seed=args.seed)
+        return await evaluate(group, act, args.episodes, seed=args.seed)
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ async def train(args: Args | CartPole) -> Run:
             min_results=args.min_results,
             seed=args.seed + run.steps,
         )
-        with group.auto_reset(), run, group.trace(args.trace) if args.trace else nullcontext():
+        with run, group.trace(args.trace) if args.trace else nullcontext():
             while run.goes_on():
                 rollout = await collector.collect()
                 with run.learning(), group.span("learner"):

@@ -124,7 +124,7 @@ async def train(args: Args | CartPole) -> Run:
         )
         trace = group.trace(args.trace) if args.trace else nullcontext()
         async with LearnerProcess(learner) as apart:
-            with group.auto_reset(), run, trace:
+            with run, trace:
                 rollout = await collector.collect()
                 while run.goes_on():
                     columns = learner.columns(rollout)

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation import Episode, EpisodeSpec, Evaluation, evaluate
+from rlightning_aio.evaluation import Episode, EpisodeSpec, Evaluation, evaluate, outcomes
 from rlightning_aio.evaluation.estimates import mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
@@ -277,21 +277,44 @@ def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
         group.collect_async()
 
 
-def test_it_needs_a_context_and_its_own_envs() -> None:
-    """These are checked before anything is sent."""
-    with group_of(scripted(lambda _: True)) as group:
-        with pytest.raises(RuntimeError, match=r"evaluate inside `with group.auto_reset\(\):`"):
-            evaluate(group, nothing, 1)
-        with group.auto_reset(9):
-            with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
-                evaluate(group, nothing, 0)
-            with pytest.raises(ValueError, match="max_attempts is for a queue of episodes"):
-                evaluate(group, nothing, 1, max_attempts=2)  # type: ignore[call-overload]
-            other = Episode("other-0", 0, 0, 1.0, 1, None)
-            with pytest.raises(
-                ValueError, match=r"'other-0'.* was not played by an env of this group"
-            ):
-                evaluate(group, nothing, 1, played=[other])
+def test_it_resets_envs_at_their_ends_by_itself() -> None:
+    """At the limits of the open context, or else at their own, if they have any."""
+    for limit, lengths in ((None, {SHORT, LONG}), (5, {SHORT, 5})):
+        for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
+            with group_of(*HALF_SUCCEED, max_episode_steps=limit) as group:
+                found: Any = evaluate(group, nothing, episodes)
+                played = found.records if isinstance(episodes, list) else found.episodes
+                assert len(played) == 8
+                assert {episode.length for episode in played} == lengths
+                with group.auto_reset(limit or 3):  # None is open.
+                    found = evaluate(group, nothing, 1)
+                assert {episode.length for episode in found.episodes} == {SHORT, limit or 3}
+
+
+def test_an_episode_that_may_never_end_is_named(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Once, in both forms: evaluate would wait for it for ever."""
+    monkeypatch.setattr(outcomes, "_LONG", 5)
+    for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
+        caplog.clear()
+        with group_of(*HALF_SUCCEED) as group:
+            evaluate(group, nothing, episodes)
+        (record,) = caplog.records
+        assert record.levelname == "WARNING"
+        assert "an episode of env 'env-2' has made 5 steps" in record.getMessage()
+
+
+def test_it_needs_its_own_envs() -> None:
+    """This is checked before anything is sent."""
+    with group_of(scripted(lambda _: True)) as group, group.auto_reset(9):
+        with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
+            evaluate(group, nothing, 0)
+        with pytest.raises(ValueError, match="max_attempts is for a queue of episodes"):
+            evaluate(group, nothing, 1, max_attempts=2)  # type: ignore[call-overload]
+        other = Episode("other-0", 0, 0, 1.0, 1, None)
+        with pytest.raises(ValueError, match=r"'other-0'.* was not played by an env of this group"):
+            evaluate(group, nothing, 1, played=[other])
 
 
 # -- statistics -------------------------------------------------------------------------

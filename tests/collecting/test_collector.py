@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -35,6 +36,19 @@ def zeros(batch: BatchedData) -> dict[str, Any]:
 
 def poles(count: int, **fields: Any) -> Any:
     return sync.build_env_group({**POLE, "num_workers": count, **fields})
+
+
+class Endless(gym.Env[Any, Any]):
+    """Its episodes don't end."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(1, np.float32), 1.0, False, False, {}
 
 
 # -- kinds of envs
@@ -578,9 +592,22 @@ def test_a_policy_must_give_the_same_columns_each_time() -> None:
 # -- the collector itself
 
 
-def test_envs_must_be_reset_by_the_group() -> None:
-    with poles(1) as group, pytest.raises(RuntimeError, match=r"with group\.auto_reset"):
-        Collector(group, zeros, num_transitions=2).collect()
+def test_it_resets_envs_at_their_ends_by_itself() -> None:
+    """At their own limits, or at none; between its calls no context is open."""
+    with poles(2) as group:
+        collector = Collector(group, zeros, num_transitions=60, min_results=2, seed=0)
+        rollouts = [collector.collect() for _ in range(2)]
+        assert all(len(rollout.episodes) > 2 for rollout in rollouts)
+        with group.auto_reset(5):
+            collector.collect()  # Episodes that were longer end.
+            assert {episode.length for episode in collector.collect().episodes} == {5}
+        with group.auto_reset(math.inf):
+            pass
+    endless = {"name": "endless", "make_env": Endless, "num_workers": 2, "placement": "inline"}
+    for limit, number in ((None, 0), (4, 5)):
+        with sync.build_env_group({**endless, "max_episode_steps": limit}) as group:
+            rollout = Collector(group, zeros, num_transitions=40, min_results=2).collect()
+            assert rollout.truncated.sum() == 2 * number
 
 
 def test_a_rollouts_memory_is_valid_until_the_second_collect_after_it() -> None:

@@ -1080,7 +1080,6 @@ class Play(Session):
             require(set(worker["owed"]) <= pending | limbo, "owed", worker, pending)
         self.check_stats()
         self.group.get_stats()
-        require(self.group.resets_by_itself == (self.context is not None), "resets_by_itself")
         if self.batches and rng.random() < 0.3:
             batch = self.batches[-1]
             twin = pickle.loads(pickle.dumps(batch))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import pickle
+from contextlib import nullcontext
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -37,19 +38,30 @@ class PolicyFailed(Exception):
 
 
 class InContext(Session):
-    """A run within one `auto_reset`.
+    """A run whose envs are reset at their ends: within one `auto_reset`, or as each call does it.
 
     Attributes:
-        limit: of that; none with envs that reset themselves, which count in their own way.
+        limit: of the context; none with envs that reset themselves, which count in their own way.
+            None: the program opens none.
     """
 
     def begin(self) -> None:
         rng = Random(self.program.seed)
         alone = all(plan.mode == "disabled" for plan in self.program.plans)
-        self.limit = rng.choice([math.inf, math.inf, 3, 5]) if alone else math.inf
+        self.limit = rng.choice([None, None, math.inf, *([3, 5] if alone else [math.inf])])
         self.by_id = {env.env_id: env for env in self.envs}
-        self.context = self.group.auto_reset(self.limit)
+        self.enter()
+
+    def enter(self) -> None:
+        self.context = nullcontext() if self.limit is None else self.group.auto_reset(self.limit)
         self.context.__enter__()
+
+    def limit_of(self, env: Env) -> float:
+        """Steps after which the group truncates the episodes of an env."""
+        if self.limit is not None:
+            return self.limit
+        limit = env.entry.limit if env.entry.mode == "disabled" else None
+        return limit or math.inf
 
     async def finish(self) -> None:
         self.context.__exit__(None, None, None)
@@ -81,7 +93,7 @@ class Training(InContext):
 
     def _begin_with(self, group: Any) -> None:
         self.trails = {
-            env.first + k: Trail(code, env.entry.own_limit, self.limit)
+            env.first + k: Trail(code, env.entry.own_limit, self.limit_of(env))
             for env in self.envs
             for k, code in enumerate(env.codes)
         }
@@ -204,8 +216,7 @@ class Training(InContext):
         await self.close()
         self.build()
         await self.start()
-        self.context = self.group.auto_reset(self.limit)
-        self.context.__enter__()
+        self.enter()
         self.kept, self.plain, self.replays = [], False, True
         self._begin_with(ReplayedGroup(self.group, record))
         for op in self.program.ops:
@@ -372,7 +383,7 @@ class Evaluations(InContext):
         while True:
             reward, ended, cut, _ = script.step(*self.choose(script.words))
             total, length = total + reward, length + 1
-            if ended or cut or length >= self.limit:
+            if ended or cut or length >= self.limit_of(env):
                 return total, length
 
     async def finish(self) -> None:

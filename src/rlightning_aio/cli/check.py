@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 import rlightning_aio
+from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.cli.options import Config, Overrides
-from rlightning_aio.cli.policies.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
@@ -122,7 +123,7 @@ async def _try(config: EnvConfig, found: _Finding) -> None:
         batch, _ = await group.reset(seed=0)
         if _has_no_samples(meta.action_space):
             return
-        with resetting(group, one):
+        with ensure_auto_reset(group):
             for _ in range(_STEPS):
                 await respond_to_all(group, respond, batch)
                 batch, _ = await group.collect_async()

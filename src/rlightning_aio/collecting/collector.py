@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio._core.group.engine.newest import newest_of
 from rlightning_aio.collecting.clock import Clock
@@ -55,19 +56,18 @@ class Collector(Generic[G, R]):
     policy at that time. Resets, transitions that were lost with a worker, and steps of a
     sub-environment that waits for others to end are in no rollout.
 
-    Use the collector inside ``with group.auto_reset():``. Between two calls, envs may be reset,
-    restored and called by others: their chains end, and new ones begin with what `EnvGroup.reset`
-    or `EnvGroup.restore` returned last. Envs that others have stepped begin a new episode, and so
-    do envs that raised an error and were not reset. A robot's or a client's env does that only if
-    you reset it.
+    Envs whose episode is over are reset, at the limits of the `auto_reset` context that is open, or
+    else at their own, if they have any. Between two calls, envs may be reset, restored and called
+    by others: their chains end, and new ones begin with what `EnvGroup.reset` or `EnvGroup.restore`
+    returned last. Envs that others have stepped begin a new episode, and so do envs that raised an
+    error and were not reset. A robot's or a client's env does that only if you reset it.
 
         async with rl.build_env_group(config) as group:
-            with group.auto_reset():
-                collector = Collector(group, policy, num_transitions=2048, min_results=4, seed=0)
-                for _ in range(updates):
-                    rollout = await collector.collect()
-                    learn(rollout)
-                    collector.policy_version += 1
+            collector = Collector(group, policy, num_transitions=2048, min_results=4, seed=0)
+            for _ in range(updates):
+                rollout = await collector.collect()
+                learn(rollout)
+                collector.policy_version += 1
 
     With a group of `rlightning_aio.sync`, call ``collector.collect()`` without ``await``.
 
@@ -187,7 +187,7 @@ class Collector(Generic[G, R]):
         lose nothing: the next call continues.
 
         Raises:
-            RuntimeError: the group has no open `auto_reset` context, or a call is in progress.
+            RuntimeError: a call is in progress.
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
                 for each entry; or these envs can't fill a block.
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
@@ -208,35 +208,34 @@ class Collector(Generic[G, R]):
             raise RuntimeError(
                 "this collector is already collecting; only one collect can run at a time"
             )
-        if not self._group.resets_by_itself:
-            raise RuntimeError(
-                "envs whose episode is over must be reset: collect inside "
-                "`with group.auto_reset():`"
-            )
         self._collecting = True
         try:
             self._clock.enter()
-            if not self._started:
-                yield from self._start()
-            is_resumed = False
-            while True:
-                if self._received is not None:
-                    self._split_received(self._received)
-                    self._received = None
-                if not self._store():
-                    yield BREAK  # After this, it would wait for the learner's next collect.
-                    return self._full()
-                if not is_resumed:
-                    self._resume()
-                    is_resumed = True
-                if self._block and not (self._unanswered or self._expecting):
-                    self._plan()
-                while self._unanswered:
-                    yield from self._answer(self._unanswered[0])
-                yield from self._wait()
+            with ensure_auto_reset(self._group):
+                return (yield from self._until_full())
         finally:
             self._collecting = False
             self._clock.leave()
+
+    def _until_full(self) -> Procedure[R]:
+        if not self._started:
+            yield from self._start()
+        is_resumed = False
+        while True:
+            if self._received is not None:
+                self._split_received(self._received)
+                self._received = None
+            if not self._store():
+                yield BREAK  # After this, it would wait for the learner's next collect.
+                return self._full()
+            if not is_resumed:
+                self._resume()
+                is_resumed = True
+            if self._block and not (self._unanswered or self._expecting):
+                self._plan()
+            while self._unanswered:
+                yield from self._answer(self._unanswered[0])
+            yield from self._wait()
 
     def _wait(self) -> Procedure[None]:
         """Wait for the next results."""

@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, Final, SupportsIndex, TypeVar, overload
 import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_numbers
 from rlightning_aio.evaluation.outcomes import (
+    EndlessEpisodes,
     is_blamed,
     responses,
     success_of,
@@ -115,7 +117,8 @@ def evaluate(
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
 
-    Use it inside ``with group.auto_reset():``, whose step limits apply.
+    Episodes end by themselves, or at the limits of the `auto_reset` context that is open, or else
+    at the envs' own limits, if they have any.
 
     Args:
         group: with nothing `pending` and without env_servers.
@@ -138,7 +141,6 @@ def evaluate(
     whose worker is not replaced leaves the others to play.
 
     Raises:
-        RuntimeError: the group has no open `auto_reset` context.
         EnvBusy: an env has a request in flight, or a result that was not collected.
         ValueError: a number is below 1, an option is meant for the other kind of `episodes`, the
             group has an env_server, or `played` has duplicates or episodes of other envs. Of a
@@ -159,7 +161,12 @@ def evaluate(
         _refuse("a number of episodes", seed=seed, played=played)
         rules = QueueRules(min_results, max_attempts or 3, results, video, on_episode)
         play = QueuePlay(group, policy, episodes, rules)
-    return run(play.to_the_end(), group)
+    return run(_resetting(play, group), group)
+
+
+def _resetting(play: _Play | QueuePlay, group: Any) -> Procedure[Any]:
+    with ensure_auto_reset(group):
+        return (yield from play.to_the_end())
 
 
 def _refuse(form: str, **options: Any) -> None:
@@ -176,10 +183,6 @@ def _check(group: Any, episodes: Any, min_results: int | None, max_attempts: int
     for name, number in numbers.items():
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, not {number!r}")
-    if not group.resets_by_itself:
-        raise RuntimeError(
-            "envs whose episode is over must be reset: evaluate inside `with group.auto_reset():`"
-        )
     for meta in group.metas:
         if meta.action_space is None:
             raise ValueError(
@@ -222,6 +225,7 @@ class _Play:
         # The number of the episodes that a reset begins, until its result has come.
         self._begins: dict[str, int] = {}
         self._losses = Counter[str]()
+        self._endless = EndlessEpisodes()
         # Results of different shapes don't stack.
         self._separate = len({(meta.num_envs, meta.agents) for meta in metas}) > 1
         self._found = Evaluation()
@@ -320,6 +324,7 @@ class _Play:
         with np.errstate(over="ignore", invalid="ignore"):  # The return shows it.
             self._reward[places] += rewards
         self._length[places] += stepped
+        self._endless.look(self._length[places].reshape(shape), batch.env_ids())
         ended = stepped & done
         if ended.any():
             self._note_ends(batch, ended.reshape(shape))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
@@ -10,9 +11,15 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-__all__ = ["is_blamed", "responses", "success_of", "summed_rewards"]
+__all__ = ["EndlessEpisodes", "is_blamed", "responses", "success_of", "summed_rewards"]
+
+_log = logging.getLogger("rlightning_aio")
+
+_LONG: Final = 100_000
 
 _SUCCESS_KEYS: Final = ("success", "is_success")
 """In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
@@ -38,6 +45,25 @@ def responses(batch: BatchedData, answer: Any) -> list[BatchedData]:
 
 def _are_batches(answer: list[Any]) -> bool:
     return bool(answer) and all(isinstance(one, BatchedData) for one in answer)
+
+
+class EndlessEpisodes:
+    """Warns once, in the log, of an episode that may never end."""
+
+    _seen = False
+
+    def look(self, lengths: NDArray[np.int64], env_ids: Sequence[str]) -> None:
+        """Look at the lengths of the episodes of a batch: ``[n]`` or ``[n, num_envs]``."""
+        if self._seen or not (lengths == _LONG).any():
+            return
+        self._seen = True
+        row = int(np.argwhere(lengths == _LONG)[0, 0])
+        _log.warning(
+            "an episode of env %r has made %d steps: if it never ends, neither does evaluate; "
+            "max_episode_steps of its entry, or `with group.auto_reset(…):`, limits it",
+            env_ids[row],
+            _LONG,
+        )
 
 
 def summed_rewards(reward: Any) -> NDArray[np.float64]:

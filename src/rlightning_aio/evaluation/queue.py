@@ -17,6 +17,7 @@ from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import (
+    EndlessEpisodes,
     is_blamed,
     responses,
     success_of,
@@ -81,6 +82,7 @@ class QueuePlay:
         self._places = {meta.env_id: place for place, meta in enumerate(metas)}
         self._reward = np.zeros(len(metas))
         self._length = np.zeros(len(metas), np.int64)
+        self._endless = EndlessEpisodes()
         self._found = QueueEvaluation()
         self._task_of = {meta.env_id: meta.task for meta in metas}
         """The task that each env has, or has begun to switch to."""
@@ -261,6 +263,7 @@ class QueuePlay:
         with np.errstate(over="ignore", invalid="ignore"):  # The return shows it.
             self._reward[places] += rewards
         self._length[places] += stepped
+        self._endless.look(self._length[places], env_ids)
         restarted = batch.restarted
         ended = stepped & all_agents(batch.done) & ~restarted
         rows: list[int] = np.flatnonzero(ended | restarted).tolist()

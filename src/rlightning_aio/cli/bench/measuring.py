@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 import rlightning_aio
+from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.cli.policies.collecting import (
     Roster,
-    resetting,
     respond_to_all,
     responder,
     traced,
@@ -231,7 +231,7 @@ class Stand:
     """An open group to be measured; all its envs are idle between measurements.
 
     Args:
-        group: an initialised group inside `resetting`.
+        group: an initialised group that resets its envs at their ends.
         everyone: a batch of all its envs, to which every action responds.
         costs: the group's costs.
         policy: the source of actions; None draws random ones from the seed.
@@ -350,7 +350,7 @@ async def opened_group(
         grown = max(0, memory_bytes([os.getpid()]) - before)
         workers = memory_bytes(_processes(group)[1:])
         costs = Costs(started - began, reset - started, workers or grown)
-        with resetting(group, setting.configs):
+        with ensure_auto_reset(group):
             yield Stand(group, setting, roster, everyone, costs, policy, seed)
 
 

@@ -297,7 +297,7 @@ def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:
 async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
     # The random actions of the saved episodes must not be drawn again.
     seed = None if order.seed is None else order.seed + len(order.played)
-    async with playing(group, order.configs, order.policy, seed, order.trace, watch.draw) as policy:
+    async with playing(group, order.policy, seed, order.trace, watch.draw) as policy:
         watch.ready(sum(meta.num_envs for meta in group.metas) * order.episodes)
         watch.found = await evaluate(
             group,

@@ -119,7 +119,7 @@ class _Play:
 
 async def _evaluate(play: _Play, order: QueueOrder) -> None:
     group, watch = play.group, play.watch
-    async with playing(group, play.configs, order.policy, None, order.trace, watch.draw) as policy:
+    async with playing(group, order.policy, None, order.trace, watch.draw) as policy:
         watch.ready()
         try:
             evaluated = evaluate(

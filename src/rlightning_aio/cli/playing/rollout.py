@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 import typer
 
 import rlightning_aio
+from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.cli.bench.plots import check_plot, draw_rollout
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
@@ -29,7 +30,6 @@ from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.cli.policies.collecting import (
     Roster,
     default_min_results,
-    resetting,
     respond_to_all,
     responder,
     traced,
@@ -190,7 +190,7 @@ async def _collect(
         sub_envs = max(config.num_envs for config in configs)
         display.ready()
         statistics.begin(roster)
-        with resetting(group, configs):
+        with ensure_auto_reset(group):
             await respond_to_all(group, respond, batch)
             while (left := order.left(statistics)) is not None:
                 most, seconds = -(-left[0] // sub_envs), left[1]

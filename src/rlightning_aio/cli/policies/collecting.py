@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import time
-import warnings
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.api.aio import ServerHandle
@@ -16,7 +14,7 @@ from rlightning_aio.cli.policies.sb3_policies import SB3Policy
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Generator, Sequence
+    from collections.abc import AsyncGenerator, Callable, Sequence
     from pathlib import Path
 
     import gymnasium as gym
@@ -29,7 +27,6 @@ __all__ = [
     "Roster",
     "default_min_results",
     "playing",
-    "resetting",
     "respond_to_all",
     "responder",
     "traced",
@@ -108,25 +105,9 @@ async def traced(group: EnvGroup, path: Path | None) -> AsyncGenerator[None]:
             trace.stop()
 
 
-@contextlib.contextmanager
-def resetting(group: EnvGroup, configs: Sequence[EnvConfig]) -> Generator[None]:
-    """Reset finished episodes, at the configured step limits or at the simulators' own.
-
-    `auto_reset` needs a limit for every entry. If one has none, episodes of all entries end where
-    their simulators end them; the simulators apply the configured limits, too.
-    """
-    limit = None if all(config.max_episode_steps for config in configs) else math.inf
-    with contextlib.ExitStack() as stack:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="auto_reset.*overrides")
-            stack.enter_context(group.auto_reset(limit))
-        yield
-
-
 @contextlib.asynccontextmanager
 async def playing(
     group: EnvGroup,
-    configs: Sequence[EnvConfig],
     policy: Policy | None,
     seed: int | None,
     trace: Path | None,
@@ -152,5 +133,4 @@ async def playing(
             with group.span("policy"):
                 return await respond(batch)
 
-        with resetting(group, configs):
-            yield answer
+        yield answer

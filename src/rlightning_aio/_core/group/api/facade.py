@@ -7,6 +7,7 @@ import os
 import time
 import warnings
 import weakref
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.drivers.scope import Scope
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AutoResetContext",
     "Facade",
+    "ensure_auto_reset",
     "only_result",
     "steps_of",
 ]
@@ -62,19 +64,41 @@ def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
 class AutoResetContext(Scope):
     """The context of `EnvGroup.auto_reset`: envs are reset at their limit from entry to exit.
 
-    It can be entered again after an exit.
+    It can be entered again after an exit. For the arguments see `Continuity.begin`.
     """
 
-    def __init__(self, core: Core, max_episode_steps: float | None, on_done: bool) -> None:
+    def __init__(
+        self,
+        core: Core,
+        max_episode_steps: float | None,
+        on_done: bool,
+        *,
+        needs_limits: bool = True,
+    ) -> None:
         self._core = core
         self._limit = max_episode_steps
         self._on_done = on_done
+        self._needs_limits = needs_limits
 
     def _enter(self) -> None:
-        self._core.continuity.begin(self._limit, on_done=self._on_done)
+        self._core.continuity.begin(
+            self._limit, on_done=self._on_done, needs_limits=self._needs_limits
+        )
 
     def _leave(self) -> None:
         self._core.continuity.end()
+
+
+def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
+    """The context in which an `EnvGroup`, or one that is wrapped, resets envs at their ends.
+
+    If the caller has one open, nothing is added to that. Otherwise each env's own step limit
+    applies, if it has one.
+    """
+    core: Core = group._core  # noqa: SLF001
+    if core.continuity.auto_reset_is_open:
+        return nullcontext()
+    return AutoResetContext(core, None, on_done=True, needs_limits=False)
 
 
 class Facade:
@@ -291,11 +315,6 @@ class Facade:
             RuntimeError: another `auto_reset` context is open; contexts don't nest.
         """
         return AutoResetContext(self._core, max_episode_steps, on_done)
-
-    @property
-    def resets_by_itself(self) -> bool:
-        """True while an `auto_reset` context is open."""
-        return self._core.continuity.auto_reset_is_open
 
     # -- measurements -------------------------------------------------------------
 

@@ -200,17 +200,24 @@ class Continuity:
 
     # -- the context ------------------------------------------------------------------
 
-    def begin(self, max_episode_steps: float | None, *, on_done: bool) -> None:
+    def begin(
+        self, max_episode_steps: float | None, *, on_done: bool, needs_limits: bool = True
+    ) -> None:
         """Open the `auto_reset` context.
+
+        Args:
+            max_episode_steps: see `EnvGroup.auto_reset`, as for `on_done`.
+            on_done: see there.
+            needs_limits: an env without a limit of its own is an error.
 
         Raises:
             ValueError: the limit is neither a positive int nor `math.inf`, or is None and an env
-                has none.
+                has none that needs one.
             RuntimeError: the context is open already.
         """
         if self.auto_reset_is_open:
             raise RuntimeError("auto_reset contexts don't nest; leave the open one first")
-        self._limits = self._chosen_limits(max_episode_steps)
+        self._limits = self._chosen_limits(max_episode_steps, needs_limits=needs_limits)
         self._uses_own_limits = max_episode_steps is None
         self._margin = 0
         self._resets_ended = on_done
@@ -218,12 +225,12 @@ class Continuity:
         self._conditions.note(CUT_BEFORE, False)
         self._update_due()
 
-    def _chosen_limits(self, given: float | None) -> NDArray[np.int64]:
+    def _chosen_limits(self, given: float | None, *, needs_limits: bool) -> NDArray[np.int64]:
         envs = self._envs
         if given is None:
             present = np.array([bool(env_id) for env_id in envs.env_ids])
             lacking = np.flatnonzero(present & (envs.step_limits == 0) & ~envs.resets_itself)
-            if len(lacking):
+            if needs_limits and len(lacking):
                 raise ValueError(
                     f"{envs.describe(int(lacking[0]))} has no step limit, neither a configured "
                     "max_episode_steps nor one of the simulator's own; configure one, pass "
