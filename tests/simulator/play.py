@@ -223,16 +223,23 @@ class Play(Session):
         require(limbo, "busy, and nothing was asked", *requests)
         self.withdraw(requests)
 
+    def refuse_dead(self, fault: WorkerDied, requests: dict[str, Request]) -> None:
+        """An env's worker is gone: the error names those that were asked, and nothing was sent."""
+        envs, named = self.model.envs, fault.env_ids
+        hosts = [envs[env_id].host for env_id in named[:1]]
+        own = [env_id for env_id in requests if envs[env_id].host in hosts]
+        require(named and sorted(named) == sorted(own), "a refusal of others", repr(fault))
+        for env_id in named:
+            self.model.gone(envs[env_id], fault)
+        self.withdraw(requests)
+
     def fail(self, fault: EnvFault, requests: dict[str, Request], owner: Any) -> None:
         """Take an error, and the results that it carries."""
         results = [] if fault.results is None else fault.results.env_ids()
         named = [env_id for one in (fault, *fault.others) for env_id in ids_of(one)]
         if isinstance(fault, WorkerDied) and {*results, *named} < {*requests}:
-            # An env whose worker is gone: nothing was sent.
             require(not results, "refused with results", repr(fault))
-            for env_id in named:
-                self.model.gone(self.model.envs[env_id], fault)
-            self.withdraw(requests)
+            self.refuse_dead(fault, requests)
             return
         require(sorted([*results, *named]) == sorted(requests), "an error of others", repr(fault))
         self.model.failed(fault, owner)
@@ -394,9 +401,7 @@ class Play(Session):
             call()
             self.scribble()
         except WorkerDied as fault:
-            for env_id in fault.env_ids:
-                self.model.gone(self.model.envs[env_id], fault)
-            self.withdraw(requests)
+            self.refuse_dead(fault, requests)
         except EnvBusy:
             self.refuse_busy(requests)
         except KeyboardInterrupt:
@@ -558,7 +563,7 @@ class Play(Session):
             return
         entries = [env.entry for env in self.model.envs.values()]
         lacks = any(e.limit is None and e.mode == "disabled" for e in entries)
-        limit = rng.choice([math.inf, math.inf, 1, 2, 3, 5, *[None] * (1 if lacks else 6)])
+        limit = rng.choice([math.inf, 1, 2, 3, 5, *[None] * (1 if lacks else 6)])
         on_done = rng.random() < 0.7
         context = self.group.auto_reset(limit, on_done)
         if self.context is not None:
@@ -587,17 +592,21 @@ class Play(Session):
         if not envs:
             return
         env, token = rng.choice(envs), rng.randrange(TOKENS)
-        handle = self.group[env.env_id]
         if "raise" in self.features and rng.random() < 0.3:
             await self.call_fault(env, "raise", token)
         elif "die" in self.features and env.host.mortal and self.plan(env).placement != "loop":
             await self.call_fault(env, rng.choice(["plain", *DYING]), token)
         else:
-            await self.answer(
-                {env.env_id: Request("call")},
-                lambda: handle.call("peek", token),
-                lambda value: self.take_value(env, value, token),
-            )
+            await self.peek(env, token)
+
+    async def peek(self, env: Env, token: int) -> None:
+        """Ask an env for its state."""
+        handle = self.group[env.env_id]
+        await self.answer(
+            {env.env_id: Request("call")},
+            lambda: handle.call("peek", token),
+            lambda value: self.take_value(env, value, token),
+        )
 
     async def call_fault(self, env: Env, effect: str, token: int) -> None:
         """Call a method that may not return."""
@@ -632,9 +641,7 @@ class Play(Session):
         try:
             self.group.call_async("peek", token, env_ids=[*requests])
         except WorkerDied as fault:
-            for env_id in fault.env_ids:
-                self.model.gone(self.model.envs[env_id], fault)
-            self.withdraw(requests)
+            self.refuse_dead(fault, requests)
         except EnvBusy:
             self.refuse_busy(requests)
         except KeyboardInterrupt:
@@ -815,8 +822,18 @@ class Play(Session):
             env = rng.choice(envs)
             await self.mark(env, rng.choice(self.marks(env)))
         if "die" in self.features and rng.random() < (0.6 if "resume" in self.features else 0.3):
-            self.kill_soon(rng, self.ready())
-            await (self.op_step(rng) if rng.random() < 0.5 else self.rest())
+            env = self.kill_soon(rng, self.ready())
+            await self.notice(rng, env)
+
+    async def notice(self, rng: Random, env: Env | None) -> None:
+        """Do what may let the group see that an env's worker has died."""
+        kind = rng.choice(["step", "rest", "call"])
+        if kind == "step":
+            await self.op_step(rng)
+        elif kind == "call" and env is not None and env.idle:
+            await self.peek(env, 0)
+        else:
+            await self.rest()
 
     async def op_restore(self, rng: Random) -> None:
         if not self.snapshots or rng.random() < 0.3:
@@ -832,8 +849,7 @@ class Play(Session):
             with self.expected(SnapshotError, "a snapshot of fewer envs"):
                 await self.done(self.group.restore(data))
             return
-        if "die" in self.features and rng.random() < 0.3:
-            self.kill_soon(rng, envs)
+        await self.prepare_restore(rng, envs)
         pairs = [(env, env.possible(), saved) for env, (_, saved) in zip(envs, states, strict=True)]
         for env, _, saved in pairs:
             if saved[0].scripts.subs[0].mark == DEADLY:
@@ -843,6 +859,13 @@ class Play(Session):
         for _ in range(rng.randint(0, 4)):
             if ready := [env for env in self.ready() if env in envs]:
                 await self.step_on(ready)
+
+    async def prepare_restore(self, rng: Random, envs: list[Env]) -> None:
+        """Do what matters to the envs of a snapshot, and to their limits."""
+        if "auto_reset" in self.features and self.context is None and rng.random() < 0.3:
+            await self.op_enter(rng)
+        if "die" in self.features and rng.random() < 0.3:
+            self.kill_soon(rng, envs)
 
     async def restore(
         self, data: bytes, pairs: Sequence[tuple[Env, list[State], list[State]]]

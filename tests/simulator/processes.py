@@ -41,8 +41,13 @@ class Living:
         self.pid = next(world.pids)
         self.alive = True
         self.world = world
+        self._pace = world.rng.choice((1, 1, 1, 30))
         self._is_stopped = False
         self._held: list[Callable[[], object]] = []
+
+    def delay(self) -> float:
+        """See `World.delay`; some processes are slower than others."""
+        return self.world.delay() * self._pace
 
     def later(self, seconds: float, callback: Callable[[], object]) -> list[Any]:
         """Do something later; see `World.after`."""
@@ -150,7 +155,7 @@ class Process(Living):
         if self._is_parked:
             self._is_parked = False
             self.world.cancel(self._timer)
-            self._timer = self.later(self.world.delay(), self._resume)
+            self._timer = self.later(self.delay(), self._resume)
 
     def unwind(self) -> None:
         """Leave all its functions, at the end of the world."""
@@ -176,7 +181,7 @@ class Process(Living):
             self.end(-signal.SIGKILL)
         elif chance < faults.deaths + faults.stops:
             self.stop(world.long())
-        self.sleep(world.delay())
+        self.sleep(self.delay())
 
     def end(self, code: int) -> None:
         """End it; everything that it has open is closed. If it ends itself, this doesn't return."""

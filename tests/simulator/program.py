@@ -232,7 +232,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     first = [Op("reset", rng.getrandbits(32))] if begins else []
     kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
     kinds += ["interrupts"] * ("async" not in features and "interrupts" in features)
-    chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
+    share = rng.choice((0.2, 0.5))
+    chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds if rng.random() < share}
     faults = Faults(**chances) if "faults" in features else Faults()
     return Program(seed, kind, features, tuple(plans), (*first, *ops), faults)
 

@@ -280,7 +280,13 @@ class Scripts:
     def faults_of_reset(self, options: dict[str, Any] | None) -> list[Act]:
         """What a reset does to its process, one after the other."""
         token = (options or {}).get("token", 0)
-        return [(sub.fault_of_reset(options), token) for sub in self.subs]
+        chosen = self._chosen(options)
+        return [(self.subs[k].fault_of_reset(options), token) for k in chosen]
+
+    def _chosen(self, options: dict[str, Any] | None) -> list[int]:
+        """Which a reset resets."""
+        mask = (options or {}).get("reset_mask")
+        return [k for k in range(len(self.subs)) if mask is None or mask[k]]
 
     def faults_of_step(self, acts: Sequence[Act]) -> list[Act]:
         """What a step does to its process; scripts that are reset instead ignore their action."""
@@ -291,11 +297,11 @@ class Scripts:
         ]
 
     def reset(self, seed: int | None, options: dict[str, Any] | None) -> list[dict[str, Any]]:
-        """Reset all; sub-environment k gets ``seed + k``."""
-        return [
-            sub.reset(None if seed is None else seed + k, options)
-            for k, sub in enumerate(self.subs)
-        ]
+        """Reset all, or those of a mask; sub-environment k gets ``seed + k``."""
+        infos: list[dict[str, Any]] = [{} for _ in self.subs]
+        for k in self._chosen(options):
+            infos[k] = self.subs[k].reset(None if seed is None else seed + k, options)
+        return infos
 
     def step(self, acts: Sequence[Act]) -> Outcome:
         found = Outcome([], [], [], [], [], [], [])
@@ -561,6 +567,8 @@ class Awaitable(_Single):
 
 class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
     """Several scripts as a vector env of Gymnasium, which cuts their episodes itself."""
+
+    takes_masks = True
 
     def __init__(
         self, codes: Sequence[int], mode: str, limit: int | None, layout: str, controls: str

@@ -184,11 +184,11 @@ class Session:
         """End a worker from outside."""
         self.kill_soon(rng, self.envs)
 
-    def kill_soon(self, rng: Random, envs: Sequence[Env]) -> None:
-        """End the worker of one of these envs, in a world also a little later."""
+    def kill_soon(self, rng: Random, envs: Sequence[Env]) -> Env | None:
+        """End the worker of one of these envs, in a world also a little later; return the env."""
         envs = [env for env in envs if self.is_killable(env) and not env.gone]
         if not envs:
-            return
+            return None
         env, delay = rng.choice(envs), rng.choice([0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1])
         env.host.struck = True
         pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
@@ -201,6 +201,7 @@ class Session:
             self.world.after(delay, lambda: self.is_calm or self.world.kill(pids))
         else:
             self.world.kill(pids)
+        return env
 
     # -- errors
 

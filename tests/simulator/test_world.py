@@ -104,7 +104,7 @@ async def played_async() -> list[float]:
     ]
     async with rl.build_env_group(kinds) as group:
         batch, _ = await group.reset(seed=5)
-        for k in range(9):
+        for k in range(99):  # Some of the workers are slow.
             group.step_async(batch.respond(action=np.full(len(batch), 2 * (k % 3))))
             batch, _ = await group.collect_async(min_results=2)
             seen += batch.observation.ravel().tolist()

@@ -51,6 +51,7 @@ class Trail:
         code: of the env.
         own_limit: steps after which its own wrapper truncates an episode.
         cut_after: steps after which `auto_reset` does.
+        cut_together: that cuts several envs at once, of which each may have begun later.
         cut_or_ended: an episode that terminates is never truncated, too.
 
     Attributes:
@@ -66,9 +67,10 @@ class Trail:
         own_limit: float,
         cut_after: float = math.inf,
         *,
+        cut_together: bool = False,
         cut_or_ended: bool = False,
     ) -> None:
-        self.code, self.cut_or_ended = code, cut_or_ended
+        self.code, self.cut_together, self.cut_or_ended = code, cut_together, cut_or_ended
         self.own_limit, self.cut_after = own_limit, cut_after
         self.last: Transition | None = None
         self.losses, self.seen, self.resumes = 0, 0, False
@@ -119,6 +121,8 @@ class Trail:
         script = script_at(made.before, self.own_limit)
         reward, terminated, truncated, _ = script.step(*made.act)
         truncated |= script.steps >= self.cut_after
+        if self.cut_together and self.cut_after < math.inf:
+            truncated |= made.truncated
         if self.cut_or_ended:
             truncated &= not terminated
         require(script.words == made.after, f"it would lead to {script.words}", made)

@@ -41,20 +41,21 @@ class InContext(Session):
     """A run whose envs are reset at their ends: within one `auto_reset`, or as each call does it.
 
     Attributes:
-        limit: of the context; none with envs that reset themselves, which count in their own way.
-            None: the program opens none.
+        limit: of the context. None: the program opens none.
     """
 
     def begin(self) -> None:
-        rng = Random(self.program.seed)
-        alone = all(plan.mode == "disabled" for plan in self.program.plans)
-        self.limit = rng.choice([None, None, math.inf, *([3, 5] if alone else [math.inf])])
+        self.limit = self.drawn_limit(Random(self.program.seed))
         self.by_id = {env.env_id: env for env in self.envs}
         self.enter()
 
     def enter(self) -> None:
         self.context = nullcontext() if self.limit is None else self.group.auto_reset(self.limit)
         self.context.__enter__()
+
+    def drawn_limit(self, rng: Random) -> float | None:
+        """Draw the limit."""
+        return rng.choice([None, None, math.inf, 3, 5])
 
     def limit_of(self, env: Env) -> float:
         """Steps after which the group truncates the episodes of an env."""
@@ -93,7 +94,12 @@ class Training(InContext):
 
     def _begin_with(self, group: Any) -> None:
         self.trails = {
-            env.first + k: Trail(code, env.entry.own_limit, self.limit_of(env))
+            env.first + k: Trail(
+                code,
+                env.entry.own_limit,
+                self.limit_of(env),
+                cut_together=env.entry.mode != "disabled",
+            )
             for env in self.envs
             for k, code in enumerate(env.codes)
         }
@@ -136,8 +142,8 @@ class Training(InContext):
     async def op_rollout(self, rng: Random) -> bool:
         """Collect a rollout, or be disturbed meanwhile."""
         self.rng = rng
-        cancels = self.is_async and "cancel" in self.features and rng.random() < 0.3
-        seconds = rng.choice([1e-5, 1e-3, 0.1]) if cancels and not self.plain else None
+        cancels = self.is_async and "cancel" in self.features and rng.random() < 0.4
+        seconds = 10 ** rng.uniform(-6, -1) if cancels and not self.plain else None
         try:
             if seconds is None or self.replays:
                 found = await self.done(self.collector.collect())
@@ -280,6 +286,11 @@ class Training(InContext):
 
 class Evaluations(InContext):
     """A run of a program that evaluates a policy, whose actions follow from what it sees."""
+
+    def drawn_limit(self, rng: Random) -> float | None:
+        """None is finite with envs that reset themselves, of which it cuts several at once."""
+        alone = all(plan.mode == "disabled" for plan in self.program.plans)
+        return super().drawn_limit(rng) if alone else rng.choice([None, math.inf])
 
     def choose(self, words: Words) -> Act:
         kind = mixed(words.seed, words.step, words.mix)

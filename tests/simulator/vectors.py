@@ -161,10 +161,12 @@ class Vectors(Session):
         return self.rows.step_wait()
 
     async def op_mask(self, rng: Random) -> None:
-        """Reset those that are over, where nobody else does."""
-        if not self.is_whole or self.mode != "disabled" or self.program.plans[0].form == "stacked":
+        """Reset those that are over, where nobody else does, and a few others."""
+        if not self.is_whole or self.mode != "disabled":
             return
-        mask = np.array(self.over)
+        if rng.random() < 0.4:
+            await self.op_kill(rng)
+        mask = np.array(self.over) | np.array([rng.random() < 0.3 for _ in self.over])
         if not mask.any():
             return
         self.is_whole = False
@@ -173,6 +175,12 @@ class Vectors(Session):
         except EnvFault as fault:
             self.fail(fault)
             return
+        except ResetNeeded:
+            died = [env.deaths > 0 for env in self.env_of]
+            require(any(died) and not mask[died].all(), "others were lost, and none has died")
+            self.counts["died beside a mask"] += 1
+            return
+        self.breaks += 1
         self.is_whole = True
         for k, one in enumerate(self.words(observation)):
             if mask[k]:
