@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import resource
 import statistics
 import threading
 import time
@@ -41,17 +40,13 @@ import rlightning_aio as rl
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-ENVS, PROCESSES, MANY = 1000, 100, 10_000
+    from rlightning_aio import EnvEpisode
+
+ENVS, PROCESSES, MANY, AGENTS = 1000, 100, 10_000, 2000
 ROUNDS, SECONDS = 5, 8.0
 SHARE, RATE, TRAINER = "share of the ideal rate", "env steps/s", "trainer, µs/step"
 ALL, START, MEMORY = "all processes, µs/step", "start-up, s", "KiB/env"
 COLUMNS = (SHARE, RATE, TRAINER, ALL, START, MEMORY)
-
-
-def processor_seconds() -> float:
-    """Return the processor time of this process."""
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
 
 
 @dataclass
@@ -81,13 +76,13 @@ class Way(Contender):
 
     def round(self, seconds: float) -> dict[str, float]:
         """Return the figures; `ALL` is to be multiplied by the number of busy processors."""
-        spent, began = processor_seconds(), time.perf_counter()
+        spent, began = self.spent(), time.perf_counter()
         rate, steps = self.play(seconds)
         return {
             ALL: 1e6 * (time.perf_counter() - began) / steps,
             SHARE: rate * MEAN / self.count,
             RATE: rate,
-            TRAINER: 1e6 * (processor_seconds() - spent) / steps,
+            TRAINER: 1e6 * (self.spent() - spent) / steps,
             START: self.start_seconds,
             MEMORY: self.kib,
         }
@@ -103,6 +98,10 @@ class Way(Contender):
         """
         raise NotImplementedError
 
+    def spent(self) -> float:
+        """Return the processor time of the trainer's thread."""
+        return time.thread_time()
+
     def teardown(self) -> None:
         self.runner.close()
 
@@ -111,6 +110,7 @@ class Way(Contender):
 class InGroup(Way):
     make_env: Callable[[], Any]
     placement: str
+    envs_per_process: int = 1
 
     def start(self) -> None:
         self.runner.run(self._start())
@@ -119,7 +119,7 @@ class InGroup(Way):
         entry: dict[str, Any] = {"name": "w", "make_env": self.make_env, "num_workers": self.count}
         entry |= {"placement": self.placement, "start_timeout": 600}
         if self.placement == "process":
-            entry["envs_per_process"] = 1
+            entry["envs_per_process"] = self.envs_per_process
         self.group = rl.build_env_group(entry)
         await self.group.init()
         self.batch, _ = await self.group.reset(seed=0)
@@ -143,6 +143,30 @@ class InGroup(Way):
     def teardown(self) -> None:
         self.runner.run(self.group.close())
         super().teardown()
+
+
+@dataclass
+class Episodes(InGroup):
+    """A coroutine for each env of the group, which plays one episode of it."""
+
+    async def _start(self) -> None:
+        await super()._start()
+        self.episodes = [self.group.episode(env_id) for env_id in self.group.env_ids]
+        await asyncio.gather(*(episode.__aenter__() for episode in self.episodes))
+
+    async def _play(self, seconds: float) -> tuple[float, int]:
+        until = time.perf_counter() + seconds
+
+        async def play(episode: EnvEpisode) -> int:
+            steps = 0
+            await episode.step(0)
+            while time.perf_counter() < until:
+                steps += 1
+                await episode.step(0)
+            return steps
+
+        steps = sum(await asyncio.gather(*map(play, self.episodes)))
+        return steps / seconds, steps + self.count
 
 
 @dataclass
@@ -205,20 +229,34 @@ class Threads(Way):
         steps = sum(self.pool.map(episode, self.envs))
         return steps / seconds, steps + self.count
 
+    def spent(self) -> float:
+        """Return the processor time of all threads."""
+        return time.process_time()
+
     def teardown(self) -> None:
         self.pool.shutdown()
         super().teardown()
 
 
 OURS, OURS_MANY = f"placement: loop, {ENVS:,} envs", f"placement: loop, {MANY:,} envs"
+AGENTS_HERE = f"a coroutine for each episode, placement: loop, {AGENTS:,} envs"
+AGENTS_OF_WORKERS = f"a coroutine for each episode, placement: process, {AGENTS:,} envs"
 WAYS: tuple[Contender, ...] = (
     InGroup(OURS, ENVS, Awaiting, "loop"),
     Gather(f"gather over episodes, {ENVS:,} envs", ENVS),
     Threads(f"a thread for each env, {ENVS:,} envs", ENVS),
     InGroup(f"a process for each env, {PROCESSES:,} envs", PROCESSES, Sleeping, "process"),
     InGroup(OURS_MANY, MANY, Awaiting, "loop"),
+    Episodes(AGENTS_HERE, AGENTS, Awaiting, "loop"),
+    Episodes(AGENTS_OF_WORKERS, AGENTS, Awaiting, "process", 500),
 )
-TARGETS = ((OURS, SHARE, "≥", 0.95), (OURS, TRAINER, "≤", 40), (OURS_MANY, START, "≤", 10))
+TARGETS = (
+    (OURS, SHARE, "≥", 0.95),
+    (OURS, TRAINER, "≤", 40),
+    (OURS_MANY, START, "≤", 10),
+    (AGENTS_HERE, TRAINER, "≤", 60),
+    (AGENTS_OF_WORKERS, TRAINER, "≤", 60),
+)
 
 
 def figures_of(rounds: list[tuple[dict[str, float], Load]]) -> dict[str, Any]:

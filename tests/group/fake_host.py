@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from rlightning_aio._core.group.drivers.wait import Parked
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
@@ -483,8 +484,7 @@ class FakeGroup:
                 if host.rung:
                     host.on_readable()
                     self.core.drain()
-                    for running in self.running:
-                        running.woken = True
+                    self.wake()
             woken = [r for r in self.running if r.is_due(self.now)]
             if not woken:
                 self.running = [running for running in self.running if not running.done]
@@ -514,7 +514,7 @@ class FakeGroup:
     def wake(self) -> None:
         """See `hosts.base.Watcher.wake`."""
         for running in self.running:
-            running.woken = True
+            running.woken |= not running.is_parked
 
     def host_of(self, slot: int) -> FakeHost:
         return next(h for h in self.hosts if h.first_slot <= slot < h.first_slot + h.num_envs)
@@ -538,7 +538,9 @@ class Running:
     def __init__(self, procedure: Procedure[Any]) -> None:
         self.procedure = procedure
         self.until: float | None = None
+        self.is_parked = False
         self.woken = False
+        self.num_turns = 0
         self.done = False
         self.error: Exception | None = None
         self.value: Any = None
@@ -550,12 +552,20 @@ class Running:
 
     def resume(self, now: float | None) -> None:
         self.woken = False
+        self.num_turns += 1
         try:
-            self.until = self.procedure.send(now).until  # type: ignore[arg-type]
+            wait = self.procedure.send(now)  # type: ignore[arg-type]
+            self.until = wait.until
+            self.is_parked = isinstance(wait, Parked)
+            if isinstance(wait, Parked):
+                wait.unpark = self._unpark
         except StopIteration as stop:
             self.done, self.value = True, stop.value
         except Exception as error:  # noqa: BLE001
             self.done, self.error = True, error
+
+    def _unpark(self) -> None:
+        self.woken = True
 
     def result(self) -> Any:
         """Return the result of the procedure, or raise its error."""

@@ -36,6 +36,7 @@ from patience import HANG as LONG
 
 import rlightning_aio as rl
 import rlightning_aio.sync
+from rlightning_aio._core.group.drivers.aio_driver import AioDriver
 from rlightning_aio.errors import (
     ConfigError,
     EnvAborted,
@@ -179,6 +180,41 @@ async def test_an_agent_may_be_one_coroutine_for_each_env() -> None:
             batch, _ = await group.collect_async(min_results=2)
             assert set(batch.ids()) <= set(batched)
         assert await asyncio.gather(*agents) == [(5 + k, k) for k in range(8)]
+
+
+async def test_an_agent_is_woken_by_results_of_its_own_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many agents wait: a result wakes its own, and the one that reads for all."""
+    count, num_steps, woken = 60, 3, 0
+    block: Any = AioDriver._block
+
+    async def counted(self: Any, wait: Any) -> None:
+        nonlocal woken
+        await block(self, wait)
+        woken += 1
+
+    async def agent(env_id: str) -> None:
+        async with group.episode(env_id) as env:
+            for _ in range(num_steps):
+                await env.step(GATE)
+
+    async with rl.build_env_group(entry(num_workers=count)) as group:
+        gates = {env_id: asyncio.Event() for env_id in group.env_ids}
+        Scripted.gates.update(gates)
+        agents = [asyncio.ensure_future(agent(env_id)) for env_id in group.env_ids]
+        await until_at_gate(*group.env_ids)
+        monkeypatch.setattr(AioDriver, "_block", counted)
+        for _ in range(num_steps):
+            for env_id, gate in gates.items():
+                gate.set()
+                while env_id in Scripted.at_gate:  # noqa: ASYNC110  # Seldom more than twice.
+                    await asyncio.sleep(0)
+                gate.clear()
+                for _ in range(20):
+                    await asyncio.sleep(0)
+        await asyncio.gather(*agents)
+    assert woken <= 3 * count * num_steps
 
 
 @pytest.mark.parametrize("action", [HANG, IGNORE], ids=["hangs", "ignores it"])

@@ -5,15 +5,16 @@ from __future__ import annotations
 import asyncio
 import os
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rlightning_aio._core.group.drivers.wait import forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import Parked, forked_from, this_process
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sized
 
-    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.drivers.wait import Procedure, Wait
     from rlightning_aio._core.hosts.base import Source
 
 __all__ = ["AioDriver"]
@@ -22,7 +23,7 @@ T = TypeVar("T")
 
 
 def _wake(woken: asyncio.Future[None]) -> None:
-    if not woken.done():
+    if not woken.done() and not woken.get_loop().is_closed():
         woken.set_result(None)
 
 
@@ -163,8 +164,7 @@ class AioDriver:
     def wake(self) -> None:
         waiting, self._waiting = self._waiting, []
         for woken in waiting:
-            if not woken.done() and not woken.get_loop().is_closed():
-                woken.set_result(None)
+            _wake(woken)
 
     def read(self) -> None:
         """Do nothing: the loop reads."""
@@ -216,7 +216,7 @@ class AioDriver:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
-                    await self._block(wait.until)
+                    await self._block(wait)
                     if self._raised is not None:
                         await asyncio.sleep(0)  # Let the loop read the source again.
                         self._raise_kept()
@@ -241,13 +241,17 @@ class AioDriver:
         if kept is not None:
             raise kept
 
-    async def _block(self, until: float | None) -> None:
-        timeout = None if until is None else until - time.monotonic()
+    async def _block(self, wait: Wait) -> None:
+        timeout = None if wait.until is None else wait.until - time.monotonic()
         if timeout is not None and timeout <= 0:
             await asyncio.sleep(0)
             return
         loop = asyncio.get_running_loop()
         woken = loop.create_future()
+        if type(wait) is Parked:
+            wait.unpark = partial(_wake, woken)
+            await woken
+            return
         timer = None if timeout is None else loop.call_later(timeout, _wake, woken)
         self._waiting.append(woken)
         try:

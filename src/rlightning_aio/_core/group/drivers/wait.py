@@ -7,7 +7,7 @@ collect waits.
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
 
@@ -17,13 +17,14 @@ from rlightning_aio._core.hosts.base import Watcher
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sized
+    from collections.abc import Sized
 
 __all__ = [
     "ANY",
     "TURN",
     "CollectRules",
     "Driver",
+    "Parked",
     "Procedure",
     "Wait",
     "earliest",
@@ -42,6 +43,23 @@ class Wait:
     """
 
     until: float | None = None
+
+
+def _nobody_waits() -> None:
+    """Do nothing."""
+
+
+@dataclass(slots=True, eq=False)
+class Parked(Wait):
+    """A request to block until `unpark` is called, whatever sources report.
+
+    Only asynchronous groups have calls that park, while another call waits for the sources.
+
+    Attributes:
+        unpark: ends the wait; set by the driver.
+    """
+
+    unpark: Callable[[], None] = _nobody_waits
 
 
 ANY: Final = Wait()

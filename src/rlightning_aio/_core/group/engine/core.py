@@ -72,7 +72,7 @@ class Core:
         self.intake = intake = Intake(tables, supervisor, results, arrivals)
         self.drain = intake.drain
         self.waiting = waiting = Waiting(
-            tables, supervisor, poller, intake, parts.watcher, one_by_one=shares_thread
+            tables, supervisor, poller, intake, parts.watcher, shares_thread=shares_thread
         )
         dispatch = Dispatch(tables, supervisor, poller, waiting, parts.watcher)
         self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)

@@ -2,6 +2,11 @@
 
 Each call is a procedure that takes turns here until its replies are ready. The bell of the workers
 is armed for the call that waits for the fewest results, however long the other envs take.
+
+Where tasks share a group, one of the calls with a ticket *leads*: it is woken by whatever happens,
+reads the replies for all, and looks after the hosts. Each of the others is *parked*: it is woken by
+replies to its own requests, and to lead when the leader has what it waited for. So a reply wakes
+two calls, however many wait.
 """
 
 from __future__ import annotations
@@ -9,7 +14,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rlightning_aio._core.group.drivers.wait import ANY, TURN, Procedure, Wait
+from rlightning_aio._core.group.drivers.wait import ANY, TURN, Parked, Procedure, Wait
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
 from rlightning_aio._core.hosts.spinner import Spinner
@@ -37,10 +42,11 @@ class Waiting:
         tables, supervisor, poller: of the group.
         intake: applies what the poller finds.
         watcher: the driver.
-        one_by_one: inline envs are executed in one turn each, so that other tasks have theirs.
+        shares_thread: other tasks may use the group while a call waits. So inline envs are executed
+            in one turn each.
 
     Attributes:
-        wanted: the number of results that each call waits for.
+        wanted: the numbers of results that calls wait for, and how many calls for each.
         intake: as given.
     """
 
@@ -52,9 +58,10 @@ class Waiting:
         intake: Intake,
         watcher: Watcher,
         *,
-        one_by_one: bool,
+        shares_thread: bool,
     ) -> None:
         self._requests = tables.requests
+        self._tickets = tables.requests.tickets
         self._conditions = tables.conditions
         self._supervisor = supervisor
         self._poller = poller
@@ -62,8 +69,10 @@ class Waiting:
         self.intake = intake
         self._completions = tables.completions
         self._watcher = watcher
-        self._one_by_one = one_by_one
-        self.wanted: list[int] = []
+        self._shares_thread = shares_thread
+        # Of the ticket whose call leads; 0 if none does.
+        self._leader = 0
+        self.wanted: dict[int, int] = {}
 
     def poll(self) -> None:
         """Read and apply the replies that are ready.
@@ -82,13 +91,17 @@ class Waiting:
         if requests.has_news:
             requests.has_news = False
             if self.wanted:
-                self._watcher.wake()
+                self.wake()
 
     def wake(self) -> None:
-        """Wake all waiting calls, to check their replies and arm the bell again.
+        """Wake waiting calls, to check their replies and arm the bell again: see the module.
 
         Needed after requests that the armed bell doesn't count, and when the number to arm changes.
         """
+        tickets = self._tickets
+        while tickets.replied:
+            if wait := tickets.parked.pop(tickets.replied.pop(), None):
+                wait.unpark()
         if self.wanted:
             self._watcher.wake()
 
@@ -113,14 +126,14 @@ class Waiting:
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
         """Wait once for `wanted` more replies, and return the time after it; the caller loops."""
         poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
-        self.wanted.append(wanted)
+        self.wanted[wanted] = self.wanted.get(wanted, 0) + 1
         try:
-            if poller.executing and poller.execute(1 if self._one_by_one else wanted, until):
+            if poller.executing and poller.execute(1 if self._shares_thread else wanted, until):
                 now = yield TURN if len(poller.executing) == len(in_flight) else Wait(0.0)
                 is_due = now >= supervisor.look_by
             else:
                 # Other calls may wait for fewer results.
-                first = wanted if len(self.wanted) == 1 else min(self.wanted)
+                first = min(self.wanted)
                 may_spin = len(in_flight) - in_flight.count(0) < poller.num_cores
                 if (may_spin and poller.spin(first)) or poller.arm(first):
                     now = yield TURN
@@ -136,13 +149,43 @@ class Waiting:
                     if not is_due:
                         supervisor.look_by = now + LOOK_SECONDS
                         is_due = self._conditions.unusual != 0
-        finally:
-            self.wanted.remove(wanted)
-            if not self.wanted:
+        finally:  # As `_want`, without a call.
+            if (calls := self.wanted.pop(wanted)) > 1:
+                self.wanted[wanted] = calls - 1
+            elif not self.wanted:
                 self._bell.disarm()
         if is_due:
             self.check(now)
         return now
+
+    def _want(self, wanted: int, calls: int) -> None:
+        """Note that more or fewer calls want so many results."""
+        calls += self.wanted.pop(wanted, 0)
+        if calls:
+            self.wanted[wanted] = calls
+        elif not self.wanted:
+            self._bell.disarm()
+
+    def _park(self, ticket: Ticket) -> Procedure[float]:
+        """Wait for replies to a ticket, or to lead; return the time after that."""
+        wanted, parked = ticket.remaining, self._tickets.parked
+        self._want(wanted, 1)
+        try:
+            if self._poller.arm(min(self.wanted)):
+                return (yield TURN)
+            parked[ticket.owner] = wait = Parked()
+            now = yield wait
+        finally:
+            parked.pop(ticket.owner, None)
+            self._want(wanted, -1)
+        if self._leader == ticket.owner:
+            self.check(now)  # The group may have been closed.
+        return now
+
+    def _hand_on(self) -> None:
+        """Let a parked call lead."""
+        self._leader, wait = self._tickets.parked.popitem()
+        wait.unpark()
 
     def ask(
         self,
@@ -167,11 +210,20 @@ class Waiting:
             if self._supervisor.members.possible:
                 self.poll()  # Replies of members that were read before cause no wake-up.
             while ticket.remaining > 0:
-                now = yield from self.turn(ticket.remaining, None)
+                if self._leader in (0, ticket.owner) or not self._shares_thread:
+                    self._leader = ticket.owner
+                    now = yield from self.turn(ticket.remaining, None)
+                else:
+                    now = yield from self._park(ticket)
                 self.poll()
         except BaseException:
             self._give_up(ticket)
             raise
+        finally:
+            if self._leader == ticket.owner:
+                self._leader = 0
+                if self._tickets.parked:
+                    self._hand_on()
         self._requests.settle(ticket)
         return ticket, now
 

@@ -10,7 +10,7 @@ The table consists of arrays, so that a batch of thousands costs a few vector op
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -28,6 +28,7 @@ from rlightning_aio.protocol.entries import OP_BITS_ARRAY, SLOT_MASK_ARRAY, Oper
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rlightning_aio._core.group.drivers.wait import Parked
     from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["Aborted", "CollectorQueue", "Requests", "Ticket", "Tickets"]
@@ -84,10 +85,14 @@ class Tickets:
 
     Attributes:
         waiting: by owner.
+        parked: the waits of those that are woken only by replies of their own; by owner.
+        replied: owners of parked calls that are to be woken.
     """
 
     def __init__(self) -> None:
         self.waiting: dict[int, Ticket] = {}
+        self.parked: dict[int, Parked] = {}
+        self.replied: list[int] = []
         self._next_owner = 1
 
     def open(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
@@ -100,6 +105,14 @@ class Tickets:
         ticket = Ticket(self._next_owner, slots, len(slots), method)
         self._next_owner += 1
         self.waiting[ticket.owner] = ticket
+        return ticket
+
+    def note_ended(self, owner: int, count: int) -> Ticket:
+        """Note that requests of a call have ended; return its ticket."""
+        ticket = self.waiting[owner]
+        ticket.remaining -= count
+        if owner in self.parked:
+            self.replied.append(owner)
         return ticket
 
     def method(self, owner: int) -> str:
@@ -417,9 +430,8 @@ class Requests:
         for owner, mine in self.owners(slots[aborted]).items():
             faults = self.aborted.take(mine)
             if owner > 0:
-                ticket = self.tickets.waiting[owner]
+                ticket = self.tickets.note_ended(owner, len(mine))
                 ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
-                ticket.remaining -= len(mine)
                 ticket.failed.update(zip(mine.tolist(), faults, strict=True))
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
@@ -449,16 +461,16 @@ class Requests:
             collector.num_ready += len(slots)
             collector.num_awaited -= len(slots)
         elif len(tickets) == 1 and not collector.num_awaited:
-            (ticket,) = tickets.values()
+            (ticket,) = tickets.values()  # It isn't parked: no other call is there.
             ticket.remaining -= len(slots)
         else:
             owners = self.owner[slots]
-            for owner in set(owners.tolist()):
-                mine = slots[owners == owner]
-                if owner:
-                    tickets[owner].remaining -= len(mine)
+            found: list[int] = owners.tolist()
+            for owner, count in Counter(found).items():
+                if owner == COLLECTOR:
+                    collector.append(slots[owners == owner])
                 else:
-                    collector.append(mine)
+                    self.tickets.note_ended(owner, count)
 
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
@@ -467,9 +479,7 @@ class Requests:
         if owner == NOBODY:
             self._forget(self.alone(slot))
         else:
-            ticket = self.tickets.waiting[owner]
-            ticket.values[slot] = value
-            ticket.remaining -= 1
+            self.tickets.note_ended(owner, 1).values[slot] = value
             self.state[slot] = _SPENT_CODE
 
     def owners(self, slots: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
@@ -483,8 +493,7 @@ class Requests:
         """End requests of one owner that are no longer in flight, in one error."""
         self.has_news = True
         if owner > 0:
-            ticket = self.tickets.waiting[owner]
-            ticket.remaining -= len(slots)
+            ticket = self.tickets.note_ended(owner, len(slots))
             ticket.failed |= dict.fromkeys(slots.tolist(), fault)
             self.state[slots] = _SPENT_CODE
         elif owner == COLLECTOR:
