@@ -116,7 +116,7 @@ class InGroup(Way):
         self.runner.run(self._start())
 
     async def _start(self) -> None:
-        entry: dict[str, Any] = {"name": "w", "make_env": self.make_env, "num_workers": self.count}
+        entry: dict[str, Any] = {"name": "w", "task": self.make_env, "num_workers": self.count}
         entry |= {"placement": self.placement, "start_timeout": 600}
         if self.placement == "process":
             entry["envs_per_process"] = self.envs_per_process

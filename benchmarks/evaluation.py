@@ -62,7 +62,7 @@ def busy(num_workers: int, envs_each: int, episodes: int, min_results: int) -> N
         return np.zeros(len(batch), np.int64)
 
     entry = {
-        "name": "uneven", "make_env": Uneven, "num_workers": num_workers * envs_each,
+        "name": "uneven", "task": Uneven, "num_workers": num_workers * envs_each,
         "envs_per_process": envs_each,
     }  # fmt: skip
     specs = [EpisodeSpec("", seed) for seed in range(episodes)]

@@ -75,7 +75,7 @@ class Raw(Stepped):
 
         self._driver = RawDriver()
         config = group_config(self.work, "auto")
-        plan = plan_group(config, None, mixed_actions=False, zero_copy=False)
+        plan = plan_group(config, {}, None, mixed_actions=False, zero_copy=False)
         self._core = assemble(plan, self._driver, shares_thread=False)
         self._driver.drain = self._core.drain
         metas = self._driver.run(self._core.start(time.monotonic()))

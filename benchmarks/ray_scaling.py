@@ -52,7 +52,7 @@ def measured(
     """Measure one round of one setting."""
     entry = {
         "name": "none",
-        "make_env": no_work(num_floats),
+        "task": no_work(num_floats),
         "num_workers": num_actors * num_envs,
         "envs_per_process": num_envs,
         "placement": placement,

@@ -56,7 +56,7 @@ def entries() -> list[EnvConfig]:
     return [
         EnvConfig(
             name=task.partition("-")[0],
-            make_env=lambda task=task, kwargs=kwargs, seconds=seconds: make(task, kwargs, seconds),
+            task=lambda task=task, kwargs=kwargs, seconds=seconds: make(task, kwargs, seconds),
             num_workers=ENVS_OF_TASK,
             envs_per_process=1,
             max_episode_steps=200,

@@ -91,7 +91,7 @@ def learner(group: Any) -> None:
 
 def recorded(what: Callable[[Any], None]) -> list[dict[str, Any]]:
     """The events of a timeline of `what`."""
-    config = EnvConfig(name="env", make_env=Sleeper, num_workers=NUM_ENVS, envs_per_process=1)
+    config = EnvConfig(name="env", task=Sleeper, num_workers=NUM_ENVS, envs_per_process=1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.json"
         with build_env_group(config) as group:

@@ -7,9 +7,11 @@ import math
 import pickle
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import hypothesis.strategies as st
 import pytest
 import yaml
@@ -364,7 +366,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("backend", "mujco", "unknown backend 'mujco'; did you mean 'mujoco'? known: "),
         ("backend", "zzz", "unknown backend 'zzz'; known: "),
         ("task", "", "is required"),
-        ("task", 5, "should be a valid string, got 5"),
+        ("task", 5, "should be a name, a callable or a list of callables, got 5"),
     ],
 )
 def test_a_wrong_field_is_named_with_file_and_entry(
@@ -404,11 +406,10 @@ def test_min_results_above_the_number_of_envs_is_refused() -> None:
     parse_configs({"name": "robots", "backend": "env_server", "min_results": 9})
 
 
-@pytest.mark.parametrize("missing", ["name", "backend", "task"])
-def test_a_missing_field_is_named(missing: str) -> None:
-    """The three fields without a default are required."""
-    fields = {name: value for name, value in HOPPER.items() if name != missing}
-    assert f", {missing}: is required" in problems_of([fields])
+def test_a_missing_task_is_named() -> None:
+    """It is the only field without a default."""
+    assert "envs.0 ('mujoco'), task: is required" in problems_of([{"backend": "mujoco"}])
+    assert "envs.0, backend: is required" in problems_of([{"num_workers": 2}])
 
 
 def test_a_name_must_not_be_empty() -> None:
@@ -498,7 +499,7 @@ def test_one_message_lists_every_problem_of_a_file(write: Write) -> None:
             "imports": ["no_such_module"],
             "envs": [
                 HOPPER | {"num_worker": 1, "num_workers": "x", "num_envs": 2, "backend": "piper"},
-                "not an entry",
+                5,
                 {"backend": "zzz", "interpreter": "/no/such/python"},
                 HOPPER,
             ],
@@ -514,9 +515,8 @@ def test_one_message_lists_every_problem_of_a_file(write: Write) -> None:
         "envs.0 ('hopper'), num_workers",
         "envs.0 ('hopper'), num_envs",
         "envs.1",
-        "envs.2, name",
-        "envs.2, task",
-        "envs.2, interpreter",
+        "envs.2 ('zzz'), task",
+        "envs.2 ('zzz'), interpreter",
         "envs.3 ('hopper'), name",
         "imports",
     ]
@@ -525,10 +525,10 @@ def test_one_message_lists_every_problem_of_a_file(write: Write) -> None:
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ({"make_env": dict, "placement": "here"}, "placement: should be .* got 'here'"),
+        ({"task": dict, "placement": "here"}, "placement: should be .* got 'here'"),
         ({"task": "os:getcwd", "num_workers": 0}, "num_workers: should be .* got 0"),
-        ({"make_env": 3}, "make_env: should be callable .* got 3"),
-        ({"make_env": [dict, dict], "num_workers": "two"}, "num_workers: should be .* got 'two'"),
+        ({"task": 3}, "task: should be a name, a callable .* got 3"),
+        ({"task": [dict, dict], "num_workers": "two"}, "num_workers: should be .* got 'two'"),
     ],
     ids=str,
 )
@@ -699,3 +699,58 @@ def test_importing_config_does_not_load_omegaconf() -> None:
     """Workers import it, too, and read no YAML."""
     code = "import rlightning_aio.config, sys; sys.exit('omegaconf' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def swing() -> Any:
+    return gym.make("Pendulum-v1")
+
+
+@pytest.mark.parametrize(
+    ("given", "fields", "expected"),
+    [
+        ("CartPole-v1", {}, ("CartPole-v1", "gymnasium", 1)),
+        ("CartPole-v1", {"num_workers": 8}, ("CartPole-v1", "gymnasium", 8)),
+        (None, {"task": "Hopper-v5"}, ("Hopper-v5", "mujoco", 1)),
+        ({"task": "Hopper-v5", "num_workers": 2}, {}, ("Hopper-v5", "mujoco", 2)),
+        ("ALE/Pong-v5", {"backend": "ale", "name": "pong"}, ("pong", "ale", 1)),
+        ("ALE/Pong-v5", {"backend": "ale"}, ("Pong-v5", "ale", 1)),
+        ("http://127.0.0.1:8000", {"backend": "openenv"}, ("openenv", "openenv", 1)),
+        (None, {"backend": "env_server"}, ("env_server", "env_server", 1)),
+        ("test_config:swing", {}, ("swing", "callable", 1)),
+        (swing, {"num_workers": 3}, ("swing", "callable", 3)),
+        (partial(swing), {}, ("swing", "callable", 1)),
+        ([swing] * 3, {}, ("swing", "callable", 3)),
+        ([swing, gym.Env], {"step_timeout": 2.0}, ("env", "callable", 2)),
+        (lambda: gym.make("Pendulum-v1"), {}, ("env", "callable", 1)),
+    ],
+)
+def test_a_task_names_its_entry_and_its_backend(given: Any, fields: Any, expected: Any) -> None:
+    """Whatever says what to build is enough, and fields are those of that entry."""
+    (config,) = parse_configs(given, fields)
+    assert (config.name, config.backend, config.num_workers) == expected
+    for name, value in fields.items():
+        assert getattr(config, name) == value
+
+
+def test_names_callables_and_configs_may_be_listed() -> None:
+    """Callables that follow one another make one entry."""
+    found = parse_configs(["CartPole-v1", swing, gym.Env, {"task": "Hopper-v5"}])
+    assert [config.name for config in found] == ["CartPole-v1", "env", "Hopper-v5"]
+    assert [config.num_workers for config in found] == [1, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("given", "fields", "said"),
+    [
+        (HOPPER, {"num_workers": 2}, "num_workers: fields can be added to a task's name or to"),
+        (["CartPole-v1"], {"step_timeout": 2}, "step_timeout: fields can be added"),
+        ("CartPole-v1", {"task": "Hopper-v5"}, "task: is given twice"),
+        ([swing] * 2, {"num_workers": 3}, "has 2 callables for num_workers: 3"),
+        (None, {"num_worker": 3, "task": "Hopper-v5"}, "did you mean 'num_workers'"),
+        (None, {}, "should be a list of entries, got None"),
+    ],
+)
+def test_fields_that_belong_to_no_entry_are_refused(given: Any, fields: Any, said: str) -> None:
+    """The message names the field."""
+    with pytest.raises(ConfigError, match=said):
+        parse_configs(given, fields)

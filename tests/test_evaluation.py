@@ -62,7 +62,7 @@ class Patient(SyncVectorEnv):
 
 def group_of(*makers: Callable[[], Any], **fields: Any) -> sync.EnvGroup:
     fields = {"placement": "inline", **fields}
-    entry = {"name": "env", "make_env": list(makers), "num_workers": len(makers), **fields}
+    entry = {"name": "env", "task": list(makers), "num_workers": len(makers), **fields}
     return sync.build_env_group(entry)
 
 
@@ -237,9 +237,9 @@ def test_entries_may_differ() -> None:
     """
     pair = {
         "name": "pair", "placement": "inline",
-        "make_env": lambda: SyncVectorEnv([scripted(lambda _: True)] * 2),
+        "task": lambda: SyncVectorEnv([scripted(lambda _: True)] * 2),
     }  # fmt: skip
-    single = {"name": "single", "placement": "inline", "make_env": scripted(lambda _: False)}
+    single = {"name": "single", "placement": "inline", "task": scripted(lambda _: False)}
 
     def by_entry(batch: rl.BatchedData) -> list[rl.BatchedData]:
         return [part.respond(action=nothing(part)) for part in batch.by_name().values()]
@@ -254,7 +254,7 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
     async def policy(batch: rl.BatchedData) -> Any:
         return nothing(batch)
 
-    entry = {"name": "env", "make_env": scripted(lambda _: True), "placement": "inline"}
+    entry = {"name": "env", "task": scripted(lambda _: True), "placement": "inline"}
     async with rl.build_env_group(entry) as group:
         with group.auto_reset(1000):
             found = await evaluate(group, policy, np.int64(2))

@@ -120,7 +120,7 @@ class Dies(Tasks):
 def test_a_process_that_ends_while_a_film_begins_is_replaced(tmp_path: Path) -> None:
     """The film is of another env of the process than the one that ended it."""
     queue = [EpisodeSpec("1", seed) for seed in (2, 9, 1, 0, 3)]
-    fields = {"make_env": Dies, "env_kwargs": {"folder": str(tmp_path)}, "envs_per_process": 2}
+    fields = {"task": Dies, "env_kwargs": {"folder": str(tmp_path)}, "envs_per_process": 2}
     video = EpisodeVideo(tmp_path / "films")
     found = evaluated(group_of(2, placement="process", **fields), queue, video=video)
     assert rows(found) == [("1", seed, seed + 1.0, seed + 1) for seed in (0, 1, 2, 3, 9)]

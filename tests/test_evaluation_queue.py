@@ -70,7 +70,7 @@ class Tasks(gym.Env[Any, Any]):
 
 
 def group_of(num_workers: int = 3, **fields: Any) -> sync.EnvGroup:
-    entry = {"name": "env", "make_env": Tasks, "placement": "inline", "num_workers": num_workers}
+    entry = {"name": "env", "task": Tasks, "placement": "inline", "num_workers": num_workers}
     return sync.build_env_group({**entry, **fields})
 
 
@@ -127,7 +127,7 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
     async def policy(batch: rl.BatchedData) -> Any:
         return nothing(batch)
 
-    entry = {"name": "env", "make_env": Tasks, "placement": "inline", "num_workers": 2}
+    entry = {"name": "env", "task": Tasks, "placement": "inline", "num_workers": 2}
     async with rl.build_env_group(entry) as group:
         with group.auto_reset(100):
             assert rows(await evaluate(group, policy, QUEUE)) == ROWS
@@ -269,7 +269,7 @@ def test_each_suspect_is_charged_an_attempt_where_no_env_is_at_fault(
     (first_life := tmp_path / "first life").touch()
     group = group_of(
         3,
-        make_env=partial(AwaitableTasks, first_life, nobodys=nobodys),
+        task=partial(AwaitableTasks, first_life, nobodys=nobodys),
         placement="process",
         envs_per_process=3,
         on_worker_death=on_worker_death,

@@ -50,7 +50,7 @@ def halves(batch: BatchedData) -> dict[str, Any]:
 
 
 def played(num_steps: int, rollouts: int, *, wait_all: bool = False) -> list[WholeEpisode]:
-    entry = {"name": "env", "make_env": Counting, "num_workers": 2, "placement": "inline"}
+    entry = {"name": "env", "task": Counting, "num_workers": 2, "placement": "inline"}
     joiner, found = EpisodeJoiner(), []
     with sync.build_env_group(entry) as group, group.auto_reset(9):
         collector = Collector(group, halves, num_transitions=num_steps, wait_all=wait_all)
@@ -93,7 +93,7 @@ def test_an_episode_that_lost_its_begin_is_left_out(
     tmp_path: Path, snapshot_every: int | None
 ) -> None:
     """With its worker, which was replaced by one that begins anew, or in the middle."""
-    entry: dict[str, Any] = {"name": "env", "make_env": lambda: Dying(tmp_path / "marker")}
+    entry: dict[str, Any] = {"name": "env", "task": lambda: Dying(tmp_path / "marker")}
     if snapshot_every is not None:
         entry |= {"on_worker_death": "resume", "snapshot_every": snapshot_every}
     with sync.build_env_group(entry) as group, group.auto_reset(9):
@@ -105,7 +105,7 @@ def test_an_episode_that_lost_its_begin_is_left_out(
 
 
 def test_an_episode_with_its_begin_in_a_rollout_that_was_not_added_is_left_out() -> None:
-    with sync.build_env_group({"name": "env", "make_env": Counting}) as group, group.auto_reset(9):
+    with sync.build_env_group({"name": "env", "task": Counting}) as group, group.auto_reset(9):
         collector = Collector(group, halves, num_transitions=2, wait_all=True)
         rollouts = [collector.collect() for _ in range(2)]
         joiner = EpisodeJoiner()

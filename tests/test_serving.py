@@ -162,7 +162,7 @@ async def test_its_frames_are_json() -> None:
         await socket.send(json.dumps({"type": kind, "data": data}))
         return loaded(await socket.recv())
 
-    entry = {"name": "unstable", "make_env": Unstable, "placement": "inline"}
+    entry = {"name": "unstable", "task": Unstable, "placement": "inline"}
     async with (
         rl.build_env_group(entry) as served,
         OpenEnvServer(served, "unstable", "127.0.0.1", 0) as server,

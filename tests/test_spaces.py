@@ -45,7 +45,7 @@ class Talk:
 
 def entry(placement: str = "loop") -> rl.EnvConfig:
     fields = {} if placement == "loop" else {"envs_per_process": 3}
-    return rl.EnvConfig(name="t", make_env=Talk, num_workers=3, placement=placement, **fields)
+    return rl.EnvConfig(name="t", task=Talk, num_workers=3, placement=placement, **fields)
 
 
 def say(batch: Any) -> list[Any]:
@@ -140,6 +140,26 @@ async def test_nothing_is_pickled_on_the_loop() -> None:
             for _ in range(3):
                 batch, _ = await group.step(batch.respond(action=say(batch)))
                 assert len(batch.observation["messages"]) == len(batch.info("said")) == 3
+
+
+class Echo:
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return f"seed {seed}", {}
+
+    async def step(self, action: Any) -> Any:
+        return f"not {action}", 1.0, False, False, {}
+
+
+@pytest.mark.parametrize("placement", ["loop", "process"])
+async def test_an_awaitable_env_needs_no_spaces(placement: str) -> None:
+    """They are `Anything`."""
+    async with rl.build_env_group(Echo, num_workers=2, placement=placement) as group:
+        assert group.get_observation_spaces() == group.get_action_spaces() == [Anything()] * 2
+        batch, _ = await group.reset(seed=3)
+        assert batch.observation == ["seed 3", "seed 4"]
+        batch, _ = await group.step(batch.respond(action=["this", "that"]))
+        assert batch.items() == [("Echo-0", batch["Echo-0"]), ("Echo-1", batch["Echo-1"])]
+        assert batch.observation == ["not this", "not that"]
 
 
 def test_it_is_a_space() -> None:

@@ -83,7 +83,7 @@ def films(folder: Path) -> dict[str, list[int]]:
 
 
 def entry(make_env: Callable[[], Any], **fields: Any) -> dict[str, Any]:
-    return {"name": "env", "make_env": make_env, "placement": "inline", **fields}
+    return {"name": "env", "task": make_env, "placement": "inline", **fields}
 
 
 def filmed(make_env: Callable[[], Any], folder: Path, **video: Any) -> dict[str, Any]:
@@ -302,7 +302,7 @@ async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
 def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
     """The error names the env or the field, and what to do."""
     makers = (Brighter, lambda: Brighter(None))
-    with sync.build_env_group({**entry(Brighter, num_workers=2), "make_env": makers}) as group:
+    with sync.build_env_group({**entry(Brighter, num_workers=2), "task": makers}) as group:
         with pytest.raises(rl.EnvRaised, match="'env-1' can't be filmed: its render_mode is None"):
             rl.record_video(group, group.env_ids, tmp_path)
         with pytest.raises(rl.EnvRaised, match="no sub-environment 2"):
@@ -394,7 +394,7 @@ def test_vector_envs_that_render_nothing_raise(tmp_path: Path) -> None:
         with pytest.raises(rl.ConfigError, match=r"entry 'env', video: .*num_envs: 2.*nothing"):
             sync.build_env_group({**atari, "video": {"folder": str(tmp_path)}})
     with (
-        sync.build_env_group({"name": "env", "make_env": Blind, "placement": "inline"}) as group,
+        sync.build_env_group({"name": "env", "task": Blind, "placement": "inline"}) as group,
         pytest.raises(rl.EnvRaised, match="'env-0' can't be filmed: a Blind renders nothing"),
     ):
         rl.record_video(group, ["env-0"], tmp_path)

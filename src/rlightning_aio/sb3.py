@@ -128,9 +128,7 @@ class VecEnv(_Base):
         del start_method
         limit = entry.pop("max_episode_steps", None)
         makers = adapted(env_fns, AutoresetMode.SAME_STEP, limit)
-        self.group: EnvGroup = build_env_group(
-            {"name": "env", "num_workers": len(makers), "make_env": makers, **entry}
-        )
+        self.group: EnvGroup = build_env_group({"name": "env", "task": makers, **entry})
         metas = self.group.init()
         try:
             self._rows = rows_of(self.group, metas)

@@ -112,7 +112,7 @@ def scripted_group(
     scripts = [[Script(width * k + j, ends) for j in range(width)] for k in range(num_envs)]
     config = {
         "name": "script",
-        "make_env": [lambda own=own: KINDS[kind](own) for own in scripts],
+        "task": [lambda own=own: KINDS[kind](own) for own in scripts],
         "num_workers": num_envs,
         "placement": "inline",
     }

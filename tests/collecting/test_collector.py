@@ -179,7 +179,7 @@ class Judged(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def collector_of_infos(value: Any, infos: Any) -> Any:
-    entry = {"name": "judged", "make_env": lambda: Judged(value), "placement": "inline"}
+    entry = {"name": "judged", "task": lambda: Judged(value), "placement": "inline"}
     group = sync.build_env_group(entry)
     return group, Collector(group, zeros, num_transitions=60, infos=infos, seed=0)
 
@@ -222,7 +222,7 @@ def test_an_info_that_no_env_reports_is_warned_of_once() -> None:
 def test_infos_that_come_later_or_from_some_entries_only_are_not_warned_of() -> None:
     """Nothing is known before an episode has ended."""
     entries = [
-        {"name": name, "make_env": maker, "placement": "inline"}
+        {"name": name, "task": maker, "placement": "inline"}
         for name, maker in (
             ("judged", lambda: Judged(1.0)),
             ("plain", lambda: gym.make("CartPole-v1")),
@@ -334,7 +334,7 @@ def test_the_step_limit_cuts_envs_with_same_step_autoreset() -> None:
     def policy(batch: BatchedData) -> dict[str, Any]:
         return {"action": np.zeros((*batch.is_reset.shape, 1))}
 
-    group = sync.build_env_group({"name": "v", "make_env": make, "placement": "inline"})
+    group = sync.build_env_group({"name": "v", "task": make, "placement": "inline"})
     with group, group.auto_reset(3):
         rollout = Collector(group, policy, num_transitions=12, seed=0).collect()
     assert np.count_nonzero(rollout.truncated) == 4
@@ -422,7 +422,7 @@ async def test_a_cancelled_wait_for_clients_is_repeated() -> None:
 
     kwargs = {"heartbeat": 5.0, "connect_timeout": HANG}
     server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
-    local = {"name": "here", "make_env": lambda: CountingEnv(7), "placement": "inline"}
+    local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
     async with rl.build_env_group([local, server]) as group:
         with group.auto_reset(4):
             collector = Collector(group, policy, num_transitions=4, seed=3)

@@ -32,7 +32,7 @@ NUM_LINES = 9000
 @pytest.fixture(scope="module")
 def group() -> Iterator[sync.EnvGroup]:
     """Two entries, each with two envs in one worker."""
-    entry = {"make_env": Uneven, "envs_per_process": 2, "num_workers": 2}
+    entry = {"task": Uneven, "envs_per_process": 2, "num_workers": 2}
     with sync.build_env_group([{**entry, "name": name} for name in PER_ENTRY]) as group:
         yield group
 

@@ -137,11 +137,11 @@ async def test_a_collect_goes_on_wherever_it_was_cancelled(way: str, slow: str) 
     """As if it had not been: envs that are slow to reset included."""
     makers = {"fast": lambda: Awaited(0), "slow": lambda: Awaited(60)}
     entries = [
-        {"name": name, "make_env": make, "num_workers": 2, "placement": "loop"}
+        {"name": name, "task": make, "num_workers": 2, "placement": "loop"}
         for name, make in makers.items()
     ]
     if slow == "inline":
-        entries[1] |= {"make_env": Uneven, "placement": "inline"}
+        entries[1] |= {"task": Uneven, "placement": "inline"}
     answer, options = WAYS[way]
     for at in itertools.count():
         async with rl.build_env_group(entries) as group:
@@ -156,7 +156,7 @@ async def test_a_collect_goes_on_wherever_it_was_cancelled(way: str, slow: str) 
 
 
 async def test_a_collect_of_workers_goes_on_wherever_it_was_cancelled() -> None:
-    entry = {"make_env": Uneven, "envs_per_process": 2, "num_workers": 2}
+    entry = {"task": Uneven, "envs_per_process": 2, "num_workers": 2}
     entries = [{**entry, "name": name} for name in PER_ENTRY]
     async with rl.build_env_group(entries) as group:
         for at in range(6):
@@ -201,7 +201,7 @@ def numbered(place: Place, **fields: Any) -> Any:
     entries = [
         {
             "name": name,
-            "make_env": [lambda k=k: Numbered(k) for k in numbers],
+            "task": [lambda k=k: Numbered(k) for k in numbers],
             "num_workers": 2,
             **fields,
         }
@@ -320,7 +320,7 @@ async def test_a_collector_begins_after_envs_have_raised_in_their_first_reset(
 ) -> None:
     """The program may have reset them, and have sent that only."""
     numbers = [lambda k=k: Reluctant(k) for k in range(4)]
-    entry = {"name": "a", "make_env": numbers, "num_workers": 4}
+    entry = {"name": "a", "task": numbers, "num_workers": 4}
     async with INLINE_SYNC.build([entry]) as group:
         with group.auto_reset(math.inf):
             collector = collector_of(group, style, failing())

@@ -51,7 +51,7 @@ async def test_blocks_hold_values_of_envs_that_are_reset_apart() -> None:
         check(batch.observation)
         return {"action": ["end" if k == 1 else "on" for k in range(len(batch))]}
 
-    config = rl.EnvConfig(name="c", make_env=Counting, num_workers=3, placement="loop")
+    config = rl.EnvConfig(name="c", task=Counting, num_workers=3, placement="loop")
     async with rl.build_env_group(config) as group:
         with group.auto_reset(math.inf):
             collector = Collector(group, policy, num_transitions=15, wait_all=True)
@@ -71,7 +71,7 @@ async def test_joined_batches_keep_them() -> None:
         )
 
     entries = [
-        rl.EnvConfig(name=kind.__name__, make_env=kind, num_workers=2, placement="loop")
+        rl.EnvConfig(name=kind.__name__, task=kind, num_workers=2, placement="loop")
         for kind in (Counting, Other)
     ]
     async with rl.build_env_group(entries) as group:

@@ -117,7 +117,7 @@ class Use:
         self.options, self.kind = options, KINDS[options.kind]
         entry = {
             "name": "env",
-            "make_env": partial(self.kind.make, options.task),
+            "task": partial(self.kind.make, options.task),
             "num_workers": NUM_ENVS,
             "snapshot_every": options.snapshot_every,
             **PLACEMENTS[options.placement],

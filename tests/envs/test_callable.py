@@ -77,7 +77,7 @@ def test_wrapped_envs_behave_as_in_a_plain_loop() -> None:
 
 def test_one_callable_makes_every_env_of_an_entry() -> None:
     """With the ``env_kwargs`` and the step limit of the entry."""
-    fields = {"make_env": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}
+    fields = {"task": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}
     with inline(**fields, max_episode_steps=3) as group:
         batch, _ = group.reset(seed=0)
         assert [meta.max_episode_steps for meta in group.init()] == [3, 3]
@@ -97,7 +97,7 @@ def test_workers_have_the_tasks_that_the_program_has_registered() -> None:
     try:
         entries = [
             {"name": "named", "backend": "gymnasium", "task": "Here-v0"},
-            {"name": "made", "make_env": lambda: gym.make("Here-v0")},
+            {"name": "made", "task": lambda: gym.make("Here-v0")},
         ]
         with build_env_group(entries) as group:
             assert [meta.max_episode_steps for meta in group.metas] == [3, 3]
@@ -110,10 +110,10 @@ def test_workers_have_the_tasks_that_the_program_has_registered() -> None:
 def test_errors_name_the_callable_of_the_env() -> None:
     """If there is no task."""
     makers = [wrapped_pendulum, lambda: wrapped_pendulum(5.0)]
-    with inline(make_env=makers, num_workers=2) as group:
+    with inline(task=makers, num_workers=2) as group:
         for k, name in enumerate((r"wrapped_pendulum", r"\S+<lambda>")):
             (env_id,) = [env_id for env_id in group.env_ids if env_id.endswith(str(k))]
-            said = rf"'{env_id}' \(entry '\w+', backend callable, make_env {name}\) raised"
+            said = rf"'{env_id}' \(entry '\w+', backend callable, task {name}\) raised"
             with pytest.raises(EnvRaised, match=said):
                 group[env_id].call("nothing")
 
@@ -131,7 +131,7 @@ def test_yaml_names_a_function(tmp_path: Any) -> None:
 def test_a_vector_env_determines_num_envs() -> None:
     """Sub-environments and autoreset mode; several have an axis of their own."""
     for count in (1, 3):
-        with inline(make_env=lambda n=count: gym.make_vec("CartPole-v1", n)) as group:
+        with inline(task=lambda n=count: gym.make_vec("CartPole-v1", n)) as group:
             (meta,) = group.init()
             assert (meta.num_envs, meta.autoreset) == (count, "next_step")
             batch, _ = group.reset(seed=3)
@@ -143,7 +143,7 @@ def test_a_vector_env_determines_num_envs() -> None:
 
 def test_a_base_env_gets_the_entry_of_its_callable() -> None:
     """It has the entry's name, and uses the group's preprocess function."""
-    config = EnvConfig(name="own", make_env=Counter, num_workers=2, placement="inline")
+    config = EnvConfig(name="own", task=Counter, num_workers=2, placement="inline")
     with build_env_group(config, preprocess_fn=lambda response: response.action + 1) as group:
         batch, _ = group.reset()
         assert batch.ids() == ["own-0", "own-1"]
@@ -175,11 +175,9 @@ def test_many_of_a_gymnasium_task_in_one_env(task: str, entry_point: bool) -> No
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"name": "e", "make_env": wrapped_pendulum, "backend": "mujoco"}, "replaces backend"),
-        ({"name": "e", "make_env": [Counter], "num_workers": 2}, "1 callables for num_workers: 2"),
-        ({"name": "e", "make_env": Counter, "task": "a:b"}, "leave 'a:b' out"),
+        ({"name": "e", "task": wrapped_pendulum, "backend": "mujoco"}, "takes a name"),
+        ({"name": "e", "task": [Counter], "num_workers": 2}, "1 callables for num_workers: 2"),
         ({"name": "e", "task": "Counter", "backend": "callable"}, "module:function"),
-        ({"name": "e", "make_env": "Counter"}, "make_env"),
     ],
 )
 def test_an_invalid_callable_raises_before_anything_starts(given: Any, said: str) -> None:
@@ -195,23 +193,23 @@ def test_a_callable_that_cannot_be_pickled_raises_before_anything_starts() -> No
     def locked() -> Any:
         return lock and gym.make("CartPole-v1")
 
-    with pytest.raises(ConfigError, match=r"make_env .*locked can't be sent.*captures 'lock'"):
+    with pytest.raises(ConfigError, match=r"task .*locked can't be sent.*captures 'lock'"):
         build_env_group([locked])
-    with inline(make_env=locked) as group:
+    with inline(task=locked) as group:
         assert len(group) == 1
 
 
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"make_env": dict}, "must return a gymnasium.Env.*not dict"),
-        ({"make_env": wrapped_pendulum, "num_envs": 2}, "returned a single env; leave num_envs"),
+        ({"task": dict}, "must return a gymnasium.Env.*not dict"),
+        ({"task": wrapped_pendulum, "num_envs": 2}, "returned a single env; leave num_envs"),
         (
-            {"make_env": lambda: gym.make_vec("CartPole-v1", 3), "num_envs": 2},
+            {"task": lambda: gym.make_vec("CartPole-v1", 3), "num_envs": 2},
             "returned 3 of them; leave num_envs",
         ),
         (
-            {"make_env": lambda: gym.make_vec("CartPole-v1", 3), "max_episode_steps": 9},
+            {"task": lambda: gym.make_vec("CartPole-v1", 3), "max_episode_steps": 9},
             "a vector env keeps its own limits",
         ),
     ],

@@ -95,7 +95,7 @@ def heavier() -> gym.Env[Any, Any]:
 
 def test_a_model_that_changes() -> None:
     """Masses and gravity are restored, and values that one step computes for the next."""
-    goes_on(make_env=heavier)
+    goes_on(task=heavier)
 
 
 def test_a_model_of_another_structure_raises() -> None:
@@ -199,7 +199,7 @@ BOX = gym.spaces.Box(-1, 1, (1,), np.float64)
     ids=lambda space: type(space).__name__,
 )
 def test_generators_of_nested_spaces_are_restored(space: gym.Space[Any]) -> None:
-    goes_on(make_env=partial(Sampling, space))
+    goes_on(task=partial(Sampling, space))
 
 
 @pytest.mark.simulators
@@ -207,7 +207,7 @@ def test_sticky_actions_of_any_other_env_raise() -> None:
     """The console in a callable's env is ale-py's, which doesn't reveal its last action."""
     pytest.importorskip("ale_py")
     for probability in (0.25, 0.0):
-        made = Made(0, make_env=partial(atari, repeat_action_probability=probability))
+        made = Made(0, task=partial(atari, repeat_action_probability=probability))
         if probability:
             with pytest.raises(NotImplementedError, match="use backend: ale"):
                 made.env.save_state()

@@ -162,7 +162,7 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
         return {"action": action, **dict.fromkeys(agent.TOKENS)}
 
     config = rl.EnvConfig(
-        name="h", make_env=Hanging, num_workers=3, placement="loop", step_timeout=0.05
+        name="h", task=Hanging, num_workers=3, placement="loop", step_timeout=0.05
     )
     async with rl.build_env_group(config) as group:
         rollouts = {

@@ -152,7 +152,7 @@ class Hanging(Walk):
 @on_one_driver
 def test_an_aborted_episode_is_not_resumed(start: Start) -> None:
     """Those of other envs in its worker continue from their checkpoints."""
-    group = start({**RESUMING, "make_env": Hanging, "snapshot_every": 1})
+    group = start({**RESUMING, "task": Hanging, "snapshot_every": 1})
     batch, _ = group.reset(seed=1)
     for _ in range(3):
         batch, _ = group.step(batch.respond(action=[0] * 4))

@@ -56,7 +56,7 @@ class Waits:
 
 
 def waits(num_workers: int = 4, **fields: Any) -> dict[str, Any]:
-    config = {"name": "w", "make_env": Waits, "num_workers": num_workers}
+    config = {"name": "w", "task": Waits, "num_workers": num_workers}
     return {**config, "envs_per_process": num_workers, **fields}
 
 

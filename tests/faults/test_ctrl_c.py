@@ -111,7 +111,7 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
     """Its handler is called at once, and is there afterwards; without one, nothing is left."""
     heard: list[int] = []
     before = signal.getsignal(signal.SIGINT)
-    entry = {"name": "a", "make_env": Pressing, "placement": "inline"}
+    entry = {"name": "a", "task": Pressing, "placement": "inline"}
     with rlightning_aio.sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         assert signal.getsignal(signal.SIGINT) is before
@@ -142,7 +142,7 @@ class Saved(Pressing):
 def test_an_interrupted_call_of_all_inline_envs_keeps_none_of_them_busy(use: str) -> None:
     """What is left of it is executed before the next request."""
     Saved.presses = iter([press])
-    entry = {"name": "a", "make_env": Saved, "placement": "inline", "num_workers": 4}
+    entry = {"name": "a", "task": Saved, "placement": "inline", "num_workers": 4}
     with rlightning_aio.sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         with pytest.raises(KeyboardInterrupt):
@@ -185,7 +185,7 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
     """Once the call has ended, though nobody waits for it."""
     go_on = tmp_path / "go-on"
     waits_for = os.getpid(), str(go_on)
-    entry = {"name": "a", "make_env": Waiting}
+    entry = {"name": "a", "task": Waiting}
     with rlightning_aio.sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         env = group["a-0"]
@@ -209,7 +209,7 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
 
 def test_an_interrupt_names_the_env_that_was_waited_for() -> None:
     """And `close` then names the env that hangs."""
-    entry = {"name": "a", "make_env": Waiting, "num_workers": 3, "envs_per_process": 3}
+    entry = {"name": "a", "task": Waiting, "num_workers": 3, "envs_per_process": 3}
     group = rlightning_aio.sync.build_env_group(entry)
     group.init()
     group.reset()
@@ -222,7 +222,7 @@ def test_an_interrupt_names_the_env_that_was_waited_for() -> None:
 
 
 def test_an_interrupted_start_names_the_envs_that_have_not_started() -> None:
-    entry = {"name": "a", "make_env": Starting, "num_workers": 10, "envs_per_process": 10}
+    entry = {"name": "a", "task": Starting, "num_workers": 10, "envs_per_process": 10}
     group = rlightning_aio.sync.build_env_group(entry)
     with pytest.raises(KeyboardInterrupt) as caught:
         group.init()
@@ -251,7 +251,7 @@ class Closing(Waiting):
 
 def test_an_interrupted_close_does_all_that_a_close_does(tmp_path: Path) -> None:
     """A timeline that was begun is written."""
-    group = rlightning_aio.sync.build_env_group({"name": "a", "make_env": Closing})
+    group = rlightning_aio.sync.build_env_group({"name": "a", "task": Closing})
     group.init()
     group.trace(tmp_path / "timeline.json").start()
     with pytest.raises(KeyboardInterrupt):

@@ -123,7 +123,7 @@ def test_no_result_is_lost_wherever_a_call_is_interrupted(
     """The call raises KeyboardInterrupt, and its results are collected; or it returns them, and the
     next call raises it.
     """
-    entry = {"name": "e", "make_env": Serial, **PLACES[place]}
+    entry = {"name": "e", "task": Serial, **PLACES[place]}
     with rlightning_aio.sync.build_env_group(entry) as group:
         answers = Answers(group)
         batch, flags = group.reset()

@@ -403,7 +403,7 @@ def test_the_traceback_of_code_that_no_worker_can_import(start: Start, way: str)
 
     local = {
         "name": "local",
-        "make_env": local_env(works if way in ("preprocess_fn", "argument") else fails),
+        "task": local_env(works if way in ("preprocess_fn", "argument") else fails),
     }
     group = start(local, preprocess_fn=fails if way == "preprocess_fn" else None)
     batch, _ = group.reset()

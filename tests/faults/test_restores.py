@@ -48,7 +48,7 @@ class Deadly(gym.Env[Any, Any]):
 
 ENTRY: dict[str, Any] = {
     "name": "e",
-    "make_env": Deadly,
+    "task": Deadly,
     "num_workers": 4,
     "envs_per_process": 2,
 }

@@ -46,7 +46,7 @@ class Walk(gym.Env[Any, Any]):
 NUM_DEATHS = int(os.environ.get("RLIGHTNING_AIO_DEATHS", "4"))
 ENTRY: dict[str, Any] = {
     "name": "e",
-    "make_env": Walk,
+    "task": Walk,
     "num_workers": 4,
     "envs_per_process": 2,
     "on_worker_death": "resume",
@@ -150,7 +150,7 @@ def test_a_resumed_env_reports_the_number_of_lost_steps(start: Start) -> None:
 @on_one_driver
 def test_a_step_limit_does_not_count_lost_steps(start: Start) -> None:
     """They are made again, and the limit comes after as many steps as without the death."""
-    group = start({**ENTRY, "num_workers": 1, "make_env": Straight})
+    group = start({**ENTRY, "num_workers": 1, "task": Straight})
     batch, _ = group.reset(seed=3)
     lengths = []
     with group.auto_reset(12):
@@ -166,7 +166,7 @@ def test_a_step_limit_does_not_count_lost_steps(start: Start) -> None:
 @on_one_driver
 def test_wrappers_and_generators_are_resumed(start: Start) -> None:
     """Running means are restored, whatever request was in progress at the death."""
-    entry = {**ENTRY, "make_env": Averaged, "num_workers": 1, "snapshot_every": 1}
+    entry = {**ENTRY, "task": Averaged, "num_workers": 1, "snapshot_every": 1}
     runs = []
     for deaths in ((), (4, 11, 13)):
         group = start(entry)
@@ -187,7 +187,7 @@ def test_wrappers_and_generators_are_resumed(start: Start) -> None:
 @on_one_driver
 def test_a_restored_env_resumes_from_the_restored_state(start: Start) -> None:
     """A death after a restore doesn't bring back the state before it."""
-    group = start({**ENTRY, "num_workers": 1, "make_env": Straight, "snapshot_every": 50})
+    group = start({**ENTRY, "num_workers": 1, "task": Straight, "snapshot_every": 50})
     batch, _ = group.reset(seed=3)
     for _ in range(3):
         batch, _ = group.step(batch.respond(action=[0]))
@@ -205,7 +205,7 @@ def test_a_restored_env_resumes_from_the_restored_state(start: Start) -> None:
 @on_one_driver
 def test_a_snapshot_of_an_env_that_was_taken_back_is_of_one_moment(start: Start) -> None:
     """State, info and counters are those of the checkpoint, also in its marked result."""
-    entry = {**ENTRY, "num_workers": 2, "make_env": Straight, "snapshot_every": 4}
+    entry = {**ENTRY, "num_workers": 2, "task": Straight, "snapshot_every": 4}
     group = start(entry)
     batch, _ = group.reset(seed=3)
     with group.group.auto_reset(10):
@@ -242,7 +242,7 @@ def test_an_env_without_checkpoints_raises_at_its_first_reset(
     build: Callable[..., Driven],
 ) -> None:
     """Not only at the first death."""
-    group = build({**ENTRY, "make_env": Locked, "num_workers": 1})
+    group = build({**ENTRY, "task": Locked, "num_workers": 1})
     group.init()
     with pytest.raises(EnvRaised, match=r"raised in reset: .*env\.env\.lock of env 'e-0'"):
         group.reset()
@@ -260,7 +260,7 @@ class Locked(Straight):
         ({"on_worker_death": "restart"}, "snapshot_every: has no meaning without"),
         ({"placement": "inline", "envs_per_process": 1}, "no worker that could die"),
         (
-            {"make_env": None, "backend": "piper", "task": "x"},
+            {"backend": "piper", "task": "x"},
             "can't restore what backend 'piper'",
         ),
     ],

@@ -119,7 +119,7 @@ class Waiting(gym.Env[Any, Any]):
 def test_infinity_is_judged_by_the_space_of_its_own_env(form: str, order: tuple[str, str]) -> None:
     """Whatever the space of the group's first env, whose rows have the same arrays."""
     made = {name: partial(Waiting, limit) for name, limit in (("near", 1), ("far", INF))}
-    entries = [EnvConfig(name=n, make_env=made[n], placement="inline") for n in order]
+    entries = [EnvConfig(name=n, task=made[n], placement="inline") for n in order]
     with sync.build_env_group(entries) as group:
         batch, _ = group.reset()
 

@@ -217,7 +217,7 @@ async def test_a_limit_counts_the_steps_of_one_episode(
 ) -> None:
     """Steps of the previous episode don't count, even if the env resets itself in between."""
     make = partial(SyncVectorEnv, [Brief] * num_envs, autoreset_mode=mode)
-    group = await start({"name": "v", "make_env": make})
+    group = await start({"name": "v", "task": make})
     with group.auto_reset(limit):
         batch, _ = await group.reset()
         for turn in range(1, 14):

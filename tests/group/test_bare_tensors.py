@@ -84,7 +84,7 @@ class Fresh(Several):
 @pytest.mark.parametrize("placement", ["inline", "process"])
 def test_every_result_has_the_type_that_the_placement_gives(make: Any, placement: str) -> None:
     """Those of resets, of steps, and those that show a restored state."""
-    config = EnvConfig(name="t", make_env=make, placement=placement, num_workers=2)
+    config = EnvConfig(name="t", task=make, placement=placement, num_workers=2)
     kind = Tensor if placement == "inline" else np.ndarray
 
     def check(batch: Any, steps: int) -> None:
@@ -127,7 +127,7 @@ class OneReward(Several):
 @pytest.mark.parametrize("placement", ["inline", "process"])
 def test_a_bare_result_is_checked_like_any_other(placement: str) -> None:
     """A reward that would have to be spread over the sub-environments is an error."""
-    config = EnvConfig(name="t", make_env=OneReward, placement=placement)
+    config = EnvConfig(name="t", task=OneReward, placement=placement)
     with sync.build_env_group(config) as group:
         batch, _ = group.reset()
         with pytest.raises(EnvRaised, match=r"reward of env 't-0' has shape \(1,\), expected"):

@@ -70,7 +70,7 @@ async def test_an_episode_is_over_at_the_end_of_all_its_agents_or_at_the_limit(
     make_env: Any, action: Any, limit: int | None, num_steps: int
 ) -> None:
     action = {"first": 0, "second": 0} if action is None else action
-    async with build_env_group({"name": "e", "make_env": make_env}) as group:
+    async with build_env_group({"name": "e", "task": make_env}) as group:
         with group.auto_reset(limit or 99):
             async with group.episode("e-0", seed=3) as episode:
                 count = 0
@@ -85,7 +85,7 @@ async def test_an_episode_is_over_when_all_sub_environments_are(other: int) -> N
     def make_env() -> Any:
         return SyncVectorEnv([lambda: Timed(2), lambda: Timed(other)])
 
-    config = {"name": "e", "make_env": make_env}
+    config = {"name": "e", "task": make_env}
     async with build_env_group(config) as group, group.episode("e-0") as episode:
         assert not episode.is_over
         for over in (False, other == 2):

@@ -281,7 +281,7 @@ class Echo(gym.Env[Any, Any]):
 @pytest.mark.parametrize("text", ["the action is in the row", "ACTION_IN_ROW", "None", ""])
 async def test_any_text_is_an_action(start: Any, text: str) -> None:
     """None has a meaning of its own on the way to the env."""
-    group = await start({"name": "e", "backend": "callable", "make_env": Echo, "num_workers": 2})
+    group = await start({"name": "e", "backend": "callable", "task": Echo, "num_workers": 2})
     batch, _ = await group.reset()
     batch, _ = await group.step(batch.respond(action=[text, "other"]))
     assert batch.info("heard") == [text, "other"]

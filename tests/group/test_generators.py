@@ -55,7 +55,7 @@ DICE = pytest.mark.parametrize("make", [Dice, AwaitableDice])
 def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 2) -> list[Any]:
     """The numbers of a reset, three steps, a death, three steps, and all of it again, by env."""
     found: list[Any] = []
-    config = EnvConfig(name="d", make_env=make, num_workers=count, envs_per_process=1)
+    config = EnvConfig(name="d", task=make, num_workers=count, envs_per_process=1)
     with sync.build_env_group(config) as group:
         for _ in range(2):
             batch, _ = group.reset(seed=seed, options=options)
@@ -84,7 +84,7 @@ def test_a_seeded_group_has_the_same_numbers_again(make: Any, options: Any) -> N
 
 
 def test_an_env_in_this_process_leaves_the_generators_to_their_owner() -> None:
-    config = EnvConfig(name="d", make_env=Dice, placement="inline")
+    config = EnvConfig(name="d", task=Dice, placement="inline")
     random.seed(3)
     np.random.seed(3)  # noqa: NPY002
     with sync.build_env_group(config) as group:

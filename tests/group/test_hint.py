@@ -230,7 +230,7 @@ class Sleeper(gym.Env[Any, Any]):
 
 def test_envs_that_truly_wait_get_the_warning(caplog: pytest.LogCaptureFixture) -> None:
     """A sleep takes hardly any time of a core, however slow the machine is."""
-    config = {"name": "bed", "make_env": Sleeper, "num_workers": 2, "envs_per_process": 2}
+    config = {"name": "bed", "task": Sleeper, "num_workers": 2, "envs_per_process": 2}
     with sync.build_env_group(config) as group:
         batch, _ = group.reset()
         while not warned(caplog):

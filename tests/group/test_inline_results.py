@@ -78,7 +78,7 @@ class Interrupting(gym.Env[Any, Any]):
 def test_a_drain_has_what_another_entry_did_before_an_interrupt() -> None:
     """Its result is reported although another env was interrupted."""
     quiet = {"name": "quiet", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
-    loud = {"name": "loud", "make_env": Interrupting, "placement": "inline"}
+    loud = {"name": "loud", "task": Interrupting, "placement": "inline"}
     with rlightning_aio.sync.build_env_group([quiet, loud]) as group:
         with pytest.raises(KeyboardInterrupt):
             group.reset()
@@ -214,7 +214,7 @@ class Telling(gym.Env[Any, Any]):
 def test_numbers_that_an_observation_space_can_not_hold_are_an_error() -> None:
     """The error has the number; numbers that fit may have a wider dtype."""
     with rlightning_aio.sync.build_env_group(
-        {"name": "t", "make_env": Telling, "placement": "inline"}
+        {"name": "t", "task": Telling, "placement": "inline"}
     ) as group:
         batch, _ = group.reset()
         assert batch.observation["history"].tolist() == [[0, -128]]
@@ -227,7 +227,7 @@ def test_numbers_that_an_observation_space_can_not_hold_are_an_error() -> None:
 def test_an_info_of_empty_arrays_arrives_unchanged() -> None:
     """It takes no byte of a row."""
     with rlightning_aio.sync.build_env_group(
-        {"name": "t", "make_env": Telling, "placement": "inline"}
+        {"name": "t", "task": Telling, "placement": "inline"}
     ) as group:
         batch, _ = group.reset()
         (info,) = batch.info()

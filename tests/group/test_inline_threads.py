@@ -40,7 +40,7 @@ class Gated(SyncVectorEnv):
 
 def entry(*gated: Gated) -> Any:
     makers = [lambda env=env: env for env in gated]
-    return {"name": "gated", "placement": "inline", "num_workers": len(gated), "make_env": makers}
+    return {"name": "gated", "placement": "inline", "num_workers": len(gated), "task": makers}
 
 
 RIGHT = np.ones((1, 2), np.int64)

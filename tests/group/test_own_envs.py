@@ -193,7 +193,7 @@ def test_an_action_space_may_be_empty(space: gym.Space[Any]) -> None:
             self.now += 1
             return self.now, float(action == space.sample()), False, False, {}
 
-    clock = {"name": "clock", "make_env": Clock, "num_workers": 2}
+    clock = {"name": "clock", "task": Clock, "num_workers": 2}
     with sync.build_env_group({**clock, "envs_per_process": 2}) as group:
         batch, _ = group.reset()
         for now in (1, 2):

@@ -67,8 +67,8 @@ ENTRIES: dict[str, dict[str, Any]] = {
     "gymnasium, several": {"backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2},
     "mujoco": {"backend": "mujoco", "task": "Hopper-v5"},
     "mujoco, several": {"backend": "mujoco", "task": "InvertedPendulum-v5", "num_envs": 2},
-    "wrappers": {"make_env": wrapped},
-    "of its own": {"make_env": Wandering},
+    "wrappers": {"task": wrapped},
+    "of its own": {"task": Wandering},
 }
 
 
@@ -332,7 +332,7 @@ class Fragile(gym.Env[Any, Any]):
 
 def test_all_envs_are_restored_or_none() -> None:
     """If one fails, all of them keep their previous state."""
-    entry = {"name": "e", "make_env": Fragile, "num_workers": 3, "envs_per_process": 1}
+    entry = {"name": "e", "task": Fragile, "num_workers": 3, "envs_per_process": 1}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         batch, _ = group.step(batch.respond(action=[0, 0, 0]))
@@ -358,7 +358,7 @@ class Lost(Fragile):
 
 def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
     """The other envs keep their state."""
-    entry = {"name": "e", "make_env": Lost, "num_workers": 2, "placement": "inline"}
+    entry = {"name": "e", "task": Lost, "num_workers": 2, "placement": "inline"}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         snapshot = group.snapshot()
@@ -372,7 +372,7 @@ def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
 
 
 def test_an_env_that_was_never_reset_has_no_state_after_a_restore_that_failed() -> None:
-    entry = {"name": "e", "make_env": Lost, "num_workers": 2, "placement": "inline"}
+    entry = {"name": "e", "task": Lost, "num_workers": 2, "placement": "inline"}
     with sync.build_env_group(entry) as one, sync.build_env_group(entry) as other:
         one.reset()
         batch, _ = other.reset(env_ids=["e-1"])
@@ -408,7 +408,7 @@ class Hidden(Fragile):
 
 def test_an_env_that_cannot_be_saved_names_the_attribute() -> None:
     """The attribute that can't be pickled."""
-    with sync.build_env_group({"name": "e", "make_env": Hidden, "placement": "inline"}) as group:
+    with sync.build_env_group({"name": "e", "task": Hidden, "placement": "inline"}) as group:
         group.reset()
         with pytest.raises(EnvRaised, match=r"env\.env\.handle of env 'e-0', a lock"):
             group.snapshot()

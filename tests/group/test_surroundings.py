@@ -49,14 +49,14 @@ def test_each_entry_has_its_own_surroundings(
     entries = [
         {
             "name": "plain",
-            "make_env": witness,
+            "task": witness,
             "num_workers": 2,
             "envs_per_process": 1,
             "cpu_affinity": True,
         },
         {
             "name": "other",
-            "make_env": witness,
+            "task": witness,
             "interpreter": str(program),
             "env_vars": {"FLAVOUR": "sugar", "PYTHONPATH": str(tmp_path), "MKL_NUM_THREADS": "3"},
             "imports": ["flavoured"],

@@ -363,7 +363,7 @@ async def test_an_episode_that_is_cancelled_in_its_reset_leaves_its_env_idle() -
             await self.gate.wait()
             return await super().reset(seed=seed, options=options)
 
-    config = rl.EnvConfig(name="p", make_env=Opening, placement="loop")
+    config = rl.EnvConfig(name="p", task=Opening, placement="loop")
     async with rl.build_env_group(config) as group:
         entering = asyncio.ensure_future(group.episode("p-0", seed=1).__aenter__())
         await Opening.at_gate.wait()
@@ -412,7 +412,7 @@ async def test_a_rebuilt_env_goes_on_with_the_task_of_the_episode_that_was_lost(
     options: dict[str, Any],
 ) -> None:
     """The one of its last reset, also if several envs were lost in a row."""
-    config = rl.EnvConfig(name="t", make_env=_tasked, step_timeout=SOON, placement="loop")
+    config = rl.EnvConfig(name="t", task=_tasked, step_timeout=SOON, placement="loop")
     async with rl.build_env_group(config) as group:
         await group.reset(seed=1, options={"task": "before"})
         await group.reset(seed=5, options=options)
@@ -633,7 +633,7 @@ async def test_the_garbage_collectors_time_is_nobodys(caplog: pytest.LogCaptureF
             time.sleep(0.12)
 
     asyncio.get_running_loop().set_debug(False)
-    config = rl.EnvConfig(name="p", make_env=Littered, placement="loop")
+    config = rl.EnvConfig(name="p", task=Littered, placement="loop")
     async with rl.build_env_group(config) as group:
         await group.reset(seed=0)
         gc.callbacks.append(take_long)
@@ -762,7 +762,7 @@ class Plain:
 
 async def test_an_object_with_gymnasiums_methods_will_do(place: dict[str, Any]) -> None:
     """Made by a callable, which need not be sent anywhere under `placement: loop`."""
-    config = rl.EnvConfig(name="p", make_env=Plain, num_workers=3, **place)
+    config = rl.EnvConfig(name="p", task=Plain, num_workers=3, **place)
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset(seed=10)
         with group.auto_reset(math.inf):
@@ -783,7 +783,7 @@ class Slotted:
 async def test_such_an_object_goes_on_where_its_snapshot_was_taken(
     kind: Any, place: dict[str, Any]
 ) -> None:
-    config = rl.EnvConfig(name="p", make_env=kind, num_workers=2, **place)
+    config = rl.EnvConfig(name="p", task=kind, num_workers=2, **place)
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset(seed=0)
         batch, _ = await group.step(batch.respond(action=np.array([1, 2])))
@@ -863,9 +863,7 @@ async def test_a_loop_with_eager_tasks_will_do() -> None:
     """A step that waits for nothing does not end while it is being sent."""
     loop = asyncio.get_running_loop()
     fields = {"placement": "loop", "max_concurrency": 2, "step_timeout": LONG}
-    config = rl.EnvConfig.model_validate(
-        {"name": "p", "make_env": Ready, "num_workers": 500, **fields}
-    )
+    config = rl.EnvConfig.model_validate({"name": "p", "task": Ready, "num_workers": 500, **fields})
     loop.set_task_factory(EAGER)
     try:
         async with rl.build_env_group(config) as group:

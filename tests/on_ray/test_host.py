@@ -101,7 +101,7 @@ def wide() -> type[gym.Env[Any, Any]]:
 async def test_envs_of_several_layouts_share_an_actor(sync_facade: Place) -> None:
     """Each has its row among those like it; large observations cross as well."""
     makers = [lambda: gym.make("CartPole-v1"), wide()] * 2
-    config = {"name": "mixed", "make_env": makers, "num_workers": 4, "placement": "ray"}
+    config = {"name": "mixed", "task": makers, "num_workers": 4, "placement": "ray"}
     async with sync_facade.build({**config, "envs_per_process": 4}, mixed_actions=True) as group:
         await group.reset(seed=3)
         with gym.make("CartPole-v1") as bare:

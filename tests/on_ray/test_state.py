@@ -84,7 +84,7 @@ class Mortal(Walk):
 
 KEPT = {
     "name": "e",
-    "make_env": Mortal,
+    "task": Mortal,
     "num_workers": 4,
     "on_worker_death": "resume",
     "snapshot_every": 5,
@@ -96,7 +96,7 @@ KEPT = {
 
 def test_all_envs_are_restored_or_none() -> None:
     """One fails at it; those in other actors are where they were."""
-    entry = {"name": "e", "make_env": Fragile, "num_workers": 2, **IN_ACTORS}
+    entry = {"name": "e", "task": Fragile, "num_workers": 2, **IN_ACTORS}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         batch, _ = group.step(batch.respond(action=[0, 0]))
@@ -112,7 +112,7 @@ def test_all_envs_are_restored_or_none() -> None:
 def test_episodes_after_deaths_have_the_returns_of_a_run_without() -> None:
     """Of actors at random turns; no more steps are lost at once than the entry says."""
     group = Driven("sync", KEPT)
-    local = {"name": "e", "make_env": Mortal, "num_workers": 4, "placement": "inline"}
+    local = {"name": "e", "task": Mortal, "num_workers": 4, "placement": "inline"}
     twins = Driven("sync", local)
     turns = iter(range(10_000))
 

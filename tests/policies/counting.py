@@ -57,7 +57,7 @@ def chunk_of(observation: Any, horizon: int = 5) -> Any:
 
 
 def group_of(num_workers: int = 2, **fields: Any) -> sync.EnvGroup:
-    entry = {"name": "env", "make_env": Counting, "placement": "inline", "num_workers": num_workers}
+    entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": num_workers}
     return sync.build_env_group({**entry, **fields})
 
 

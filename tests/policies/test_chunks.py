@@ -59,7 +59,7 @@ async def test_the_policy_may_be_a_coroutine_function() -> None:
     async def policy(batch: rl.BatchedData) -> Any:
         return chunks(batch)
 
-    entry = {"name": "env", "make_env": Counting, "placement": "inline", "num_workers": 3}
+    entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": 3}
     async with rl.build_env_group(entry) as group:
         with group.auto_reset(100):
             check(await evaluate(group, ActionChunks(policy, 3), QUEUE))

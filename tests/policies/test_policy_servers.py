@@ -58,7 +58,7 @@ def test_actions_of_a_vla_eval_server_are_played(chunks: bool) -> None:
 
 async def test_they_are_awaited_over_an_asynchronous_group() -> None:
     """The loop of the group goes on while a server computes."""
-    entry = {"name": "env", "make_env": Counting, "placement": "inline", "num_workers": 2}
+    entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": 2}
     with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
         async with rl.build_env_group(entry) as group:
             with group.auto_reset(100):
@@ -81,7 +81,7 @@ async def test_a_synchronous_group_waits_for_them_in_a_running_loop() -> None:
 
 async def test_an_answer_that_nobody_awaits_was_not_asked_for() -> None:
     """The client can be used on; while an answer is awaited, a second one is refused."""
-    entry = {"name": "env", "make_env": Counting, "placement": "inline"}
+    entry = {"name": "env", "task": Counting, "placement": "inline"}
     server = OpenPiServer()
     with serving(server) as url, OpenPiPolicy(url) as policy:
         async with rl.build_env_group(entry) as group:

@@ -103,7 +103,7 @@ class Plan:
         if self.start:
             makers[-1] = partial(broken, self.start, make, *makers[-1].args)
             found["start_timeout"] = 5.0
-        return found | {"make_env": makers}
+        return found | {"task": makers}
 
     def codes(self, number: int, worker: int) -> list[int]:
         """Of the sub-environments of one env."""

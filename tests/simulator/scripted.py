@@ -673,4 +673,4 @@ MAKERS: dict[str, Callable[..., Any]] = {
     "awaitable": Awaitable,
     "stacked": Stacked,
 }
-"""What `make_env` may call, by the form of the envs; `ScriptedBase` is a backend."""
+"""What `task` may call, by the form of the envs; `ScriptedBase` is a backend."""

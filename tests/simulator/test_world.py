@@ -66,7 +66,7 @@ def config(**fields: Any) -> rl.EnvConfig:
     return rl.EnvConfig(
         name="counting",
         backend="callable",
-        make_env=CountingEnv,
+        task=CountingEnv,
         **{"num_workers": 4, "envs_per_process": 2, **fields},
     )
 
@@ -96,7 +96,7 @@ def played(world: World, **fields: Any) -> list[float]:
 async def played_async() -> list[float]:
     """Play with envs in workers, and with awaitable ones in a worker and on the loop."""
     seen: list[float] = []
-    two = {"backend": "callable", "make_env": AwaitableEnv, "num_workers": 2}
+    two = {"backend": "callable", "task": AwaitableEnv, "num_workers": 2}
     kinds = [
         config(),
         rl.EnvConfig(name="in-worker", envs_per_process=2, step_timeout=9.0, **two),

@@ -370,9 +370,9 @@ def test_make_vec_passes_on_what_the_runtime_needs(task: str, mode: Any) -> None
 
 def test_errors_name_what_the_user_has_given() -> None:
     """The task, the class or the function, and not what this package puts around it."""
-    with pytest.raises(StartFailed, match=r"make_env CartPole-v1\).*'unknown'"):
+    with pytest.raises(StartFailed, match=r"task CartPole-v1\).*'unknown'"):
         make_vec("CartPole-v1", 2, unknown=3)
-    with pytest.raises(StartFailed, match=r"make_env Sized\)"):
+    with pytest.raises(StartFailed, match=r"task Sized\)"):
         VectorEnv([partial(Sized, high=3)] * 2)
 
 

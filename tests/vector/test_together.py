@@ -286,7 +286,7 @@ def test_an_entry_of_vector_environments_of_one_has_results_of_single_envs(
     }
     found: list[Any] = []
     for make in makers.values():
-        config: Any = {"name": "e", "make_env": make}
+        config: Any = {"name": "e", "task": make}
         with sync.build_env_group(config) as group, group.auto_reset(math.inf):
             batch, _ = group.reset(seed=1)
             rewards = 0

@@ -83,7 +83,7 @@ def check(
 async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
     for config in configs:
         found = _Finding(
-            config.name, config.backend, config.task, config.num_workers, config.num_envs
+            config.name, config.backend, config.task_name, config.num_workers, config.num_envs
         )
         if config.backend == "env_server":
             found.skipped = "its envs live with its clients"
@@ -105,9 +105,11 @@ def _offers(config: EnvConfig) -> dict[str, Any]:
 
     headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers
     try:
-        return {path: get_json(config.task, f"/{path}", headers) for path in ("metadata", "schema")}
+        return {
+            path: get_json(config.task_name, f"/{path}", headers) for path in ("metadata", "schema")
+        }
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{config.name!r}: {config.task} can't be read: {error}") from error
+        raise ConfigError(f"{config.name!r}: {config.task_name} can't be read: {error}") from error
 
 
 async def _try(config: EnvConfig, found: _Finding) -> None:

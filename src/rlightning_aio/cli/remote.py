@@ -150,7 +150,7 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
     except Exception as error:  # noqa: BLE001  # It is the env author's code.
         words, env_id = ErrorText.of(error), f"{entry.name}-0"
         fault = EnvRaised.of(
-            f"{env_id} (backend {entry.backend!r}, task {entry.task!r}) raised "
+            f"{env_id} (backend {entry.backend!r}, task {entry.task_name!r}) raised "
             f"{words.summary}; its __cause__ is the remote traceback",
             env_id=env_id,
             exception_type=words.type_name,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from rlightning_aio.config.checks import check_installed
 from rlightning_aio.config.documents import load_config, parse_configs
-from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, VideoConfig, moved
+from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, VideoConfig, makers_of, moved
 
 __all__ = [
     "MADE_BY_GYMNASIUM",
@@ -18,6 +18,7 @@ __all__ = [
     "VideoConfig",
     "check_installed",
     "load_config",
+    "makers_of",
     "moved",
     "parse_configs",
 ]

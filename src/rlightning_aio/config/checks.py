@@ -8,9 +8,9 @@ import sys
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
-from rlightning_aio.config.entry import CALLABLE, MADE_BY_GYMNASIUM, EnvConfig
+from rlightning_aio.config.entry import CALLABLE, MADE_BY_GYMNASIUM, EnvConfig, makers_of
 from rlightning_aio.config.problems import Problems
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -98,21 +98,16 @@ def _check_backend(config: EnvConfig) -> str | None:
 
 
 def _check_task(config: EnvConfig) -> str | None:
-    if config.make_env is not None and config.backend == CALLABLE:
-        return f"make_env makes the envs; leave {config.task!r} out" if config.task else None
-    if config.backend == CALLABLE and not all(config.task.partition(":")):
-        return f"should look like module:function (or give make_env), got {config.task!r}"
-    return None if config.task or config.backend == "env_server" else "is required"
-
-
-def _check_make_env(config: EnvConfig) -> str | None:
-    makers = config.make_env
-    if makers is None:
-        return None
+    task = config.task
+    if isinstance(task, str):
+        if task.endswith((".yaml", ".yml")):
+            return f"should be a name, got {task!r}; load_config reads files"
+        if config.backend == CALLABLE and not all(task.partition(":")):
+            return f"should be a callable or look like module:function, got {task!r}"
+        return None if task or config.backend == "env_server" else "is required"
     if config.backend != CALLABLE:
-        return f"replaces backend {config.backend!r}; leave one of them out"
-    count = len(cast("tuple[Any, ...]", makers)) if isinstance(makers, tuple) else None
-    if count not in (None, config.num_workers):
+        return f"backend {config.backend!r} takes a name, not a callable; leave the backend out"
+    if (count := len(makers_of(config))) != config.num_workers:
         return f"has {count} callables for num_workers: {config.num_workers}"
     return None
 
@@ -170,8 +165,7 @@ def _check_video(config: EnvConfig) -> str | None:
 
 
 _COMPARED_WITH = {
-    "task": ("make_env",),
-    "make_env": ("num_workers",),
+    "task": ("num_workers",),
     "min_results": ("num_workers",),
     "snapshot_every": ("on_worker_death",),
     "video": ("num_workers", "num_envs", "env_kwargs"),
@@ -180,7 +174,6 @@ _COMPARED_WITH = {
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,
-    "make_env": _check_make_env,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "min_results": _check_min_results,

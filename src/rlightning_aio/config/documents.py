@@ -7,17 +7,21 @@ import itertools
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, cast
 
 from pydantic import ValidationError
 
 from rlightning_aio.config.checks import Entry, check_entry, check_imports, check_names
-from rlightning_aio.config.entry import EnvConfig, with_backend
+from rlightning_aio.config.entry import EnvConfig, completed
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
 from rlightning_aio.config.yaml_files import TOP_LEVEL, imports_above, plain, read_yaml, sections
+from rlightning_aio.errors import ConfigError
 
 __all__ = ["load_config", "parse_configs"]
 
+_OF_ENTRIES = EnvConfig.model_fields.keys() - {"imports"}
+"""Keys of an entry that a document of entries has not."""
 _TYPO = 0.8
 """Similarity above which another section of a file counts as a misspelt name."""
 
@@ -42,18 +46,40 @@ def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     return _parse(read_yaml(source, overrides), source)
 
 
-def parse_configs(env_cfgs: object) -> list[EnvConfig]:
+def parse_configs(
+    env_cfgs: object, fields: Mapping[str, Any] = MappingProxyType({})
+) -> list[EnvConfig]:
     """Check entries that were written in Python.
 
     Args:
-        env_cfgs: an `EnvConfig`, a plain mapping of its fields, or an OmegaConf node of them; a
-            list of these; or a mapping with ``envs:`` (or ``env:``) and ``imports:`` as in
-            a file. A node that is part of a document gets that document's ``imports``.
+        env_cfgs: a task's name, a callable, an `EnvConfig`, a plain mapping of its fields, or an
+            OmegaConf node of them; a list of these; or a mapping with ``envs:`` (or ``env:``) and
+            ``imports:`` as in a file. A node that is part of a document gets that document's
+            ``imports``.
+        fields: of the one entry that a name or callables make; without `env_cfgs`, all of its
+            fields.
 
     Raises:
         ConfigError: something is wrong; the message lists every problem.
     """
-    return _parse(env_cfgs, "environment configuration")
+    return _parse(_with_fields(env_cfgs, fields), "environment configuration")
+
+
+def _with_fields(env_cfgs: object, fields: Mapping[str, Any]) -> object:
+    if not fields:
+        return env_cfgs
+    if env_cfgs is None:
+        return fields
+    several = isinstance(env_cfgs, list | tuple)
+    tasks = cast("Sequence[Any]", env_cfgs) if several else (env_cfgs,)
+    if not (isinstance(env_cfgs, str) or (tasks and all(map(callable, tasks)))):
+        raise ConfigError(
+            f"{', '.join(fields)}: fields can be added to a task's name or to callables; write "
+            "them into the configs"
+        )
+    if "task" in fields:
+        raise ConfigError("task: is given twice")
+    return {"task": tuple(tasks) if several else env_cfgs, **fields}
 
 
 def _parse(env_cfgs: object, source: str) -> list[EnvConfig]:
@@ -76,10 +102,8 @@ def _parse(env_cfgs: object, source: str) -> list[EnvConfig]:
 
 def _split(env_cfgs: object, source: str, problems: Problems) -> tuple[list[tuple[str, Any]], Any]:
     """Return the entries, each with its place, and the imports they share."""
-    if isinstance(env_cfgs, EnvConfig):
+    if isinstance(env_cfgs, EnvConfig | str) or callable(env_cfgs):
         return [("envs.0", env_cfgs)], ()
-    if callable(env_cfgs):
-        return [("envs.0", _entry_of([env_cfgs]))], ()
     document = sections(env_cfgs, source)
     if not isinstance(document, Mapping):
         if isinstance(document, list | tuple):
@@ -87,7 +111,7 @@ def _split(env_cfgs: object, source: str, problems: Problems) -> tuple[list[tupl
         return _listed(document, "envs", problems), imports_above(env_cfgs, source)
     fields = cast("Mapping[Any, Any]", document)
     if not {"env", "envs"} & fields.keys():
-        if {"name", "backend"} & fields.keys():
+        if _OF_ENTRIES & fields.keys():
             return [("envs.0", env_cfgs)], ()
         closeness = 0.0  # No key is known, so report each of them.
     else:
@@ -108,14 +132,14 @@ def _listed(entries: object, key: str, problems: Problems) -> list[tuple[str, An
     text = as_text(entries)
     if isinstance(entries, Mapping):
         entry = cast("Mapping[Any, Any]", entries)
-        if {"name", "backend"} & entry.keys():
+        if _OF_ENTRIES & entry.keys():
             return [(key, entry)]
     if not isinstance(entries, list | tuple):
-        hint = "; load_config reads files" if isinstance(entries, str | Path) else ""
+        hint = "; load_config reads files" if isinstance(entries, Path) else ""
         problems.add(key, f"should be a list of entries, got {text}{hint}")
         return []
     if not entries:
-        problems.add(key, "no entries; give at least one, with name, backend and task")
+        problems.add(key, "no entries; give at least one, with its task")
     found = cast("Sequence[Any]", entries)
     return [(f"{key}.{index}", entry) for index, entry in enumerate(found)]
 
@@ -125,17 +149,8 @@ def _entries_of_callables(listed: Sequence[Any]) -> list[Any]:
     entries: list[Any] = []
     for are_callable, group in itertools.groupby(listed, callable):
         values = list(group)
-        entries += [_entry_of(values)] if are_callable else values
+        entries += [{"task": tuple(values)}] if are_callable else values
     return entries
-
-
-def _entry_of(makers: list[Any]) -> dict[str, Any]:
-    same = all(maker is makers[0] for maker in makers)
-    return {
-        "name": "env",
-        "make_env": makers[0] if same else tuple(makers),
-        "num_workers": len(makers),
-    }
 
 
 def _shared_imports(imports: object, problems: Problems) -> tuple[str, ...]:
@@ -156,16 +171,18 @@ def _with_imports(config: EnvConfig, shared: tuple[str, ...]) -> EnvConfig:
 def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
     if isinstance(entry, EnvConfig):
         return Entry(f"{place} ({entry.name!r})", entry, set())
+    if isinstance(entry, str) or callable(entry):
+        entry = {"task": entry}
     if not isinstance(entry, Mapping):
         problems.add(place, f"should be a mapping of fields, got {as_text(entry)}")
         return None
     given = cast("Mapping[Any, Any]", entry)
-    if isinstance(name := given.get("name"), str) and name:
-        place = f"{place} ({name!r})"
     known = EnvConfig.model_fields
+    fields = completed({k: plain(v, place) for k, v in given.items() if k in known})
+    if isinstance(name := fields.get("name"), str) and name:
+        place = f"{place} ({name!r})"
     for unknown in (k for k in given if k not in known):
         problems.add(f"{place}, {unknown}", unknown_field(unknown, known))
-    fields = with_backend({k: plain(v, place) for k, v in given.items() if k in known})
     try:
         return Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:

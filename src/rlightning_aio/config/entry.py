@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from pydantic import (
@@ -15,8 +16,8 @@ from pydantic import (
     model_validator,
 )
 
-from rlightning_aio.config.problems import Problems, explained, unknown_field
-from rlightning_aio.registry import ENVS, PLACEMENTS, placement_of
+from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
+from rlightning_aio.registry import ENVS, PLACEMENTS, name_of, placement_of
 from rlightning_aio.sharing import num_batches, num_cores
 
 __all__ = [
@@ -24,8 +25,9 @@ __all__ = [
     "MADE_BY_GYMNASIUM",
     "EnvConfig",
     "VideoConfig",
+    "completed",
+    "makers_of",
     "moved",
-    "with_backend",
 ]
 
 CALLABLE = "callable"
@@ -88,22 +90,21 @@ class EnvConfig(_Fields):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
 
-    name: str = Field(min_length=1)
-    """Name of the entry; its envs have the ids ``<name>-0``, ``<name>-1``, …"""
+    name: str = Field(default="", min_length=1)
+    """Name of the entry; its envs have the ids ``<name>-0``, ``<name>-1``, … By default that of the
+    task or of the callable."""
     backend: str = Field(default="", validate_default=True)
-    """Simulator backend (``rlightning-aio backends`` lists them). Where envs come from a callable,
-    the default is ``callable``."""
-    task: str = ""
+    """Simulator backend (``rlightning-aio backends`` lists them). By default ``callable`` where
+    envs come from a callable, ``mujoco`` for Gymnasium's MuJoCo tasks, and ``gymnasium``."""
+    task: str | Callable[..., Any] | tuple[Callable[..., Any], ...] = ""
     """Task name within the backend; required by every backend but ``env_server``. For the
-    backend ``callable``: ``module:function``, which is called with ``env_kwargs``."""
-    make_env: Callable[..., Any] | tuple[Callable[..., Any], ...] | None = Field(
-        default=None, repr=False
-    )
-    """One callable, or one for each env. The worker calls it with ``env_kwargs``, and it returns a
-    `gymnasium.Env`, a `gymnasium.vector.VectorEnv` or a `BaseEnv`."""
+    backend ``callable``: ``module:function``, a callable, or one for each env. The worker calls
+    it with ``env_kwargs``, and it returns a `gymnasium.Env`, a `gymnasium.vector.VectorEnv`, a
+    `BaseEnv` or an object whose ``reset`` and ``step`` are ``async def``."""
     num_workers: int = Field(default=1, ge=1)
-    """Number of envs. With ``auto``, `num_envs` is the total number of sub-environments; they are
-    spread over the cores, and both fields then hold the result."""
+    """Number of envs; by default that of the callables. With ``auto``, `num_envs` is the total
+    number of sub-environments; they are spread over the cores, and both fields then hold the
+    result."""
     num_envs: int = Field(default=1, ge=1)
     """Number of vectorised sub-environments in each env, where the backend supports them."""
     max_episode_steps: int | None = Field(default=None, ge=1)
@@ -156,6 +157,11 @@ class EnvConfig(_Fields):
     video: VideoConfig | None = None
     """Episodes to film from the start; `record_video` films envs of a running group."""
 
+    @property
+    def task_name(self) -> str:
+        """Return the task, or an empty string if callables make the envs."""
+        return self.task if isinstance(self.task, str) else ""
+
     @model_validator(mode="before")
     @classmethod
     def _suggest_known_names(cls, fields: Any) -> Any:
@@ -165,13 +171,13 @@ class EnvConfig(_Fields):
         for name in given:
             if name not in cls.model_fields:
                 raise ValueError(f"{name}: {unknown_field(name, cls.model_fields)}")
-        return _spread_over_cores(with_backend(given))
+        return _spread_over_cores(completed(given))
 
     @field_validator("backend")
     @classmethod
     def _require_backend(cls, backend: str) -> str:
         if not backend:
-            raise ValueError("is required")
+            raise ValueError("is required where no task is given")
         return backend
 
     @field_validator("num_workers", mode="before")
@@ -184,10 +190,16 @@ class EnvConfig(_Fields):
             )
         return num_workers
 
-    @field_validator("make_env", mode="before")
+    @field_validator("task", mode="before")
     @classmethod
-    def _accept_lists(cls, makers: Any) -> Any:
-        return tuple(cast("list[Any]", makers)) if isinstance(makers, list) else makers
+    def _know_tasks(cls, task: Any) -> Any:
+        if isinstance(task, str) or callable(task):
+            return task
+        makers = cast("Sequence[Any]", task if isinstance(task, list | tuple) else ())
+        if makers and all(map(callable, makers)):
+            return tuple(makers)
+        text = as_text(cast("object", task))
+        raise ValueError(f"should be a name, a callable or a list of callables, got {text}")
 
     @field_validator("env_vars", mode="before")
     @classmethod
@@ -230,11 +242,41 @@ class EnvConfig(_Fields):
         return self
 
 
-def with_backend(fields: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `fields` with the backend ``callable`` added where a callable implies it."""
-    if "backend" in fields or ("make_env" not in fields and ":" not in str(fields.get("task"))):
-        return fields
-    return {**fields, "backend": CALLABLE}
+def completed(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `fields` with the backend, name and number of envs that a task implies."""
+    task = fields.get("task") or ""
+    implied: dict[str, Any] = {"backend": _backend_of(task)} if task else {}
+    if isinstance(task, list | tuple):
+        implied["num_workers"] = len(cast("Sequence[Any]", task))
+    whole = {**implied, **fields}
+    return {"name": _name_of(task, whole["backend"]), **whole} if "backend" in whole else whole
+
+
+def makers_of(config: EnvConfig) -> tuple[Callable[..., Any], ...]:
+    """Return the callables of an entry, one for each env, or none if its backend makes them."""
+    task: Any = config.task
+    if isinstance(task, tuple):
+        return cast("tuple[Callable[..., Any], ...]", task)
+    return () if isinstance(task, str) else (task,) * config.num_workers
+
+
+def _backend_of(task: Any) -> str:
+    if not isinstance(task, str) or ":" in task:
+        return CALLABLE
+    import gymnasium  # noqa: PLC0415  # Workers are given their backend.
+
+    spec = gymnasium.registry.get(task)
+    is_mujoco = spec is not None and str(spec.entry_point).startswith("gymnasium.envs.mujoco")
+    return "mujoco" if is_mujoco else "gymnasium"
+
+
+def _name_of(task: Any, backend: object) -> str:
+    """Return the name of an entry that has none, such as ``Pong-v5`` for ``ALE/Pong-v5``."""
+    if isinstance(task, str):  # A URL says nothing, and an env_server has no task.
+        return str(backend) if not task or "://" in task else re.split("[:/]", task)[-1]
+    makers = cast("Sequence[Any]", task if isinstance(task, list | tuple) else [task])
+    names = {name_of(maker).rpartition(".")[2] for maker in makers}
+    return "env" if len(names) != 1 or "<lambda>" in names else names.pop()
 
 
 def _spread_over_cores(fields: Mapping[str, Any]) -> Mapping[str, Any]:

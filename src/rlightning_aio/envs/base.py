@@ -211,7 +211,7 @@ class BaseEnv(abc.ABC):
             agents=self.agents,
             max_episode_steps=self.max_episode_steps,
             autoreset=self.autoreset,
-            task=self.config.task,
+            task=self.config.task_name,
             switches_task=self.switches_task,
         )
 

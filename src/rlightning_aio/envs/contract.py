@@ -124,7 +124,7 @@ class EnvContract:
             for action in self.actions(env):
                 result = env.reset() if ended else _step(env, action)
                 outcome = outcome_of(result)
-                _check_membership(self.config.task, outcome[0], env.get_observation_space())
+                _check_membership(self.config.task_name, outcome[0], env.get_observation_space())
                 if not ended:
                     _check_columns(outcome, meta.agents, shape)
                 ended = _awaits_reset(env, outcome)

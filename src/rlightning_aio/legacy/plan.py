@@ -93,8 +93,7 @@ class Plan:
         return EnvConfig(
             name=self._name(config.name),
             backend="callable",
-            make_env=tuple(replicas),
-            num_workers=len(replicas),
+            task=tuple(replicas),
             **fields,
         )
 

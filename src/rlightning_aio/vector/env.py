@@ -117,7 +117,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if max_concurrency is not None:
             entry = {"envs_per_process": per_worker(max_concurrency, len(makers)), **entry}
         self.group: EnvGroup = build_env_group(
-            {"name": "env", "num_workers": len(makers), "make_env": makers, **entry},
+            {"name": "env", "task": makers, **entry},
             mixed_actions=True,
         )
         metas = self.group.init()

@@ -30,7 +30,7 @@ Mode = Literal["async", "vector_entry_point"]
 BATCH_OPTIONS: Final = ("num_threads", "randomize")
 """Options of envs that are stepped together, in addition to those of the task."""
 _WHICH_ENVS: Final = {
-    "name", "backend", "task", "make_env", "num_workers", "num_envs", "max_episode_steps",
+    "name", "backend", "task", "num_workers", "num_envs", "max_episode_steps",
     "env_kwargs",
 }  # fmt: skip
 RUNTIME_FIELDS: Final = EnvConfig.model_fields.keys() - _WHICH_ENVS | {"autoreset_mode"}

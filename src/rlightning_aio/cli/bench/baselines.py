@@ -193,7 +193,7 @@ def _made(baseline: Baseline) -> _Loop | _Vector:
 
     def make() -> Any:
         with outdated_assets_accepted():
-            return gym.make(config.task, **options)
+            return gym.make(config.task_name, **options)
 
     makers = [make] * baseline.num_sims
     if baseline.words == _LOOP:

@@ -111,7 +111,7 @@ class QueueOptions:
             if names:
                 return [EpisodeSpec(name, seed) for name in names for seed in seeds]
             return [
-                EpisodeSpec(config.task, seed, entry=config.name)
+                EpisodeSpec(config.task_name, seed, entry=config.name)
                 for config in configs
                 for seed in seeds
             ]
@@ -165,9 +165,9 @@ def _seeds(text: str) -> list[int]:
 
 def _with_tasks(specs: list[EpisodeSpec], configs: Sequence[EnvConfig]) -> list[EpisodeSpec]:
     """Give episodes without a task that of their entry."""
-    task_of = {config.name: config.task for config in configs}
+    task_of = {config.name: config.task_name for config in configs}
     if len(configs) == 1:
-        task_of[""] = configs[0].task
+        task_of[""] = configs[0].task_name
     return [
         spec if spec.task else replace(spec, task=task_of.get(spec.entry, "")) for spec in specs
     ]

@@ -91,7 +91,7 @@ class OpenEnv(BaseEnv):
         keep = options.session == "keep"
         self._servers = [
             OpenEnvSession(url, keep=keep, headers=options.headers)
-            for url in (config.task, *options.urls)
+            for url in (config.task_name, *options.urls)
         ]
         self._server = worker_index % len(self._servers)
         self._last: Any = None

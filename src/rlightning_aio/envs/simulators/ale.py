@@ -91,7 +91,7 @@ class ALEEnv(GymnasiumEnv):
             # The preprocessing skips frames, and needs the skipped ones.
             game_kwargs = {"frameskip": 1, **game_kwargs}
         game_kwargs = {"disable_env_checker": True, **game_kwargs}
-        env: gym.Env[Any, Any] = gym.make(self.config.task, **game_kwargs)
+        env: gym.Env[Any, Any] = gym.make(self.config.task_name, **game_kwargs)
         game: Any = env.unwrapped
         if is_sticky(game.ale):
             game.ale = StickyConsole(game.ale)
@@ -120,7 +120,7 @@ class ALEEnv(GymnasiumEnv):
                 self.config.max_episode_steps * frames_per_step
             )
         games = gym.make_vec(
-            self.config.task,
+            self.config.task_name,
             num_envs=self.num_envs,
             vectorization_mode="vector_entry_point",
             **vector_kwargs,
@@ -129,7 +129,7 @@ class ALEEnv(GymnasiumEnv):
         return games if frame_stack > 1 else _without_stack_axis(games)
 
     def _raw_frames(self) -> dict[str, Any]:
-        game = gym.make(self.config.task)
+        game = gym.make(self.config.task_name)
         height, width, _ = cast("tuple[int, int, int]", game.observation_space.shape)
         game.close()
         return {

@@ -14,6 +14,7 @@ from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, outdated_asse
 from rlightning_aio.envs.sub_envs.only_sub_env import OnlySubEnv
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import load
+from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -30,7 +31,7 @@ def env_of_callable(
     """Call what the entry names with its ``env_kwargs``, and make an env of what it returns.
 
     Args:
-        config: with ``make_env``, or a ``task`` that reads ``module:function``.
+        config: its ``task`` is one callable, or reads ``module:function``.
         worker_index: of the env within its entry.
         preprocess_fn: turns a `PolicyResponse` into what the env steps with.
 
@@ -38,9 +39,9 @@ def env_of_callable(
         TypeError: what it returns is no env.
         ConfigError: the entry asks for what the env can't be given from outside.
     """
-    make: Any = load(config.task) if config.make_env is None else config.make_env
+    make: Any = load(config.task) if isinstance(config.task, str) else config.task
     # The env needs no copy of what made it.
-    config = config.model_copy(update={"make_env": None})
+    config = config.model_copy(update={"task": config.task_name})
     with outdated_assets_accepted() if "mujoco" in sys.modules else contextlib.nullcontext():
         made = make(**config.env_kwargs)
     if isinstance(made, BaseEnv):
@@ -100,7 +101,10 @@ class _GivenEnv(GymnasiumEnv):
 
 
 class _AwaitableEnv(BaseEnv):
-    """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions."""
+    """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions.
+
+    A space that it doesn't have is `Anything`.
+    """
 
     def __init__(
         self,
@@ -112,6 +116,12 @@ class _AwaitableEnv(BaseEnv):
         super().__init__(config, worker_index, preprocess_fn)
         self.env = made
         self.switches_task = bool(getattr(made, "switches_task", False))
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return getattr(self.env, "observation_space", Anything())
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return getattr(self.env, "action_space", Anything())
 
     async def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None

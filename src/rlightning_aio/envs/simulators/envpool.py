@@ -94,7 +94,7 @@ class EnvPoolEnv(BaseEnv):
         """Make the pool, whose seeds can't change later."""
         limit = self.config.max_episode_steps
         self.env = envpool.make(
-            self.config.task,
+            self.config.task_name,
             env_type="gymnasium",
             seed=seeds,
             num_envs=self.config.num_envs,
@@ -103,8 +103,8 @@ class EnvPoolEnv(BaseEnv):
         )
         if self.env.config["max_num_players"] > 1:
             raise ConfigError(
-                f"env {self.env_id!r}: EnvPool's task {self.config.task!r} has several players; "
-                "choose one for a single player"
+                f"env {self.env_id!r}: EnvPool's task {self.config.task_name!r} has several "
+                "players; choose one for a single player"
             )
         self._arrays = _PoolArrays(self.env)
         self._ready: Any = None  # The sub-environments that wait for actions.

@@ -72,19 +72,19 @@ class GymnasiumEnv(BaseEnv):
         make_kwargs: dict[str, Any] = {"disable_env_checker": True, **config.env_kwargs}
         if config.max_episode_steps is not None:
             make_kwargs["max_episode_steps"] = config.max_episode_steps
-        if spec_of(config.task).vector_entry_point is None:
+        if spec_of(config.task_name).vector_entry_point is None:
             # The runtime copies results into their rows.
             make_kwargs["vector_kwargs"] = {"copy": False}
         else:
             del make_kwargs["disable_env_checker"]
-        return gym.make_vec(config.task, config.num_envs, **make_kwargs)
+        return gym.make_vec(config.task_name, config.num_envs, **make_kwargs)
 
     def _make_one(self) -> gym.Env[Any, Any]:
         # The runtime checks observations itself when it copies them; Gymnasium's checker would
         # cost time in every step.
         make_kwargs: dict[str, Any] = {"disable_env_checker": True, **self.config.env_kwargs}
         limit = self.config.max_episode_steps
-        return gym.make(self.config.task, max_episode_steps=limit, **make_kwargs)
+        return gym.make(self.config.task_name, max_episode_steps=limit, **make_kwargs)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -196,8 +196,8 @@ class MujocoEnv(GymnasiumEnv):
             except NotImplementedError as error:
                 one.close()
                 warnings.warn(
-                    f"{self.env_id}: {self.config.num_envs} envs of {self.config.task} are stepped "
-                    f"one after the other: {error}",
+                    f"{self.env_id}: {self.config.num_envs} envs of {self.config.task_name} are "
+                    f"stepped one after the other: {error}",
                     RuntimeWarning,
                     stacklevel=2,
                 )

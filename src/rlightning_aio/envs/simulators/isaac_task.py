@@ -86,12 +86,12 @@ def make_simulator(
         if not _launched:
             _launched.append(_launch_isaac_sim(env_id, app, launcher_args))
         cfg = _make_cfg(env_id, config, options, device, worker_index)
-    if "::" not in config.task:
-        return gym.make(config.task, cfg=cfg).unwrapped
+    if "::" not in config.task_name:
+        return gym.make(config.task_name, cfg=cfg).unwrapped
     env_class = options.env_class or default_env_class
     if env_class is None:
         raise ConfigError(
-            f"{env_id}: task {config.task!r} is a configuration class; say which environment "
+            f"{env_id}: task {config.task_name!r} is a configuration class; say which environment "
             "it is for in env_kwargs.env_class, as 'module::Class'"
         )
     return load_named(env_id, "env_kwargs.env_class", env_class, "::")(cfg=cfg)
@@ -115,15 +115,15 @@ def _make_cfg(
 ) -> Any:
     """The task's configuration, with this entry's settings in it."""
     tasks: Any = importlib.import_module("isaaclab_tasks.utils")
-    if "::" in config.task:
-        cfg = load_named(env_id, "task", config.task, "::")()
+    if "::" in config.task_name:
+        cfg = load_named(env_id, "task", config.task_name, "::")()
         if hasattr(tasks, "resolve_presets"):
             cfg = tasks.resolve_presets(cfg)
         cfg.sim.device = device
         cfg.scene.num_envs = config.num_envs
     else:
         importlib.import_module("isaaclab_tasks")
-        package, _, name = config.task.rpartition(":")
+        package, _, name = config.task_name.rpartition(":")
         if package:
             importlib.import_module(package)
         _check_registered(env_id, name)

@@ -26,7 +26,7 @@ class _LeRobotEnv(GymnasiumEnv):
     def _make(self) -> Any:
         importlib.import_module(self.package)
         make = partial(_made, self.package, self.config.env_kwargs)
-        env = SwitchingEnv(make, self.config.task)
+        env = SwitchingEnv(make, self.config.task_name)
         limit = (
             self.config.max_episode_steps
             or gym.spec(f"{self.package}/{env.task}").max_episode_steps

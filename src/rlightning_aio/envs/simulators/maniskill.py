@@ -105,13 +105,14 @@ class ManiskillEnv(BaseEnv):
 
     def _open(self) -> None:
         try:
-            self.env = gym.make(self.config.task, **self._make_kwargs)
+            self.env = gym.make(self.config.task_name, **self._make_kwargs)
         except (EOFError, SystemExit) as error:
             # ManiSkill asks at the terminal whether to download what is missing, and exits
             # the interpreter on any answer but yes.
             raise ConfigError(
-                f"env {self.env_id!r}: the assets of {self.config.task} are not on this machine; "
-                f"`python -m mani_skill.utils.download_asset {self.config.task}` fetches them"
+                f"env {self.env_id!r}: the assets of {self.config.task_name} are not on this "
+                f"machine; `python -m mani_skill.utils.download_asset {self.config.task_name}` "
+                "fetches them"
             ) from error
         self._is_offloaded = False
         self._is_seeded = False

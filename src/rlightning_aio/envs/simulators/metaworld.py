@@ -48,7 +48,7 @@ class MetaworldEnv(GymnasiumEnv):
         if options.observations == "pixels":
             options.render_mode = "rgb_array"
         env: Any = SwitchingEnv(
-            partial(MetaworldTask, options=options), self.config.task, _space(options)
+            partial(MetaworldTask, options=options), self.config.task_name, _space(options)
         )
         limit = self.config.max_episode_steps
         if limit is not None:

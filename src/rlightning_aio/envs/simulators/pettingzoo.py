@@ -65,7 +65,7 @@ class PettingZooEnv(BaseEnv):
             self.max_episode_steps = _own_limit(self.env.unwrapped)
 
     def _make(self) -> Any:
-        module, _, name = self.config.task.rpartition(":")
+        module, _, name = self.config.task_name.rpartition(":")
         if all(part.isidentifier() for part in name.split(".")):
             return self._factory()(**self.config.env_kwargs)
         if module:
@@ -89,7 +89,7 @@ class PettingZooEnv(BaseEnv):
             raise ConfigError(f"env {self.env_id!r}: PettingZoo's {name!r} {reason}") from error
 
     def _factory(self) -> Any:
-        module_name, _, function = self.config.task.partition(":")
+        module_name, _, function = self.config.task_name.partition(":")
         factory = getattr(import_module(module_name), function or DEFAULT_FACTORY, None)
         if factory is None:
             raise ConfigError(

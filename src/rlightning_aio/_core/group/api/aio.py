@@ -200,26 +200,33 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
 
 
 def build_env_group(
-    env_cfgs: Any,
+    env_cfgs: Any = None,
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None = None,
     mixed_actions: bool = False,
     zero_copy: bool = False,
+    **fields: Any,
 ) -> EnvGroup:
     """Build a group of the configured envs; nothing is started yet.
 
     Args:
-        env_cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
+        env_cfgs: a task's name, a callable that makes an env, an `EnvConfig`, a dict of its
+            fields or an OmegaConf node; or a list of these, in which callables that follow one
+            another make one entry.
         preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
             all, a list with one for each entry, or one for each env. Anything that
             cloudpickle can pickle.
         mixed_actions: allow envs whose action spaces have different shapes.
         zero_copy: return observations as read-only views, valid until that env's next
             request, if the envs' rows are contiguous.
+        fields: of `EnvConfig`, for the one entry of a name or of callables; without `env_cfgs`,
+            the whole entry.
 
     Raises:
         ConfigError: something is wrong with the configuration or a preprocess function.
     """
-    plan = plan_group(env_cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
+    plan = plan_group(
+        env_cfgs, fields, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy
+    )
     return EnvGroup(plan)
 
 

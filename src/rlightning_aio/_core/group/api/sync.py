@@ -179,14 +179,17 @@ def driver_of(group: EnvGroup) -> SyncDriver:
 
 
 def build_env_group(
-    env_cfgs: Any,
+    env_cfgs: Any = None,
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None = None,
     mixed_actions: bool = False,
     zero_copy: bool = False,
+    **fields: Any,
 ) -> EnvGroup:
     """Build a synchronous group; nothing is started yet.
 
     Arguments and errors are those of `rlightning_aio.build_env_group`.
     """
-    plan = plan_group(env_cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
+    plan = plan_group(
+        env_cfgs, fields, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy
+    )
     return EnvGroup(plan)

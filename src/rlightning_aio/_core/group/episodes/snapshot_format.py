@@ -8,10 +8,11 @@ Left out: a signature. A person who can write the file can make a worker execute
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from rlightning_aio.config import makers_of
 from rlightning_aio.errors import SnapshotError
 from rlightning_aio.registry import name_of
 from rlightning_aio.sealing import seal, unseal
@@ -54,12 +55,10 @@ def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -
         meta: of the env.
         versions: of the libraries that it uses, in its worker.
     """
-    maker: Any = config.make_env
-    maker = cast("tuple[Any, ...]", maker)[0] if isinstance(maker, tuple) else maker
-    made_by = name_of(maker) if maker else config.task
+    makers = makers_of(config)
     return {
         "backend": config.backend,
-        "task": made_by,
+        "task": name_of(makers[0]) if makers else config.task_name,
         "env_kwargs": _ADDRESS.sub("", repr(sorted(config.env_kwargs.items()))),
         "num_envs": str(config.num_envs),
         "max_episode_steps": str(config.max_episode_steps),

@@ -8,11 +8,11 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
-from rlightning_aio.config import EnvConfig, check_installed, parse_configs
+from rlightning_aio.config import EnvConfig, check_installed, makers_of, parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import check_folder
 from rlightning_aio.protocol.pickling import dumped_with_code
@@ -40,6 +40,7 @@ class Plan:
 
 def plan_group(
     env_cfgs: Any,
+    fields: Mapping[str, Any],
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None,
     *,
     mixed_actions: bool,
@@ -50,7 +51,7 @@ def plan_group(
     Raises:
         ConfigError: a config or a preprocess function can't be used.
     """
-    configs = parse_configs(env_cfgs)
+    configs = parse_configs(env_cfgs, fields)
     check_installed(configs)
     _check_videos(configs)
     fns = _preprocess_fns(configs, preprocess_fn)
@@ -65,8 +66,8 @@ def plan_group(
                 "runs at the client",
                 stacklevel=3,
             )
-        for make in _distinct(config.make_env):
-            _check_sendable(config, "make_env", make)
+        for make in _distinct(makers_of(config)):
+            _check_sendable(config, "task", make)
     return Plan(configs, fns, mixed_actions, zero_copy)
 
 

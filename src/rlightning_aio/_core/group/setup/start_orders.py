@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 from collections import Counter
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, TypeAlias
 
 from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
 from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, filmed_alone, place_of
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
-from rlightning_aio.config import EnvConfig, moved
+from rlightning_aio.config import EnvConfig, makers_of, moved
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -102,12 +102,10 @@ def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]
 
 
 def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
-    """`config` for a host of the envs at `indices`, with only their `make_env` functions."""
-    makers: Any = config.make_env
-    if not isinstance(makers, tuple):
+    """`config` for a host of the envs at `indices`, with only their callables."""
+    if not (makers := makers_of(config)):
         return config
-    makers = cast("tuple[Any, ...]", makers)
-    return config.model_copy(update={"make_env": tuple(makers[k] for k in indices)})
+    return config.model_copy(update={"task": tuple(makers[k] for k in indices)})
 
 
 def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:

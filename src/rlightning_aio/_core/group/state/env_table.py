@@ -6,11 +6,12 @@ a host while the group runs (a member). No step changes anything here.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rlightning_aio.batch.names import EnvNames
+from rlightning_aio.config import makers_of
 from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.registry import name_of
@@ -213,9 +214,8 @@ class EnvTable:
         """The name of an env in messages, with its entry, backend and task."""
         config = self.configs[slot]
         env_id = self.env_ids[slot] or self.names.shared_ids[slot]
-        makers: Any = config.make_env
-        if isinstance(makers, tuple):
+        task = repr(config.task_name)
+        if makers := makers_of(config):
             first = next(k for k, other in enumerate(self.configs) if other is config)
-            makers = cast("tuple[Any, ...]", makers)[slot - first]
-        made = f"make_env {name_of(makers)}" if makers else f"task {config.task!r}"
-        return f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, {made})"
+            task = name_of(makers[slot - first])
+        return f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, task {task})"

@@ -10,6 +10,7 @@ from gymnasium.error import UnregisteredEnv
 
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
+from rlightning_aio.config import makers_of
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -59,9 +60,8 @@ def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunn
         TypeError: the env is awaitable and its placement can't await it, or the reverse.
     """
     config, index = order.config, order.worker_indices[place]
-    makers: Any = config.make_env
-    if isinstance(makers, tuple):
-        config = config.model_copy(update={"make_env": makers[place]})
+    if makers := makers_of(config):
+        config = config.model_copy(update={"task": makers[place]})
     env = _built(order, config, index, order.preprocess_fns[place])
     env.trainer_pid = None if inline else order.trainer_pid
     video = config.video
