@@ -174,14 +174,14 @@ def test_different_observation_spaces_do_not_stack() -> None:
     batch = mixed()
     assert batch.ids() == ["pendulum-0", "grid-world-1", "pendulum-2", "grid-world-0"]
     assert batch.reward.tolist() == [0.5, 0.5, 1.5, 1.5]
-    with pytest.raises(ValueError, match=r"by_name\(\)"):
+    with pytest.raises(ValueError, match=r"by_entry\(\)"):
         batch.observation  # noqa: B018
     assert [value.env_id for value in batch.values()] == batch.ids()
 
 
 def test_each_entry_of_a_mixed_batch_stacks() -> None:
     """Names may contain dashes; the order is kept; responses go to their envs."""
-    split = mixed().by_name()
+    split = mixed().by_entry()
     assert list(split) == ["pendulum", "grid-world"]
     assert split["pendulum"].observation.tolist() == [[0.0, 1.0], [2.0, 3.0]]
     assert split["grid-world"].observation.tolist() == [7, 8]
@@ -190,8 +190,8 @@ def test_each_entry_of_a_mixed_batch_stacks() -> None:
     responses = split["grid-world"].respond(action=np.array([3, 4]))
     assert [(id_, r.action) for id_, r in responses] == [("grid-world-1", 3), ("grid-world-0", 4)]
     ids = ["robots-0/arm-left", "a/b-10", "robots-1/left-3/x", "own-id", "id"]
-    assert list(BatchedData(ids, ids).by_name()) == ["robots", "a/b", "own", "id"]
-    plain = BatchedData(["grid-world-0", "pendulum-1"], [1, 2]).by_name()
+    assert list(BatchedData(ids, ids).by_entry()) == ["robots", "a/b", "own", "id"]
+    plain = BatchedData(["grid-world-0", "pendulum-1"], [1, 2]).by_entry()
     assert {name: part.values() for name, part in plain.items()} == {
         "grid-world": [1],
         "pendulum": [2],
@@ -362,7 +362,7 @@ def test_values_of_different_structure_do_not_stack(one: Any, other: Any) -> Non
         ["a-0", "b-0"],
         [EnvRet(env_id="a-0", observation=one), EnvRet(env_id="b-0", observation=other)],
     )
-    with pytest.raises(ValueError, match=r"by_name\(\)"):
+    with pytest.raises(ValueError, match=r"by_entry\(\)"):
         batch.observation  # noqa: B018
 
 
@@ -452,7 +452,7 @@ def test_each_row_has_its_flags(drawn: tuple[BatchedData, list[dict[str, Any]]])
     for name in rows[0]:
         assert by_rows(batch, name) == [row[name] for row in rows], name
     ids = batch.ids()
-    for entry, part in batch.by_name().items():
+    for entry, part in batch.by_entry().items():
         mine = [row for row, id_ in zip(rows, ids, strict=True) if id_.startswith(entry)]
         for name in rows[0]:
             assert by_rows(part, name) == [row[name] for row in mine], name
@@ -490,9 +490,9 @@ def test_rows_of_different_shapes_have_no_common_column() -> None:
         columns([0], np.zeros((1, 1)), [0]),
         columns([3], np.zeros((1, 1)), [1], reward=np.zeros((1, 2)), flags=flags((1, 2))),
     )
-    with pytest.raises(ValueError, match=r"by_name\(\)"):
+    with pytest.raises(ValueError, match=r"by_entry\(\)"):
         batch.is_reset  # noqa: B018
-    assert [part.is_reset.shape for part in batch.by_name().values()] == [(1,), (1, 2)]
+    assert [part.is_reset.shape for part in batch.by_entry().values()] == [(1,), (1, 2)]
 
 
 @pytest.mark.parametrize("name", ["is_reset", "limit_reached", "restarted", "index", "sent"])
@@ -1057,7 +1057,7 @@ def contents(batch: BatchedData) -> str:
     columns = (batch.reward, batch.terminated, batch.truncated, batch.done)
     rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
     sent = {name: batch.sent[name] for name in batch.sent}
-    split = {name: (part.ids(), part.observation) for name, part in batch.by_name().items()}
+    split = {name: (part.ids(), part.observation) for name, part in batch.by_entry().items()}
     values = [(value.model_dump(), value._extra) for value in batch.values()]
     return repr((list(batch.ids()), batch.env_ids(), columns, rows, sent, split, values))
 

@@ -242,7 +242,7 @@ def test_entries_may_differ() -> None:
     single = {"name": "single", "placement": "inline", "task": scripted(lambda _: False)}
 
     def by_entry(batch: rl.BatchedData) -> list[rl.BatchedData]:
-        return [part.respond(action=nothing(part)) for part in batch.by_name().values()]
+        return [part.respond(action=nothing(part)) for part in batch.by_entry().values()]
 
     found = evaluated(sync.build_env_group([pair, single]), 2, policy=by_entry)
     assert [len(found.of_envs([id_]).episodes) for id_ in ("pair-0", "single-0")] == [4, 2]

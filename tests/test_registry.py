@@ -14,7 +14,7 @@ from rlightning_aio import registry
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, MujocoEnv
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ROWS_GROUP, Backend, Registry
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend, Registry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,8 +37,8 @@ def announce(monkeypatch: pytest.MonkeyPatch) -> Announce:
     def entry_points(*, group: str, **wanted: str) -> EntryPoints:
         return EntryPoints(announced).select(group=group, **wanted)
 
-    def announce(name: str, target: str, group: str = ENTRY_POINT_GROUP) -> None:
-        announced.append(EntryPoint(name, target, group))
+    def announce(name: str, target: str) -> None:
+        announced.append(EntryPoint(name, target, ENTRY_POINT_GROUP))
 
     monkeypatch.setattr("importlib.metadata.entry_points", entry_points)
     monkeypatch.setattr(registry, "_plugged_in", cache(registry._plugged_in.__wrapped__))
@@ -99,23 +99,15 @@ def test_a_registered_class_replaces_a_built_in_one() -> None:
     assert envs.resolve("mujoco") is OwnEnv
 
 
-def test_an_entry_point_adds_an_env_class(announce: Announce) -> None:
-    """The user need not import the package."""
-    announce("theirs", f"{__name__}:OwnEnv")
-    envs = Registry()
-    assert envs.knows("theirs")
-    assert issubclass(envs.resolve("theirs"), BaseEnv)
-
-
 def test_an_entry_point_never_replaces_a_built_in_backend(announce: Announce) -> None:
     """Installing a package must not change the meaning of a config."""
-    announce("mujoco", f"{__name__}:OwnEnv")
+    announce("mujoco", f"{__name__}:ROW")
     assert Registry().resolve("mujoco") is MujocoEnv
 
 
-def test_a_plug_in_can_describe_its_backend(announce: Announce) -> None:
-    """The trainer then knows that it is hardware before its class is imported."""
-    announce("arm", f"{__name__}:ROW", ROWS_GROUP)
+def test_an_entry_point_describes_a_backend(announce: Announce) -> None:
+    """The trainer knows that it is hardware before its class is imported."""
+    announce("arm", f"{__name__}:ROW")
     envs = Registry()
     assert envs.described("arm") is not None
     assert envs.is_hardware("arm")
@@ -126,7 +118,7 @@ def test_a_plug_in_can_describe_its_backend(announce: Announce) -> None:
 
 def test_naming_a_backend_imports_nothing(announce: Announce) -> None:
     """A broken package raises an error only when its env is resolved."""
-    announce("broken", "no_such_module:Env")
+    announce("broken", "no_such_module:ROW")
     assert Registry().knows("broken")
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
         Registry().resolve("broken")

@@ -247,9 +247,9 @@ def test_a_running_group_is_filmed_for_a_while(running: sync.EnvGroup, tmp_path:
     """Chosen envs and episodes; before and after, and of others, nothing is rendered."""
     play(running, 2)
     before = rendered(running)
-    rl.record_video(running, ["env-1"], tmp_path, every=2)
+    running.record_video(tmp_path, ["env-1"], every=2)
     play(running, 10)
-    rl.record_video(running, ["env-1"], None)
+    running.record_video(None, ["env-1"])
     count = rendered(running)
     assert [n - m for n, m in zip(count, before, strict=True)] == [0, 7]
     play(running, 5)
@@ -264,10 +264,10 @@ def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -
     """The current episode isn't filmed. A later call replaces an earlier one."""
     batch, _ = running.reset()
     for folder in ("left", "taken"):
-        rl.record_video(running, ["env-0"], tmp_path / folder)
+        running.record_video(tmp_path / folder, ["env-0"])
         batch, _ = running.step(batch.respond(action=[0, 0]))
     play(running, 3)
-    rl.record_video(running, ["env-0"], None)
+    running.record_video(None, ["env-0"])
     assert films(tmp_path / "left") == {}
     assert films(tmp_path / "taken") == {"env-0-episode-0.mp4": [0, 1, 2, 3]}
 
@@ -275,7 +275,7 @@ def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -
 def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
     """With all earlier frames; the replacement isn't filmed."""
     with two() as group:
-        rl.record_video(group, group.env_ids, tmp_path)
+        group.record_video(tmp_path, group.env_ids)
         play(group, 2)
         group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
         play(group, 3)
@@ -291,11 +291,11 @@ async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
     config = entry(lambda: SyncVectorEnv([Odd, Brighter]), **both)
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset()
-        await rl.record_video(group, ["env-0"], tmp_path, sub_env=1, episodes=[1])
+        await group.record_video(tmp_path, ["env-0"], sub_env=1, episodes=[1])
         batch, _ = await group.reset()
         for _ in range(8):
             batch, _ = await group.step(batch.respond(action=np.zeros((1, 2), np.int64)))
-        await rl.record_video(group, ["env-0"], None)
+        await group.record_video(None, ["env-0"])
     assert films(tmp_path) == {"env-0-sub-1-episode-1.mp4": [0, 1, 2, 3]}
 
 
@@ -304,16 +304,16 @@ def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
     makers = (Brighter, lambda: Brighter(None))
     with sync.build_env_group({**entry(Brighter, num_workers=2), "task": makers}) as group:
         with pytest.raises(rl.EnvRaised, match="'env-1' can't be filmed: its render_mode is None"):
-            rl.record_video(group, group.env_ids, tmp_path)
+            group.record_video(tmp_path, group.env_ids)
         with pytest.raises(rl.EnvRaised, match="no sub-environment 2"):
-            rl.record_video(group, ["env-0"], tmp_path, sub_env=2)
+            group.record_video(tmp_path, ["env-0"], sub_env=2)
         with pytest.raises(rl.UnknownEnv, match="'env_0'"):
-            rl.record_video(group, ["env_0"], tmp_path)
+            group.record_video(tmp_path, ["env_0"])
         with pytest.raises(rl.ConfigError, match=r"record_video: every: .* got 0"):
-            rl.record_video(group, ["env-0"], tmp_path, every=0)
+            group.record_video(tmp_path, ["env-0"], every=0)
         (tmp_path / "file").touch()
         with pytest.raises(rl.EnvRaised, match="File exists"):
-            rl.record_video(group, ["env-0"], tmp_path / "file")
+            group.record_video(tmp_path / "file", ["env-0"])
         play(group, 3)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
@@ -397,4 +397,4 @@ def test_vector_envs_that_render_nothing_raise(tmp_path: Path) -> None:
         sync.build_env_group({"name": "env", "task": Blind, "placement": "inline"}) as group,
         pytest.raises(rl.EnvRaised, match="'env-0' can't be filmed: a Blind renders nothing"),
     ):
-        rl.record_video(group, ["env-0"], tmp_path)
+        group.record_video(tmp_path, ["env-0"])

@@ -9,19 +9,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rlightning_aio._core.group.api.aio import (
-        EnvGroup,
-        EnvHandle,
-        ServerHandle,
-        build_env_group,
-        run,
-    )
+    from rlightning_aio._core.group.api.aio import EnvGroup, EnvHandle, build_env_group, run
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig, load_config
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.errors import (
         BadAction,
+        ClientRefused,
         ConfigError,
+        EnvAway,
         EnvBusy,
         EnvFault,
         EnvHung,
@@ -36,14 +32,7 @@ if TYPE_CHECKING:
         WorkerDied,
     )
     from rlightning_aio.registry import ENVS
-    from rlightning_aio.types import (
-        EnvMeta,
-        EnvRet,
-        MultiAgentEnvRet,
-        PolicyResponse,
-        default_env_preprocess_fn,
-    )
-    from rlightning_aio.video import record_video
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __version__ = "0.2.0"
 
@@ -53,7 +42,9 @@ _HOMES = {
     "envs.base": ("BaseEnv",),
     "errors": (
         "BadAction",
+        "ClientRefused",
         "ConfigError",
+        "EnvAway",
         "EnvBusy",
         "EnvFault",
         "EnvHung",
@@ -67,16 +58,9 @@ _HOMES = {
         "UnknownEnv",
         "WorkerDied",
     ),
-    "_core.group.api.aio": ("EnvGroup", "EnvHandle", "ServerHandle", "build_env_group", "run"),
+    "_core.group.api.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
     "registry": ("ENVS",),
-    "types": (
-        "EnvMeta",
-        "EnvRet",
-        "MultiAgentEnvRet",
-        "PolicyResponse",
-        "default_env_preprocess_fn",
-    ),
-    "video": ("record_video",),
+    "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -85,7 +69,9 @@ __all__ = [
     "BadAction",
     "BaseEnv",
     "BatchedData",
+    "ClientRefused",
     "ConfigError",
+    "EnvAway",
     "EnvBusy",
     "EnvConfig",
     "EnvFault",
@@ -101,15 +87,12 @@ __all__ = [
     "NothingPending",
     "PolicyResponse",
     "RLightningError",
-    "ServerHandle",
     "SnapshotError",
     "StartFailed",
     "UnknownEnv",
     "WorkerDied",
     "build_env_group",
-    "default_env_preprocess_fn",
     "load_config",
-    "record_video",
     "run",
 ]
 

@@ -2,8 +2,8 @@
 
 Rule: naming a backend imports nothing; its class is imported where the env is built, which is in a
 worker. A name is looked up among the classes registered in this process, then among built-in
-backends, then among plug-ins: entry points of the group ``rlightning_aio.backends`` (`Backend`
-rows, which may be read in the trainer) and of ``rlightning_aio.envs`` (env classes).
+backends, then among plug-ins: entry points of the group ``rlightning_aio.backends``, which name
+`Backend` rows that the trainer can read.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ __all__ = [
     "placement_of",
 ]
 
-ENTRY_POINT_GROUP = "rlightning_aio.envs"
-ROWS_GROUP = "rlightning_aio.backends"
+ENTRY_POINT_GROUP = "rlightning_aio.backends"
 
 EnvClass = TypeVar("EnvClass", bound="type[Any]")
 
@@ -291,16 +290,16 @@ def load(target: str) -> Any:
     return getattr(importlib.import_module(module_name), name)
 
 
-def _entry_points(group: str) -> EntryPoints:
+def _entry_points() -> EntryPoints:
     from importlib.metadata import entry_points  # noqa: PLC0415  # See `Backend`.
 
-    return entry_points(group=group)
+    return entry_points(group=ENTRY_POINT_GROUP)
 
 
 @cache
 def _plugged_in(name: str) -> Backend | None:
     """Return the row of a plug-in, or None. Its module imports no simulator."""
-    for point in _entry_points(ROWS_GROUP):
+    for point in _entry_points():
         if point.name == name:
             return point.load()
     return None
@@ -380,8 +379,7 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return the name of every backend that can be resolved, sorted."""
-        points = [p for group in (ROWS_GROUP, ENTRY_POINT_GROUP) for p in _entry_points(group)]
-        return sorted({*self._classes, *BACKENDS, *(point.name for point in points)})
+        return sorted({*self._classes, *BACKENDS, *(point.name for point in _entry_points())})
 
     def resolve(self, name: str) -> type[Any]:
         """Import and return the class of backend `name`.
@@ -394,9 +392,6 @@ class Registry:
             return env_class
         if (backend := self.described(name)) is not None:
             return load(backend.target)
-        for point in _entry_points(ENTRY_POINT_GROUP):
-            if point.name == name:
-                return point.load()
         raise ConfigError(self.unknown(name))
 
     def unknown(self, name: str) -> str:

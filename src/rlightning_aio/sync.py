@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from rlightning_aio._core.group.api.sync import EnvGroup, EnvHandle, ServerHandle, build_env_group
+from rlightning_aio._core.group.api.sync import EnvGroup, EnvHandle, build_env_group
 
-__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "build_env_group"]
+__all__ = ["EnvGroup", "EnvHandle", "build_env_group"]

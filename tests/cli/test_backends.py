@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
+from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest import mock
 
 import gymnasium
 from cli.command import invoke, invoke_json, run
 
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ENVS, Backend
+from rlightning_aio.registry import BACKENDS, ENVS, Backend
 
 if TYPE_CHECKING:
     import pytest
@@ -45,21 +47,15 @@ def test_a_missing_simulator_is_listed_as_not_installed(monkeypatch: pytest.Monk
     assert invoke("backends").stdout.count("not installed") == len(ROWS)
 
 
-def test_env_classes_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their lines have their package and its version."""
-    distribution = importlib.metadata.distribution("gymnasium")
-    point = importlib.metadata.EntryPoint("theirs", "their.module:Env", ENTRY_POINT_GROUP)
-    vars(point)["dist"] = distribution
-    found = importlib.metadata.entry_points
-    monkeypatch.setattr(
-        importlib.metadata,
-        "entry_points",
-        lambda **wanted: [point] if wanted == {"group": ENTRY_POINT_GROUP} else found(**wanted),
-    )
+def test_backends_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their lines have the package that they need, and its version."""
+    point = mock.Mock(load=lambda: replace(BACKENDS["gymnasium"], name="theirs"))
+    point.name = "theirs"
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda *, group: [point])
     assert invoke_json("backends")[-1] == {
         "name": "theirs",
         "installed": True,
         "package": "gymnasium",
-        "version": distribution.version,
-        "install": "pip install gymnasium",
+        "version": gymnasium.__version__,
+        "install": "pip install rlightning-aio",
     }

@@ -141,7 +141,7 @@ def test_envs_of_several_kinds_need_several_policies() -> None:
     entries = [{**POLE}, {**POLE, "name": "car", "task": "MountainCar-v0"}]
     with sync.build_env_group(entries, mixed_actions=True) as group, group.auto_reset():
         collector = Collector(group, zeros, num_transitions=4)
-        with pytest.raises(ValueError, match="by_name"):
+        with pytest.raises(ValueError, match="by_entry"):
             collector.collect()
 
 
@@ -603,7 +603,7 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
             assert {episode.length for episode in collector.collect().episodes} == {5}
         with group.auto_reset(math.inf):
             pass
-    endless = {"name": "endless", "make_env": Endless, "num_workers": 2, "placement": "inline"}
+    endless = {"name": "endless", "task": Endless, "num_workers": 2, "placement": "inline"}
     for limit, number in ((None, 0), (4, 5)):
         with sync.build_env_group({**endless, "max_episode_steps": limit}) as group:
             rollout = Collector(group, zeros, num_transitions=40, min_results=2).collect()

@@ -15,7 +15,6 @@ from combinations.options import NUM_ENVS, SEED, Books, Use, assert_as_played
 from combinations.played import Transition, as_tuple
 from timelines import Seen
 
-from rlightning_aio import record_video
 from rlightning_aio.collecting import Collector, RecordedGroup, ReplayedGroup, Rollout
 from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.evaluation import evaluate
@@ -264,9 +263,9 @@ def video(use: Use, folder: Path) -> None:
     if use.options.task == "CartPole":
         return  # Its renderer is a package of its own.
     env_ids = use.group.env_ids[:1]
-    use.done(record_video(use.group, env_ids, folder, episodes=[0]))
+    use.done(use.group.record_video(folder, env_ids, episodes=[0]))
     step_all(use, 20).check(5)
-    use.done(record_video(use.group, env_ids, None))
+    use.done(use.group.record_video(None, env_ids))
     assert list(folder.glob("*.mp4"))
 
 

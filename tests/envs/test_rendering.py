@@ -61,8 +61,8 @@ def test_workers_render_what_an_env_in_this_process_does(entry: dict[str, Any]) 
 @pytest.mark.skipif(PLACE != "egl", reason="MUJOCO_GL is not egl")
 def test_a_worker_renders_on_the_device_of_its_number() -> None:
     """A device that is not there is an error, and named by its variable."""
-    devices = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "{worker_index}"}
+    devices = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "{process_index}"}
     assert frames(METAWORLD, env_vars=devices).std() > 10
-    devices["MUJOCO_EGL_DEVICE_ID"] = "9{worker_index}"
+    devices["MUJOCO_EGL_DEVICE_ID"] = "9{process_index}"
     with pytest.raises(rl.EnvFault, match=r"MUJOCO_EGL_DEVICE_ID.*got 90"):
         frames(METAWORLD, env_vars=devices)

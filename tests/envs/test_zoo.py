@@ -90,11 +90,11 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
         batch, _ = await group.reset(seed=0)
         assert batch.ids() == group.env_ids
         with group.auto_reset(NO_LIMIT):
-            for part in batch.by_name().values():
+            for part in batch.by_entry().values():
                 group.step_async(part.respond(action=actions(part, action_spaces)))
             while counts.total() < RESULTS or min(counts.values()) < LEAST:
                 batch, _ = await group.collect_async()
-                parts = batch.by_name()
+                parts = batch.by_entry()
                 # In lockstep every collect returns results of all, until the first entry rests.
                 partial += len(parts) < len(NAMES) and max(counts.values()) < MOST
                 for name, part in parts.items():
@@ -108,9 +108,9 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
 
 
 def test_each_entry_has_its_own_columns(overrides: list[str]) -> None:
-    """`by_name` separates values that don't stack: arrays, images, dicts by part or by agent."""
+    """`by_entry` separates values that don't stack: arrays, images, dicts by part or by agent."""
     with sync.build_env_group(rl.load_config(ZOO, overrides), mixed_actions=True) as group:
-        parts = group.reset(seed=0)[0].by_name()
+        parts = group.reset(seed=0)[0].by_entry()
     assert list(parts) == NAMES
     shapes = {
         name: [np.shape(array) for array in leaves(parts[name].observation)] for name in NAMES

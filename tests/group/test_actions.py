@@ -127,7 +127,7 @@ def test_infinity_is_judged_by_the_space_of_its_own_env(form: str, order: tuple[
             columns = part.respond(action=np.array(action, np.float32))
             return columns if form == "columns" else BatchedData(part.ids(), columns.values())
 
-        far = responses(batch.by_name()["far"], [[INF, 0]])
+        far = responses(batch.by_entry()["far"], [[INF, 0]])
         assert group.step(far)[0].reward.tolist() == [INF]
         with pytest.raises(BadAction, match=r"'near-0'.* holds inf"):
             group.step(responses(batch, [[INF, 0], [INF, 0]]))

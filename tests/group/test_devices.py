@@ -133,7 +133,7 @@ def test_workers_find_their_share_in_their_environment(monkeypatch: pytest.Monke
         "num_workers": 4,
         "envs_per_process": 2,
         "num_gpus": 1,
-        "env_vars": {"CACHE": "/tmp/cache-{worker_index}", "BRACES": "{other}"},
+        "env_vars": {"CACHE": "/tmp/cache-{process_index}", "BRACES": "{other}"},
     }
     names = ("CUDA_VISIBLE_DEVICES", "CACHE", "BRACES")
     with sync.build_env_group([entry, {**entry, "name": "f", "num_gpus": 0}]) as group:

@@ -166,7 +166,7 @@ async def test_actions_with_extras_arrive_as_columns_and_one_by_one(start: Any) 
         mixed_actions=True,
     )
     batch, _ = await group.reset()
-    probes = batch.by_name()["probe"]
+    probes = batch.by_entry()["probe"]
     weight = np.array([10.0, 20.0])
     for action in (np.array([[0, 2.0], [0, 3.0]]), [[0, 2.0], 3.0], [[0, np.nan], [1, 2.0]]):
         batch, _ = await group.step(probes.respond(action=action, weight=weight))
@@ -399,15 +399,15 @@ async def test_envs_of_different_observations_work_as_one_group(start: Any) -> N
     group = await start([wide, poles])
     batch, _ = await group.reset(seed=0)
     assert [space.shape for space in group.get_observation_spaces()] == [(6,), (4,), (4,)]
-    with pytest.raises(ValueError, match=r"by_name\(\)"):
+    with pytest.raises(ValueError, match=r"by_entry\(\)"):
         batch.observation  # noqa: B018
-    split = batch.by_name()
+    split = batch.by_entry()
     assert split["e"].observation.shape == (1, 6)
     assert split["pole"].observation.shape == (2, 4)
     group.step_async(split["pole"].respond(action=np.array([1, 0])))
     group.step_async(split["e"].respond(action=np.array([2])))
     batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(batch.by_name()) == ["e", "pole"]
+    assert sorted(batch.by_entry()) == ["e", "pole"]
     batch, _ = await group.step(batch.respond(action=np.zeros(3, int)))
     assert len(batch.info()) == 3
 
@@ -423,7 +423,7 @@ async def test_each_entry_is_read_by_its_own_space(start: Any, task: str) -> Non
     group = await start(entries)
     batch, _ = await group.reset()
     for _ in range(3):
-        for part in batch.by_name().values():
+        for part in batch.by_entry().values():
             assert same(first_row(part.observation), part.values()[0].observation)
         batch, _ = await group.step(batch.respond(action=np.zeros(len(tasks), int)))
 

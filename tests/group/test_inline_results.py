@@ -130,7 +130,7 @@ def test_fresh_observations_equal_those_of_a_worker() -> None:
         return [
             {
                 name: (part.observation, [value.observation for value in part.values()])
-                for name, part in batch.by_name().items()
+                for name, part in batch.by_entry().items()
             }
             for batch in batches
         ]
@@ -161,7 +161,7 @@ def test_envs_of_different_spaces_stack_each_for_itself() -> None:
     """Observations of different spaces are not stacked, handed over or not."""
     with rlightning_aio.sync.build_env_group([fresh(t) for t in sample_envs.Fresh.SPACES]) as group:
         batch = step(group, group.reset()[0])
-        by_name = batch.by_name()
+        by_name = batch.by_entry()
         for task, space in sample_envs.Fresh.SPACES.items():
             (value,) = by_name[task].values()
             assert value.observation in space

@@ -37,7 +37,7 @@ def test_inline_entries_take_turns() -> None:
             group.step_async(batch.respond(action=np.zeros(6, np.int64)))
             for _ in range(60):
                 batch, _ = group.collect_async()
-                came.update(list(batch.by_name()))
+                came.update(list(batch.by_entry()))
                 group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
     assert came == {"first": 20, "second": 20, "third": 20}
 

@@ -230,6 +230,12 @@ class Counter(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=self.total, last_reward=1.0)
 """
 
+ROW = """
+from rlightning_aio.registry import Backend
+
+BACKEND = Backend("announced", "counters:Counter", "gymnasium", "gymnasium")
+"""
+
 SCRIPT = (
     MODULE
     + """
@@ -315,7 +321,9 @@ def test_an_installed_package_may_announce_them(
     info = tmp_path / "counters-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: counters\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[rlightning_aio.envs]\nannounced = counters:Counter\n")
+    points = "[rlightning_aio.backends]\nannounced = announced:BACKEND\n"
+    (info / "entry_points.txt").write_text(points)
+    (tmp_path / "announced.py").write_text(ROW)
     (tmp_path / "counters.py").write_text(MODULE)
     monkeypatch.syspath_prepend(tmp_path)
     with sync.build_env_group({"name": "c", "backend": "announced", "task": "x"}) as group:

@@ -312,6 +312,6 @@ def test_env_steps_count_sub_environments_but_no_resets() -> None:
         with group.auto_reset(max_episode_steps=1):
             for _ in range(2):
                 batch, _ = group.step(idle_steps(group))
-        assert all(part.is_reset.all() for part in batch.by_name().values())
+        assert all(part.is_reset.all() for part in batch.by_entry().values())
         samples = list(group._core.stats._samples)[-4:]
         assert [sample.steps().sum() for sample in samples] == [3, 2, 0, 0]

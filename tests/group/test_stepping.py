@@ -453,7 +453,7 @@ async def test_results_are_never_overwritten(start: Any) -> None:
         [ENTRY, {**ENTRY, "name": "reusing", "backend": "reusing"}], mixed_actions=True
     )
     first, _ = await group.reset()
-    probes, others = first.by_name().values()
+    probes, others = first.by_entry().values()
     before = probes.observation.copy()
     infos = others.info()
     values = others.values()
@@ -472,13 +472,13 @@ async def test_a_sent_action_may_be_changed(start: Any) -> None:
     """The env is stepped with the action at the time of sending, even if it runs later."""
     group = await start([ENTRY, {**ENTRY, "name": "chunked", "backend": "chunked"}])
     batch, _ = await group.reset()
-    probes, chunked = batch.by_name().values()
+    probes, chunked = batch.by_entry().values()
     plain, chunk = actions(1, 2, 3, 4), np.ones((4, 5))
     group.step_async(probes.respond(action=plain))
     group.step_async(chunked.respond(action=chunk))
     plain[:] = chunk[:] = 50
     batch, _ = await group.collect_async(wait_all=True)
-    found = batch.by_name()
+    found = batch.by_entry()
     assert sorted(found["probe"].reward.tolist()) == [1, 2, 3, 4]
     assert found["chunked"].reward.tolist() == [5] * 4
 

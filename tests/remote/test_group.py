@@ -186,7 +186,7 @@ def test_a_client_with_other_actions_than_the_local_envs_is_refused() -> None:
 
 
 def test_local_envs_and_clients_mix_in_one_batch() -> None:
-    """First ready, first served; by_name() makes stackable parts."""
+    """First ready, first served; by_entry() makes stackable parts."""
     envs = [CountingEnv(k) for k in range(2)]
     seen: dict[str, int] = {}
     with (
@@ -196,7 +196,7 @@ def test_local_envs_and_clients_mix_in_one_batch() -> None:
         batch, _ = group.reset(seed=0)
         # On a busy machine a worker may not run for a while.
         for _ in range(20_000):
-            for name, part in batch.by_name().items():
+            for name, part in batch.by_entry().items():
                 for ret in part.values():
                     seen[ret.env_id] = seen.get(ret.env_id, 0) + 1
                 action = actions(part) if name == "robots" else np.zeros(len(part), np.int64)
@@ -523,7 +523,7 @@ async def test_closing_a_group_ends_a_collect_that_waits_for_clients() -> None:
     async with rlightning_aio.build_env_group([timed, entry()], mixed_actions=True) as group:
         with clients(group, env):
             batch, _ = await group.reset(env_ids=None)
-            theirs = batch.by_name()["robots"]
+            theirs = batch.by_entry()["robots"]
             group.step_async(theirs.respond(action=actions(theirs)))
             collecting = asyncio.create_task(group.collect_async())
             await asyncio.sleep(0)

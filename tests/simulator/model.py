@@ -751,7 +751,7 @@ def rows_of(batch: BatchedData, envs: dict[str, Env], flags: Sequence[bool] | No
     require(batch.ids() == env_ids and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
     require(flags is None or len(flags) == len(env_ids), "as many flags as results", flags)
     names = {envs[env_id].entry.name for env_id in env_ids if env_id in envs}
-    parts = [batch] if len(names) == 1 else list(batch.by_name().values())
+    parts = [batch] if len(names) == 1 else list(batch.by_entry().values())
     rows = {row.env_id: row for part in parts for row in _rows_of(part, envs)}
     require(sorted(rows) == sorted(env_ids), "a part of the batch is missing", sorted(rows))
     found = [rows[env_id] for env_id in env_ids]

@@ -272,7 +272,7 @@ class Play(Session):
 
     def keep(self, batch: BatchedData) -> None:
         """Keep a batch, to see at the end that nobody wrote to it."""
-        parts = list(batch.by_name().values()) if self.program.plans[1:] else [batch]
+        parts = list(batch.by_entry().values()) if self.program.plans[1:] else [batch]
         for part in parts:
             columns = [part.reward, part.terminated, part.infos]
             if "zero_copy" not in self.features:

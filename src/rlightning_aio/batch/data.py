@@ -178,7 +178,7 @@ class BatchedData:
         Values without fixed size (Text, Sequence, Graph) are a list of n.
 
         Raises:
-            ValueError: the envs have different observation spaces; use `by_name`.
+            ValueError: the envs have different observation spaces; use `by_entry`.
         """
         parts = self._parts
         if parts:
@@ -228,7 +228,7 @@ class BatchedData:
 
         Raises:
             AttributeError: the batch holds plain values, not results of a group.
-            ValueError: the envs have different numbers of sub-environments; use `by_name`.
+            ValueError: the envs have different numbers of sub-environments; use `by_entry`.
         """
         return _by_row(self, lambda part: part.is_reset)
 
@@ -329,7 +329,7 @@ class BatchedData:
 
     # -- parts of a batch ---------------------------------------------------------
 
-    def by_name(self) -> dict[str, BatchedData]:
+    def by_entry(self) -> dict[str, BatchedData]:
         """Split by config entry, in the order of first appearance; values keep their order."""
         if self._origin is None:
             names = [_entry_of(id_) for id_ in self.ids()]

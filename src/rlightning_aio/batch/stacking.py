@@ -59,7 +59,7 @@ def _keys_of(tree: Any) -> Any:
 def differing() -> ValueError:
     """The error for values of one batch that don't stack."""
     return ValueError(
-        "envs of this batch have different shapes, so their values don't stack; use by_name()"
+        "envs of this batch have different shapes, so their values don't stack; use by_entry()"
     )
 
 

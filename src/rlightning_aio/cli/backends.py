@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib.metadata
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 
 from rich.text import Text
 
 from rlightning_aio.cli.options import AsJson
 from rlightning_aio.cli.terminal import named_columns, out, print_json, print_table
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ROWS_GROUP, Backend
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend
 
 __all__ = ["backends"]
 
@@ -28,19 +29,16 @@ def backends(
 ) -> None:
     """List all backends: whether the package they need is installed here, and how to install it.
 
-    Backends of plug-ins (entry points of the groups rlightning_aio.backends and
-    rlightning_aio.envs) are listed after the built-in ones. Simulators that exclude each other
-    need separate virtual environments; run this command there, and name that Python in an
-    entry's `interpreter`.
+    Backends of plug-ins (entry points of the group rlightning_aio.backends) are listed after
+    the built-in ones. Simulators that exclude each other need separate virtual environments;
+    run this command there, and name that Python in an entry's `interpreter`.
 
     For example:
 
         rlightning-aio backends
         rlightning-aio backends --json
     """
-    described = [*BACKENDS.values(), *_plug_in_rows()]
-    rows = [_row(backend) for backend in described]
-    rows += _plug_in_classes({row.name for row in rows})
+    rows = [_row(backend) for backend in (*BACKENDS.values(), *_plugged_in())]
     if as_json:
         print_json([asdict(row) for row in rows])
         return
@@ -62,19 +60,6 @@ def _row(backend: Backend) -> _Row:
     return _Row(backend.name, version is not None, package, version, command)
 
 
-def _points(group: str) -> list[importlib.metadata.EntryPoint]:
-    return sorted(importlib.metadata.entry_points(group=group), key=lambda point: point.name)
-
-
-def _plug_in_rows() -> list[Backend]:
-    return [point.load() for point in _points(ROWS_GROUP) if point.name not in BACKENDS]
-
-
-def _plug_in_classes(listed: set[str]) -> list[_Row]:
-    return [
-        _Row(
-            point.name, True, point.dist.name, point.dist.version, f"pip install {point.dist.name}"
-        )
-        for point in _points(ENTRY_POINT_GROUP)
-        if point.dist is not None and point.name not in listed
-    ]
+def _plugged_in() -> list[Backend]:
+    points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+    return [p.load() for p in sorted(points, key=attrgetter("name")) if p.name not in BACKENDS]

@@ -318,7 +318,7 @@ class Collector(Generic[G, R]):
         policies = self._policies
         if policies is None:
             return [(self._kind("", self._policy), batch)]
-        parts = batch.by_name()
+        parts = batch.by_entry()
         for name in parts.keys() - policies.keys():
             raise ValueError(
                 f"no policy was given for the envs of entry {name!r}; those given are for "

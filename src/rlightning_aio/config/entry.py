@@ -147,8 +147,8 @@ class EnvConfig(_Fields):
     interpreter: str | None = None
     """Python of another virtual environment for this entry's workers."""
     env_vars: dict[str, str] = Field(default_factory=dict)
-    """Environment variables of the worker, set before anything is imported; ``{worker_index}`` in a
-    value stands for the number of the worker among the entry's."""
+    """Environment variables of the worker, set before anything is imported; ``{process_index}`` in
+    a value stands for the number of the worker among the entry's."""
     cpu_affinity: bool = False
     """Pin worker k to the k-th core this process may use."""
     ray_options: dict[str, Any] = Field(default_factory=dict)

@@ -260,7 +260,7 @@ class _Play:
 
     def _continue(self, batch: BatchedData) -> Procedure[int]:
         """Record results, and step or reset their envs. Return the number of requests."""
-        for part in batch.by_name().values() if self._separate else (batch,):
+        for part in batch.by_entry().values() if self._separate else (batch,):
             self._record(part)
         resets: list[str] = []
         steps: list[int] = []

@@ -227,7 +227,7 @@ class QueuePlay:
         """Add results to their episodes, and begin others or step their envs."""
         env_ids = batch.env_ids()
         self._pending.difference_update(env_ids)
-        for part in batch.by_name().values() if self._separate else (batch,):
+        for part in batch.by_entry().values() if self._separate else (batch,):
             self._record(part)
         yield from self._begin_episodes()
         rows = [

@@ -113,7 +113,7 @@ class Responder:
         Raises:
             PolicyRaised: the policy raised an exception that is none of this package.
         """
-        parts = list(batch.by_name().values()) if self._separate else [batch]
+        parts = list(batch.by_entry().values()) if self._separate else [batch]
         return [await self._respond(part) for part in parts]
 
     async def _respond(self, batch: BatchedData) -> BatchedData:

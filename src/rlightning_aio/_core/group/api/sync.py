@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar, TypeVarTuple
 
 from rlightning_aio._core.group.api.facade import only_result, steps_of
+from rlightning_aio._core.group.api.filming import film, video_of
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
@@ -20,6 +21,7 @@ from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Mapping, Sequence
 
     from rlightning_aio._core.group.setup.plan import Plan
@@ -113,6 +115,17 @@ class EnvGroup(GroupInterface):
         self, snapshot: bytes, env_ids: Sequence[str] | None = None
     ) -> tuple[BatchedData, list[bool]]:
         return self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
+
+    def record_video(
+        self,
+        folder: str | os.PathLike[str] | None,
+        env_ids: Sequence[str] | None = None,
+        every: int = 1,
+        episodes: Sequence[int] | None = None,
+        sub_env: int = 0,
+    ) -> None:
+        video = video_of(folder, every, episodes, sub_env)
+        self._driver.run(film(self._core, env_ids, video))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         return self._handle(env_id, EnvHandle, ServerHandle)

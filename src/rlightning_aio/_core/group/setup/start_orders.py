@@ -84,7 +84,7 @@ def _order_of_members(config: EnvConfig) -> StartOrder:
 def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
     """The environment variables of each worker, given its entry.
 
-    The entry's own variables override those that assign devices. ``{worker_index}`` in a value is
+    The entry's own variables override those that assign devices. ``{process_index}`` in a value is
     replaced by the number of the worker within its entry.
     """
     devices = iter(dealt_out([config for config in workers if _has_worker_here(config)]))
@@ -93,7 +93,7 @@ def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]
     for config in workers:
         index = str(count[config.name])
         count[config.name] += 1
-        own = {k: v.replace("{worker_index}", index) for k, v in config.env_vars.items()}
+        own = {k: v.replace("{process_index}", index) for k, v in config.env_vars.items()}
         if config.placement == "inline":
             check_own_devices(config)
         dealt = next(devices) if _has_worker_here(config) else {}
