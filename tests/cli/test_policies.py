@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio import BatchedData, EnvRet, MultiAgentEnvRet
-from rlightning_aio.cli.policies.policies import RandomPolicy
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.policies.random_actions import RandomPolicy
 
 shapes = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(tuple)
 extremes = st.sampled_from([-np.inf, np.inf, 3e38, -3e38])

@@ -69,7 +69,8 @@ def sizes_of_batches(group: Any, **options: Any) -> set[int]:
 
 def test_the_configs_number_of_results_is_the_default() -> None:
     """Inline envs are executed only while too few results are ready."""
-    assert sizes_of_batches(poles(4)) == {1}
+    assert sizes_of_batches(poles(4)) == {2}, "half of the envs"
+    assert sizes_of_batches(poles(1)) == {1}
     assert sizes_of_batches(poles(4, min_results=3)) == {3}
     assert sizes_of_batches(poles(4, min_results=3), min_results=2) == {2}
 
@@ -483,12 +484,15 @@ def test_a_coroutine_needs_an_asynchronous_group() -> None:
 @pytest.mark.parametrize(
     ("answer", "error", "named"),
     [
-        (np.zeros(2), TypeError, "columns by name"),
-        ({"actions": [0, 0]}, ValueError, "including 'action', not 'actions'"),
+        (
+            {"actions": [0, 0]},
+            BadAction,
+            "a dict of columns with 'action'.* not a dict of 'actions'",
+        ),
         (
             {"action": np.zeros(2, int), "value": np.zeros(3)},
-            ValueError,
-            r"'value' has shape \[3\]",
+            BadAction,
+            "'value' has 3 rows for a batch of 2",
         ),
         ({"action": np.zeros(2, int), "reward": np.zeros(2)}, ValueError, "already has 'reward'"),
         ({"action": np.zeros((2, 5), int)}, BadAction, "nothing was sent"),

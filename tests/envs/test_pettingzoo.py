@@ -10,10 +10,10 @@ from envs.group_contract import NO_LIMIT, GroupContract
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from rlightning_aio import sync
-from rlightning_aio.cli.policies.policies import RandomPolicy
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import evaluate
+from rlightning_aio.policies.random_actions import RandomPolicy
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio._core.group.engine.newest import newest_of
 from rlightning_aio.collecting.clock import Clock
@@ -25,10 +25,13 @@ from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure,
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
+from rlightning_aio.policies.random_actions import RandomPolicy
 from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
+
+    import gymnasium as gym
 
     from rlightning_aio._core.group.engine.newest import Newest
     from rlightning_aio.batch import BatchedData
@@ -73,17 +76,18 @@ class Collector(Generic[G, R]):
 
     Args:
         group: an initialised group, or a `RecordedGroup` or `ReplayedGroup` around one.
-        policy: called with a batch of results (`BatchedData`); returns columns by name, including
-            ``action``, with one row for each result, ``[n, …]``, or for each sub-environment,
-            ``[n, num_envs, …]``: arrays, or CPU tensors without gradient. It may be a coroutine
-            function if the group is asynchronous. Envs of different kinds need one policy for each
-            config entry, as a mapping by its name; `collect` then returns a dict of rollouts with
-            `num_transitions` transitions in total.
+        policy: called with a batch of results (`BatchedData`); returns actions, a dict of columns
+            with ``action``, or what `BatchedData.respond` returns. A column has one row for each
+            result, ``[n, …]``, or for each sub-environment, ``[n, num_envs, …]``: arrays, or CPU
+            tensors without gradient. It may be a coroutine function if the group is asynchronous.
+            None: random actions. Envs of different kinds need one policy for each config entry, as
+            a mapping by its name; `collect` then returns a dict of rollouts with `num_transitions`
+            transitions in total.
         num_transitions: transitions of each rollout, counting sub-environments; T * N with
             `wait_all`.
         min_results: number of results to wait for before the policy is called, or all pending
             ones if they are fewer; an env with sub-environments returns one result. None is the
-            sum of ``min_results`` of the config entries, or 1.
+            sum of ``min_results`` of the config entries, or else half of the envs.
         wait_all: collect blocks ``[T, N]``.
         infos: names of numbers in infos, such as ``("success",)``. Each becomes a float64 column
             of the rollout, NaN where the info of a transition has no such number. A name that no
@@ -103,7 +107,7 @@ class Collector(Generic[G, R]):
     def __init__(
         self: Collector[H, Rollout],
         group: H | RecordedGroup[H] | ReplayedGroup[H],
-        policy: Callable[[BatchedData], Any],
+        policy: Callable[[BatchedData], Any] | None,
         *,
         num_transitions: int,
         min_results: int | None = None,
@@ -116,7 +120,7 @@ class Collector(Generic[G, R]):
     def __init__(
         self: Collector[H, dict[str, Rollout]],
         group: H | RecordedGroup[H] | ReplayedGroup[H],
-        policy: Mapping[str, Callable[[BatchedData], Any]],
+        policy: Mapping[str, Callable[[BatchedData], Any] | None],
         *,
         num_transitions: int,
         min_results: int | None = None,
@@ -150,7 +154,7 @@ class Collector(Generic[G, R]):
         self._infos = infos
         self._are_infos_known = not infos
         self._policy: Any = policy
-        self._policies: Mapping[str, Callable[[BatchedData], Any]] | None = (
+        self._policies: Mapping[str, Callable[[BatchedData], Any] | None] | None = (
             policy if isinstance(policy, Mapping) else None
         )
         self._quota = num_transitions
@@ -208,34 +212,31 @@ class Collector(Generic[G, R]):
             raise RuntimeError(
                 "this collector is already collecting; only one collect can run at a time"
             )
-        self._collecting = True
-        try:
-            self._clock.enter()
-            with ensure_auto_reset(self._group):
-                return (yield from self._until_full())
-        finally:
-            self._collecting = False
-            self._clock.leave()
-
-    def _until_full(self) -> Procedure[R]:
-        if not self._started:
-            yield from self._start()
-        is_resumed = False
-        while True:
-            if self._received is not None:
-                self._split_received(self._received)
-                self._received = None
-            if not self._store():
-                yield BREAK  # After this, it would wait for the learner's next collect.
-                return self._full()
-            if not is_resumed:
-                self._resume()
-                is_resumed = True
-            if self._block and not (self._unanswered or self._expecting):
-                self._plan()
-            while self._unanswered:
-                yield from self._answer(self._unanswered[0])
-            yield from self._wait()
+        with ensure_auto_reset(self._group):
+            self._collecting = True
+            try:
+                self._clock.enter()
+                if not self._started:
+                    yield from self._start()
+                is_resumed = False
+                while True:
+                    if self._received is not None:
+                        self._split_received(self._received)
+                        self._received = None
+                    if not self._store():
+                        yield BREAK  # After this, it would wait for the learner's next collect.
+                        return self._full()
+                    if not is_resumed:
+                        self._resume()
+                        is_resumed = True
+                    if self._block and not (self._unanswered or self._expecting):
+                        self._plan()
+                    while self._unanswered:
+                        yield from self._answer(self._unanswered[0])
+                    yield from self._wait()
+            finally:
+                self._collecting = False
+                self._clock.leave()
 
     def _wait(self) -> Procedure[None]:
         """Wait for the next results."""
@@ -264,6 +265,8 @@ class Collector(Generic[G, R]):
             self._start_raised = isinstance(error, EnvFault)
             raise
         self._newest = newest_of(self._group)
+        if self._min_results is None:
+            self._min_results = default_min_results(self._group)
         self._started = self._newest.keeps = True
 
     def _start_again(self) -> Procedure[None]:
@@ -326,10 +329,17 @@ class Collector(Generic[G, R]):
             )
         return [(self._kind(name, policies[name]), part) for name, part in parts.items()]
 
-    def _kind(self, name: str, policy: Callable[[BatchedData], Any]) -> EnvKind:
+    def _kind(self, name: str, policy: Callable[[BatchedData], Any] | None) -> EnvKind:
         if name not in self._kinds:
+            policy = policy or RandomPolicy(
+                self._action_space_of, self._seed if isinstance(self._seed, int) else None
+            )
             self._kinds[name] = EnvKind(policy, self._quota, self._meta_of, self._infos)
         return self._kinds[name]
+
+    def _action_space_of(self, env_id: str) -> gym.Space[Any] | None:
+        meta = self._meta_of(env_id)
+        return None if meta is None else meta.action_space
 
     def _meta_of(self, env_id: str) -> EnvMeta | None:
         group = self._group

@@ -7,20 +7,23 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.batch import joined
+from rlightning_aio.batch import BatchedData, joined
+from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.collecting.results import ResultRows, result_rows
 from rlightning_aio.collecting.rollout import Ends, Lag, Rollout, Seconds
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
+from rlightning_aio.errors import BadAction
+from rlightning_aio.policies.answers import answers_of
 from rlightning_aio.protocol.columns import gather, is_array, mapped, paired
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.newest import Newest
-    from rlightning_aio.batch import BatchedData
     from rlightning_aio.protocol.columns import Tree
     from rlightning_aio.types import EnvMeta
 
@@ -113,6 +116,7 @@ class EnvKind:
         self.num_steps = 0
         self.held: Part | None = None
         self._acts_in_arrays = False
+        self._action_space: gym.Space[Any] | None = None
         self.staging = Staging(quota, infos)
         self._taken = OWN_NAMES.union(infos)
         # Two sets, so that one rollout can be read while the next one is collected.
@@ -138,6 +142,7 @@ class EnvKind:
             if meta is None:
                 continue
             space = meta.action_space
+            self._action_space = space
             self._acts_in_arrays = space is not None and is_array(space)
             if meta.autoreset == "same_step":
                 self.staging.note_same_step(results.index[row])
@@ -159,18 +164,17 @@ class EnvKind:
         """Convert the policy's answer for `part` to a batch of responses, and to columns.
 
         Raises:
-            ValueError, TypeError: the answer doesn't fit.
+            ValueError, TypeError: the answer doesn't fit (`BadAction` is a ValueError).
         """
-        try:
-            given = dict(answer)
-        except (TypeError, ValueError):
-            raise TypeError(
-                "a policy returns columns by name, as {'action': actions, 'value': values}, not a "
-                f"{type(answer).__name__}"
-            ) from None
-        if "action" not in given:
-            names = ", ".join(map(repr, given)) or "nothing"
-            raise ValueError(f"a policy returns columns by name, including 'action', not {names}")
+        answers = answers_of(part.batch, answer, self._space)
+        given = columns_of_responses(answers[0])
+        if given is None or (
+            isinstance(answer, BatchedData | list) and _answered(answers) != part.batch.env_ids()
+        ):
+            raise BadAction(
+                "a Collector's policy answers all results of its batch in their order; return "
+                "batch.respond(action=…, …) of that very batch"
+            )
         for name in self._taken & given.keys():
             raise ValueError(
                 f"a rollout already has {name!r}; give the policy's column another name"
@@ -182,7 +186,10 @@ class EnvKind:
         columns = rows_of(stored, head)
         columns["observation"] = part.results.observation
         self.staging.check(columns)
-        return part.batch.respond(**given), columns
+        return answers[0], columns
+
+    def _space(self) -> gym.Space[Any] | None:
+        return self._action_space
 
     def rollout(self, held: ResultRows | None, version: int, seconds: Seconds) -> Rollout:
         """Return the completed transitions as columns.
@@ -233,6 +240,10 @@ OWN_NAMES: Final = frozenset(
     | {"truncated", "advantages", "at_ends", "keys", "next_observation", "vtrace"}
 )
 """Names that neither a policy nor an info may give to a column of a rollout."""
+
+
+def _answered(answers: list[BatchedData]) -> list[str]:
+    return answers[0].env_ids() if len(answers) == 1 else []
 
 
 def _lag(ages: NDArray[np.int64]) -> Lag:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, SupportsIndex, TypeVar, overload
 import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.collecting.procedure import Procedure, run
@@ -23,15 +23,17 @@ from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_number
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
     is_blamed,
-    responses,
     success_of,
     summed_rewards,
 )
 from rlightning_aio.evaluation.queue import QueuePlay, QueueRules
+from rlightning_aio.policies.answers import answers_of
+from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
 
+    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
@@ -51,7 +53,7 @@ _LOSSES_IN_A_ROW: Final = 3
 @overload
 def evaluate(
     group: SyncEnvGroup,
-    policy: Callable[[BatchedData], Any],
+    policy: Callable[[BatchedData], Any] | None,
     episodes: int,
     *,
     seed: int | None = None,
@@ -64,7 +66,7 @@ def evaluate(
 @overload
 def evaluate(
     group: AsyncEnvGroup,
-    policy: Callable[[BatchedData], Any],
+    policy: Callable[[BatchedData], Any] | None,
     episodes: int,
     *,
     seed: int | None = None,
@@ -77,7 +79,7 @@ def evaluate(
 @overload
 def evaluate(
     group: SyncEnvGroup,
-    policy: Callable[[BatchedData], Any],
+    policy: Callable[[BatchedData], Any] | None,
     episodes: Iterable[EpisodeSpec],
     *,
     min_results: int | None = None,
@@ -91,7 +93,7 @@ def evaluate(
 @overload
 def evaluate(
     group: AsyncEnvGroup,
-    policy: Callable[[BatchedData], Any],
+    policy: Callable[[BatchedData], Any] | None,
     episodes: Iterable[EpisodeSpec],
     *,
     min_results: int | None = None,
@@ -104,7 +106,7 @@ def evaluate(
 
 def evaluate(
     group: Any,
-    policy: Callable[[BatchedData], Any],
+    policy: Callable[[BatchedData], Any] | None,
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -117,19 +119,18 @@ def evaluate(
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
 
-    Episodes end by themselves, or at the limits of the `auto_reset` context that is open, or else
-    at the envs' own limits, if they have any.
+    Envs are reset at their ends, and at the limits of an open `auto_reset`, or else at their own.
 
     Args:
         group: with nothing `pending` and without env_servers.
-        policy: called with a batch of results (`BatchedData`). It returns actions ``[n, *action]``,
-            or a batch made by `respond`, or a list of such batches, which together answer all
-            results. It may be a coroutine function if the group is asynchronous.
+        policy: called with a batch of results (`BatchedData`). It returns actions, or columns by
+            name with ``action``, or what `BatchedData.respond` returns, or a list of such; with an
+            asynchronous group, it may be awaitable. None: random actions.
         episodes: a number for each env, and for each sub-environment; or a queue of episodes,
             each to be played once by any free env.
         seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
             seed ``seed + n * N + k``; of sub-environments that reset themselves, only the first.
-        min_results: of `EnvGroup.collect_async`, before each call of the policy.
+        min_results: results to wait for; None is that of the entries, or else half of the envs.
         max_attempts: for a queue: an episode that was lost this often has failed; None is 3.
         results: for a queue: the file to save episodes in; those that it has are not played again.
         video: for a queue: the episodes to film.
@@ -153,6 +154,7 @@ def evaluate(
         OSError: nothing can be written into the folder of `video`.
     """
     _check(group, episodes, min_results, max_attempts)
+    policy, min_results = policy or _random(group, seed), min_results or default_min_results(group)
     if isinstance(episodes, SupportsIndex):
         _refuse("a queue of episodes", max_attempts=max_attempts, results=results, video=video)
         play = _Play(group, policy, index(episodes), seed, min_results, on_episode)
@@ -167,6 +169,10 @@ def evaluate(
 def _resetting(play: _Play | QueuePlay, group: Any) -> Procedure[Any]:
     with ensure_auto_reset(group):
         return (yield from play.to_the_end())
+
+
+def _random(group: Any, seed: int | None) -> RandomPolicy:
+    return RandomPolicy({meta.env_id: meta.action_space for meta in group.metas}.get, seed)
 
 
 def _refuse(form: str, **options: Any) -> None:
@@ -276,9 +282,12 @@ class _Play:
         if steps:
             stepped = batch if len(steps) == len(batch) else batch.take(steps)
             answer = yield lambda: self._policy(stepped)
-            for part in responses(stepped, answer):
+            for part in answers_of(stepped, answer, lambda: self._space_of(stepped)):
                 self._group.step_async(part)
         return len(resets) + len(steps)
+
+    def _space_of(self, batch: BatchedData) -> gym.Space[Any] | None:
+        return self._metas[batch.env_ids()[0]].action_space
 
     def _places(self, env_id: str) -> slice:
         first = self._first[env_id]

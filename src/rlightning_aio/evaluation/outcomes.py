@@ -1,4 +1,4 @@
-"""Parts of both kinds of evaluation: answers of a policy, rewards, and success of an episode."""
+"""Parts of both kinds of evaluation: rewards, success and length of an episode."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import BadAction
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["EndlessEpisodes", "is_blamed", "responses", "success_of", "summed_rewards"]
+__all__ = ["EndlessEpisodes", "is_blamed", "success_of", "summed_rewards"]
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -23,28 +20,6 @@ _LONG: Final = 100_000
 
 _SUCCESS_KEYS: Final = ("success", "is_success")
 """In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
-
-
-def responses(batch: BatchedData, answer: Any) -> list[BatchedData]:
-    """Convert a policy's answer to batches of responses.
-
-    Raises:
-        BadAction: it doesn't answer all results.
-    """
-    if isinstance(answer, BatchedData):
-        parts = [answer]
-    elif isinstance(answer, list) and _are_batches(cast("list[Any]", answer)):
-        parts = cast("list[BatchedData]", answer)
-    else:
-        parts = [batch.respond(action=answer)]
-    answered = sum(map(len, parts))
-    if answered != len(batch):
-        raise BadAction(f"the policy has answered {answered} of {len(batch)} results")
-    return parts
-
-
-def _are_batches(answer: list[Any]) -> bool:
-    return bool(answer) and all(isinstance(one, BatchedData) for one in answer)
 
 
 class EndlessEpisodes:

@@ -19,12 +19,12 @@ from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
     is_blamed,
-    responses,
     success_of,
     summed_rewards,
 )
 from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
 from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
+from rlightning_aio.policies.answers import answers_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -238,7 +238,8 @@ class QueuePlay:
         if rows:
             stepped = batch if len(rows) == len(batch) else batch.take(rows)
             answer = yield lambda: self._policy(stepped)
-            for part in responses(stepped, answer):
+            space = self._metas[env_ids[rows[0]]].action_space
+            for part in answers_of(stepped, answer, lambda: space):
                 self._step(part)
 
     def _step(self, batch: BatchedData) -> None:

@@ -1,4 +1,4 @@
-"""Policies for `evaluate`: action chunks, and models of Stable-Baselines3 and LeRobot.
+"""Policies, and what they may return; action chunks, and models of Stable-Baselines3 and LeRobot.
 
 Rule: a policy is called with a batch of results and returns one action for each, and whatever it
 keeps between calls belongs to one env's episode and ends with it.

@@ -28,7 +28,7 @@ from rlightning_aio.cli.playing.queue_options import (
     VideoEpisodes,
     VideoFailed,
 )
-from rlightning_aio.cli.policies.collecting import default_min_results, playing
+from rlightning_aio.cli.policies.collecting import playing
 from rlightning_aio.cli.policies.policies import load_policy, served_policy
 from rlightning_aio.cli.policies.sb3_policies import SB3Policy, digest_of
 from rlightning_aio.cli.terminal import (
@@ -304,7 +304,6 @@ async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
             policy,
             order.episodes,
             seed=order.seed,
-            min_results=default_min_results(order.configs),
             played=order.played,
             on_episode=watch.note,
         )

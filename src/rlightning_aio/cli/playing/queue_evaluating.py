@@ -19,7 +19,7 @@ from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.playing.evaluation_file import queue_subject
 from rlightning_aio.cli.playing.films import rendering
-from rlightning_aio.cli.policies.collecting import default_min_results, playing
+from rlightning_aio.cli.policies.collecting import playing
 from rlightning_aio.cli.terminal import (
     count,
     counted,
@@ -126,7 +126,6 @@ async def _evaluate(play: _Play, order: QueueOrder) -> None:
                 group,
                 policy,
                 play.specs,
-                min_results=default_min_results(play.configs),
                 max_attempts=play.max_attempts,
                 results=play.results,
                 video=play.video,

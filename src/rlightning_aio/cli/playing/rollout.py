@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 import typer
 
 import rlightning_aio
-from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.cli.bench.plots import check_plot, draw_rollout
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
@@ -29,7 +29,6 @@ from rlightning_aio.cli.playing.films import Video, VideoEnvs, VideoEvery, filme
 from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.cli.policies.collecting import (
     Roster,
-    default_min_results,
     respond_to_all,
     responder,
     traced,
@@ -69,7 +68,7 @@ class _Order:
 
     steps: int | None
     seconds: float | None
-    min_results: int
+    min_results: int | None
     seed: int | None
     policy: Policy | None
     trace: Path | None
@@ -127,7 +126,8 @@ def rollout(
 
     Actions are sampled at random from the envs' action spaces, or come from the callable that
     --policy names. It gets a BatchedData (one for each entry, if their spaces differ) and
-    returns actions, one row for each result, or a batch made with its respond() method.
+    returns actions, one row for each result, or a dict of columns with 'action', or a batch made
+    with its respond() method.
     Ctrl-C ends the collection early and prints the table so far.
 
     For example:
@@ -146,7 +146,7 @@ def rollout(
     order = _Order(
         _STEPS if steps is None and seconds is None else steps,
         seconds,
-        min_results or default_min_results(configs),
+        min_results,
         seed,
         load_policy(policy) if policy else None,
         trace,
@@ -190,13 +190,14 @@ async def _collect(
         sub_envs = max(config.num_envs for config in configs)
         display.ready()
         statistics.begin(roster)
+        wanted = order.min_results or default_min_results(group)
         with ensure_auto_reset(group):
             await respond_to_all(group, respond, batch)
             while (left := order.left(statistics)) is not None:
                 most, seconds = -(-left[0] // sub_envs), left[1]
                 try:
                     batch, _ = await group.collect_async(
-                        min_results=min(order.min_results, most),
+                        min_results=min(wanted, most),
                         max_results=most,
                         deadline=seconds,
                     )

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.cli.option_files import naming_option
-from rlightning_aio.cli.policies.policies import Policy, RandomPolicy, Responder
+from rlightning_aio.cli.policies.policies import Policy, Responder
 from rlightning_aio.cli.policies.sb3_policies import SB3Policy
+from rlightning_aio.policies.random_actions import RandomPolicy
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
@@ -21,11 +22,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.config import EnvConfig
 
 __all__ = [
     "Roster",
-    "default_min_results",
     "playing",
     "respond_to_all",
     "responder",
@@ -62,10 +61,14 @@ def responder(
 ) -> Responder:
     """Return a responder with `policy` or random actions, called once for each kind of space."""
     actions = group.get_action_spaces()
+
+    def space_of(env_id: str) -> gym.Space[Any] | None:
+        return roster(env_id).action_space
+
     if policy is None:
-        chosen = RandomPolicy(lambda env_id: roster(env_id).action_space, seed)
-        return Responder(chosen, separate=_differ(actions))
-    return Responder(policy, separate=_differ(actions) or _differ(group.get_observation_spaces()))
+        return Responder(RandomPolicy(space_of, seed), space_of, separate=_differ(actions))
+    separate = _differ(actions) or _differ(group.get_observation_spaces())
+    return Responder(policy, space_of, separate=separate)
 
 
 def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
@@ -78,12 +81,6 @@ async def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData
         responses = await respond(batch)
     for response in responses:
         group.step_async(response)
-
-
-def default_min_results(configs: Sequence[EnvConfig]) -> int:
-    """Return the number of results to wait for: that of the entries, or half of the envs."""
-    configured = sum(config.min_results or 0 for config in configs)
-    return configured or max(1, sum(config.num_workers for config in configs) // 2)
 
 
 @contextlib.asynccontextmanager

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AutoResetContext",
     "Facade",
+    "default_min_results",
     "ensure_auto_reset",
     "only_result",
     "steps_of",
@@ -99,6 +100,12 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     if core.continuity.auto_reset_is_open:
         return nullcontext()
     return AutoResetContext(core, None, on_done=True, needs_limits=False)
+
+
+def default_min_results(group: Any) -> int:
+    """Number of results that a policy waits for: the sum of the entries', or half of the envs."""
+    configured: int = group._core.envs.usual_min_results(None)  # noqa: SLF001
+    return configured if configured > 1 else max(1, len(group.env_ids) // 2)
 
 
 class Facade:

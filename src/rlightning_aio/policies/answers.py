@@ -1,0 +1,75 @@
+"""`answers_of`: the one reading of what a policy returns.
+
+A policy is called with a batch of results. It returns actions, ``[n, *action]`` (a dict or tuple of
+such arrays for Dict and Tuple spaces, or a list with one action for each result), or a dict of
+columns with ``action``, or what `BatchedData.respond` returns. It may be a coroutine function;
+whoever calls it awaits it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import BadAction
+from rlightning_aio.protocol.columns import is_dict
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import gymnasium as gym
+
+__all__ = ["answers_of"]
+
+
+def answers_of(
+    batch: BatchedData, answer: Any, space_of: Callable[[], gym.Space[Any] | None]
+) -> list[BatchedData]:
+    """Convert what a policy has returned for `batch` to batches of responses, usually one.
+
+    Args:
+        batch: of results.
+        answer: see the module; or a list of batches of responses, which together answer all
+            results.
+        space_of: returns the action space of the batch's envs, None if that is unknown.
+
+    Raises:
+        BadAction: it doesn't answer all results, or it is a dict, but not of columns.
+    """
+    if isinstance(answer, BatchedData):
+        parts = [answer]
+    elif isinstance(answer, list) and _are_batches(cast("list[Any]", answer)):
+        parts = cast("list[BatchedData]", answer)
+    elif isinstance(answer, dict | Mapping):  # Most are dicts, for which this is cheap.
+        named = cast("Mapping[Any, Any]", answer)
+        return [batch.respond(**(named if _are_columns(named, space_of()) else {"action": named}))]
+    else:
+        return [batch.respond(action=answer)]
+    answered = sum(map(len, parts))
+    if answered != len(batch):
+        raise BadAction(f"the policy has answered {answered} of {len(batch)} results")
+    return parts
+
+
+def _are_batches(answer: list[Any]) -> bool:
+    return bool(answer) and all(isinstance(one, BatchedData) for one in answer)
+
+
+def _are_columns(answer: Mapping[Any, Any], space: gym.Space[Any] | None) -> bool:
+    """Return True for a dict of columns, and False for one of the parts of Dict actions."""
+    keys = cast("Any", space).spaces if space is not None and is_dict(space) else None
+    if "action" in answer:
+        if keys is not None and "action" in keys:
+            raise BadAction(
+                "the action space has a key 'action', so a dict with one may be actions or columns:"
+                " return batch.respond(action=…), with further columns as further arguments"
+            )
+        return True
+    if keys is None and space is not None:
+        names = ", ".join(map(repr, answer)) or "nothing"
+        raise BadAction(
+            "a policy returns actions, a dict of columns with 'action', or batch.respond(action=…),"
+            f" and not a dict of {names}"
+        )
+    return False

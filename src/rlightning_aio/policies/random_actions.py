@@ -1,0 +1,160 @@
+"""`RandomPolicy`: random actions, as a policy.
+
+Sampling works on whole columns, so its cost hardly grows with the batch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import gymnasium as gym
+import numpy as np
+
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
+from rlightning_aio.protocol.columns import index, stacked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+
+__all__ = ["RandomPolicy", "sampler_of"]
+
+Sampler: TypeAlias = "Callable[[int], Any]"
+
+_UNBOUNDED_SCALE = 0.1
+"""Standard deviation for unbounded spaces. Their actions are usually in units of a joint's range,
+and larger ones would throw a robot about."""
+
+
+class RandomPolicy:
+    """Samples actions from the envs' spaces.
+
+    Bounded numbers are uniform, unbounded ones normal with a small spread. Envs whose first
+    result has an ``action_mask`` (see `masks`) get discrete actions that it allows, or any if it
+    allows none. One generator serves all envs in the order of their results.
+
+    Args:
+        space_of: a function that returns the action space for an env id; called at the env's
+            first result.
+        seed: the seed of the generator; None draws one.
+    """
+
+    def __init__(self, space_of: Callable[[str], gym.Space[Any] | None], seed: int | None) -> None:
+        self._space_of = space_of
+        self._rng = np.random.default_rng(seed)
+        self._kinds: list[tuple[gym.Space[Any], Sampler]] = []
+        self._samplers: dict[str, Sampler] = {}
+        self._masked: dict[str, gym.Space[Any]] = {}
+        """Action spaces of envs whose results have masks."""
+
+    def __call__(self, batch: BatchedData) -> Any:
+        """Return actions for a batch: columns if its envs share one action space, else a list."""
+        env_ids = batch.env_ids()
+        samplers = [
+            self._samplers.get(id_) or self._meet(id_, batch, row)
+            for row, id_ in enumerate(env_ids)
+        ]
+        first = samplers[0]
+        if samplers.count(first) < len(samplers):
+            actions = [index(sampler(1), 0) for sampler in samplers]
+        else:
+            actions = first(len(samplers))
+        return self._allowed(env_ids, actions, batch) if self._masked else actions
+
+    def _allowed(self, env_ids: list[str], actions: Any, batch: BatchedData) -> Any:
+        """Return `actions` in the same form, with allowed ones in place of forbidden ones."""
+        listed = isinstance(actions, list)
+        chosen = [actions[k] if listed else index(actions, k) for k in range(len(env_ids))]
+        for row, (env_id, result) in enumerate(zip(env_ids, batch.values(), strict=True)):
+            if (space := self._masked.get(env_id)) is not None:
+                chosen[row] = allowed_action(space, chosen[row], result, self._rng)
+        return chosen if listed else stacked(chosen)
+
+    def _meet(self, env_id: str, batch: BatchedData, row: int) -> Sampler:
+        space = self._space_of(env_id)
+        if space is None:
+            raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
+        sampler = next((sampler for known, sampler in self._kinds if known == space), None)
+        if sampler is None:
+            sampler = sampler_of(space, self._rng)
+            self._kinds.append((space, sampler))
+        self._samplers[env_id] = sampler
+        # Other infos are not read: they may hold objects that can't be unpickled here.
+        if can_be_masked(space) and has_masks(batch.values()[row]):
+            self._masked[env_id] = space
+        return sampler
+
+
+def sampler_of(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
+    """Return a function that makes n actions of `space`, as columns."""
+    columns = _columns(space, rng)
+    if columns is not None:
+        return columns
+    space.seed(int(rng.integers(2**31)))
+    return lambda n: [space.sample() for _ in range(n)]
+
+
+def _columns(space: gym.Space[Any], rng: np.random.Generator) -> Sampler | None:
+    """Return a function that makes columns, or None for spaces whose values can't be stacked."""
+    # Gymnasium's spaces are generic over a dtype that is usually left out.
+    spaces: Any = gym.spaces
+    known = cast("Any", space)
+    if isinstance(space, spaces.Box):
+        return _box(known, rng)
+    if isinstance(space, spaces.Discrete):
+        return _integers(known.start, known.start + known.n - 1, known, rng)
+    if isinstance(space, spaces.MultiDiscrete):
+        return _integers(known.start, known.start + known.nvec - 1, known, rng)
+    if isinstance(space, spaces.MultiBinary):
+        return _integers(0, 1, known, rng)
+    if isinstance(space, spaces.Dict):
+        return _mapping({key: _columns(inner, rng) for key, inner in known.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        parts = _mapping(dict(enumerate(_columns(inner, rng) for inner in known.spaces)))
+        return parts and (lambda n: tuple(parts(n).values()))
+    return None
+
+
+def _mapping(samplers: dict[Any, Sampler | None]) -> Sampler | None:
+    found = {key: sampler for key, sampler in samplers.items() if sampler is not None}
+    if len(found) < len(samplers):
+        return None
+    return lambda n: {key: sampler(n) for key, sampler in found.items()}
+
+
+def _integers(low: Any, high: Any, space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
+    """Return a function that draws integers from `low` to `high`, both included."""
+    shape, dtype = space.shape or (), space.dtype
+    return lambda n: rng.integers(low, high, (n, *shape), dtype=dtype, endpoint=True)
+
+
+def _box(space: Any, rng: np.random.Generator) -> Sampler:
+    if np.issubdtype(space.dtype, np.integer):
+        return _integers(space.low, space.high, space, rng)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    shape, dtype = space.shape, space.dtype
+    with np.errstate(over="ignore"):
+        span = high - low
+    if np.isfinite(span).all():
+        return lambda n: (low + span * rng.random((n, *shape))).astype(dtype)
+    return lambda n: _partly_bounded(low, high, span, rng, (n, *shape)).astype(dtype)
+
+
+def _partly_bounded(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    span: NDArray[np.float64],
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+) -> NDArray[np.float64]:
+    """Draw uniformly between two bounds, and normally around 0 or away from a single bound."""
+    both = np.isfinite(span)
+    uniform = np.where(both, low, 0.0) + np.where(both, span, 0.0) * rng.random(shape)
+    normal = rng.normal(0.0, _UNBOUNDED_SCALE, shape)
+    normal = np.where(np.isfinite(low), low + abs(normal), normal)
+    normal = np.where(~np.isfinite(low) & np.isfinite(high), high - abs(normal), normal)
+    return np.where(both, uniform, normal)
