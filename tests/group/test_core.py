@@ -375,6 +375,26 @@ def test_a_worker_that_dies_at_any_moment_of_a_restore_leaves_the_others_as_they
         assert batch.observation[:, 3].tolist() == [0 if slot in dead else 4]
 
 
+def test_nothing_is_loaded_into_the_replacement_of_a_worker_that_died_before(
+    new_group: NewGroup,
+) -> None:
+    """Its env would go on in the state of the snapshot, though nothing was restored."""
+    group = new_group(1, 1)
+    run(group, group.core.reset(group.now, None, None, None))
+    snapshot = run(group, group.core.snapshot(group.now, None))
+    restoring = group.begin(group.core.restore(group.now, snapshot, None))
+    group.finish(0)
+    die(group, 0)
+    group.finish(1)
+    group.pass_time(1.0)
+    assert not group.hosts[0].waiting
+    while not restoring.done:
+        group.finish(1)
+    with pytest.raises(WorkerDied) as caught:
+        restoring.result()
+    assert caught.value.env_ids == ("fake-0",)
+
+
 def test_requests_that_show_a_restored_state_are_as_old_as_they_are(new_group: NewGroup) -> None:
     """Not as old as the call, which has waited for two replies of each env before."""
     group = new_group(2)

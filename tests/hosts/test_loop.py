@@ -399,6 +399,19 @@ async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
         assert "Scripted.step" in caplog.text
 
 
+async def test_an_env_that_hangs_after_a_restore_begins_the_restored_episode_again(
+    place: dict[str, Any],
+) -> None:
+    async with rl.build_env_group(entry(step_timeout=SOON, **place)) as group:
+        await group.reset(seed=3)
+        snapshot = await group.snapshot()
+        await group.reset(seed=7)
+        await group.restore(snapshot)
+        batch, _ = await group.step(steps(e_0=HANG))
+        assert batch.restarted.all()
+        assert batch.observation[:, 3].tolist() == [3]
+
+
 class Tasked(Scripted):
     """Can't be reset without a task."""
 

@@ -157,12 +157,10 @@ class Snapshots:
         """
         states = [(snapshot.state, True) for snapshot in snapshots]
         try:
+            self._check_alive(slots, deaths)  # A replacement must not go on where it never was.
             ticket, now = yield from self._load(now, slots, states)
             values_of([ticket])
-            last = self._supervisor.last_losses(slots)
-            for death in last[last != deaths]:
-                # Its envs had replied, so nobody has heard.
-                raise death.silent(slots[last == death])
+            self._check_alive(slots, deaths)
         except EnvFault as fault:
             alive = self._supervisor.last_losses(slots) == deaths
             kept = [before[k] for k in np.flatnonzero(alive).tolist()]
@@ -173,6 +171,12 @@ class Snapshots:
             fault.add_note(note)
             raise
         return now
+
+    def _check_alive(self, slots: NDArray[np.intp], deaths: NDArray[Any]) -> None:
+        """Raise a death since `deaths`, of which nobody has heard, as its envs had replied."""
+        last = self._supervisor.last_losses(slots)
+        for death in last[last != deaths]:
+            raise death.silent(slots[last == death])
 
     def _undo(
         self, now: float, slots: NDArray[np.intp], before: Sequence[bytes]

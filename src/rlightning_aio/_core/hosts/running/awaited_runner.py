@@ -6,10 +6,11 @@ It is an `EnvRunner` that awaits what its env returns, and that another env may 
 from __future__ import annotations
 
 import inspect
+import pickle
 import time
 from typing import Any
 
-from rlightning_aio._core.hosts.running.runner import EnvRunner
+from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.protocol.entries import answers_with_value
 
 __all__ = ["Abandoned", "AwaitedRunner"]
@@ -24,7 +25,8 @@ class AwaitedRunner(EnvRunner):
 
     Attributes:
         is_abandoned: the env was replaced and may not write to its row any more.
-        reset_with: seed and options of the last reset, of this env or of the one before it.
+        reset_with: seed and options of the reset that began the episode, of this env, of the one
+            before it, or of the one whose snapshot was restored.
     """
 
     is_awaitable = True
@@ -51,6 +53,15 @@ class AwaitedRunner(EnvRunner):
         if self.is_abandoned:
             raise Abandoned
         return finish(returned, time.monotonic_ns() - began)
+
+    def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
+        versions, has_result, state = super()._snapshot()
+        return versions, has_result, pickle.dumps((self.reset_with, state))
+
+    def _restore(self, checkpoint: bytes, show: bool) -> None:
+        reset_with, state = loaded(checkpoint)
+        super()._restore(state, show)
+        self.reset_with = reset_with
 
     def _seed_and_options(self, arguments: Any) -> tuple[Any, Any]:
         """Return what to reset the env with, and remember it."""
