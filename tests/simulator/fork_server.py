@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from simulator.processes import Killed, Living, Process
 
 from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.messages import Attached
 from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from simulator.world import World
 
-    from rlightning_aio._core.hosts.messages import WorkerPlace
+    from rlightning_aio._core.hosts.messages import Completion, WorkerPlace
 
 __all__ = ["ForkServer"]
 
@@ -182,6 +183,16 @@ class ForkServer(Living):
             self.end(0)
 
 
+class _Worker(Worker):
+    """Notes that it is about to tell of its start."""
+
+    has_attached = False
+
+    def _post(self, completion: Completion) -> None:
+        self.has_attached |= isinstance(completion, Attached)
+        super()._post(completion)
+
+
 class _WorkerProcess(Process):
     """The worker of `place`, as it is forked.
 
@@ -194,7 +205,7 @@ class _WorkerProcess(Process):
         self, world: World, place: WorkerPlace, channel: int, arena: int, on_exit: Any
     ) -> None:
         self._place, self._channel, self._arena = place, channel, arena
-        self._worker: Worker | None = None
+        self._worker: _Worker | None = None
         super().__init__(world, f"worker {place.host_id}", self._serve, on_exit)
         world.note("{} is forked", self.name)
         self._end = world.sockets.by_number[channel].end
@@ -208,7 +219,7 @@ class _WorkerProcess(Process):
         return since_order > _LEAST_START_SECONDS * 1e9 and not self.has_started()
 
     def has_started(self) -> bool:
-        return self._worker is not None and self._worker._attached
+        return self._worker is not None and self._worker.has_attached
 
     def _serve(self) -> int:
         place, sockets = self._place, self.world.sockets
@@ -218,7 +229,7 @@ class _WorkerProcess(Process):
             memory = map_shared(self._arena, place.rings_offset, rings_size(place.num_envs))
             rings = WorkerRings(memory, place.num_envs, bell)
             channel = sockets.by_number[self._channel]
-            self._worker = Worker(channel, self._arena, rings, place.first_slot)  # pyright: ignore[reportArgumentType]
+            self._worker = _Worker(channel, self._arena, rings, place.first_slot)  # pyright: ignore[reportArgumentType]
             self._worker.serve()
         except Killed:
             raise

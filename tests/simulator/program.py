@@ -26,17 +26,27 @@ FEATURES = (
     "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
     "interrupts",
 )  # fmt: skip
-THEMES: tuple[tuple[str, ...], ...] = (
-    ("snapshots", "resume", "die", "processes", "auto_reset"),
-    ("snapshots", "die", "processes", "several envs"),
-    ("async", "snapshots", "cancel", "timeouts"),
-    ("snapshots", "calls", "several envs", "faults", "interrupts"),
-    ("resume", "die", "processes", "ends", "stacked"),
-    ("resume", "processes", "faults", "several envs", "calls"),
-    ("auto_reset", "stacked", "ends"),
-    ("several envs", "extras", "infos", "partial steps"),
-)
-"""Features that matter to each other: half of the programs have those of a theme."""
+_OF_OTHERS = (("resume", "die", "processes", "ends", "stacked"), ("processes", "hang", "faults"))
+THEMES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "group": (
+        ("snapshots", "resume", "die", "processes", "auto_reset"),
+        ("snapshots", "die", "processes", "several envs"),
+        ("async", "snapshots", "cancel", "timeouts"),
+        ("snapshots", "calls", "several envs", "faults", "interrupts"),
+        ("resume", "processes", "faults", "several envs", "calls"),
+        ("auto_reset", "stacked", "ends"),
+        ("several envs", "extras", "infos", "partial steps"),
+        *_OF_OTHERS,
+    ),
+    "training": (
+        ("async", "cancel", "processes", "several entries", "several envs"),
+        *_OF_OTHERS,
+    ),
+    "evaluations": _OF_OTHERS,
+    "vectors": _OF_OTHERS,
+    "sb3": _OF_OTHERS,
+}
+"""Features that matter to each other: half of the programs of a kind have those of a theme."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +205,7 @@ ROWS: dict[str, tuple[int, str | None]] = {
 }  # fmt: skip
 KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
     "group": (12, OPS),
-    "training": (4, {"rollout": (6, None), "learn": (2, None), "kill": (2, "die")}),
+    "training": (5, {"rollout": (6, None), "learn": (2, None), "kill": (2, "die")}),
     "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
     "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls")}),
     "sb3": (2, ROWS),
@@ -207,7 +217,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     """The program of a seed, without some features; a third of them have few."""
     rng = Random(seed)
     share = rng.choice((0.25, 0.5, 0.5))
-    theme = rng.choice(THEMES) if rng.random() < 0.5 else ()
+    kind = rng.choices([*KINDS], [weight for weight, _ in KINDS.values()])[0]
+    theme = rng.choice(THEMES[kind]) if rng.random() < 0.5 else ()
     features = frozenset(f for f in FEATURES if f in theme or rng.random() < share) - without
     plans = [_plan(rng, features, "a")]
     if "several entries" in features:
@@ -217,8 +228,6 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     if workers and rng.random() < 0.03:
         k = rng.choice(workers)
         plans[k] = replace(plans[k], start=rng.choice(["raise", "exit", "hang"]))
-    weights = [weight for weight, _ in KINDS.values()]
-    kind = rng.choices([*KINDS], weights)[0]
     if kind in ("vectors", "sb3"):
         features, plans = _as_rows(rng, features, kind)
     ops_of_kind = KINDS[kind][1]
@@ -252,9 +261,8 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
 
 
 def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
-    form = rng.choice(
-        [f for f in ("gym", "stacked", "base", "awaitable") if f == "gym" or f in features]
-    )
+    forms = ("gym", "stacked", "stacked", "base", "awaitable")
+    form = rng.choice([f for f in forms if f == "gym" or f in features])
     fixed = form == "stacked" or "out of band" not in features
     controls = [c for c in CONTROLS if not fixed or c not in ("text", "anything")]
     layouts = [*FIXED, "number"] if form != "stacked" and fixed else FIXED if fixed else LAYOUTS

@@ -77,6 +77,7 @@ class Trail:
         # Return and length up to each state of the episode.
         self._sums: dict[Words, tuple[float, int]] = {}
         self.ended: list[tuple[float, int]] = []
+        self._over: set[Words] = set()
 
     def allow(self, losses: int) -> None:
         """Note how many losses there may have been from the beginning on."""
@@ -94,7 +95,7 @@ class Trail:
         """Check one more; one that `goes_on` after an end belongs to no episode."""
         before, last = made.before, self.last
         require(before.code == self.code, "a transition of another env", made)
-        self._check_step(made)
+        has_ended = self._check_step(made)
         if goes_on:
             require(last is None or before == last.after, "it does not go on", last, made)
             self.last = made._replace(terminated=True)
@@ -102,6 +103,7 @@ class Trail:
         if last is not None and not self.is_over and before == last.after and not made.first:
             pass
         else:
+            require(before not in self._over, "it goes on after an end", last, made)
             self.losses -= not self.is_over
             require(self.losses >= 0, "an episode that is not over is cut", last, made)
             require(made.first is not False, "it continues nothing, and is not first", made)
@@ -115,16 +117,23 @@ class Trail:
         self._sums[made.after] = total, length
         if made.terminated or made.truncated:
             self.ended.append((total, length))
+        if has_ended:
+            self._over.add(made.after)
         self.last = made
 
-    def _check_step(self, made: Transition) -> None:
+    def _check_step(self, made: Transition) -> bool:
+        """Check a step by itself; return whether the env itself has ended its episode."""
         script = script_at(made.before, self.own_limit)
         reward, terminated, truncated, _ = script.step(*made.act)
-        truncated |= script.steps >= self.cut_after
+        has_ended = terminated or truncated
+        cut = script.steps >= self.cut_after
         if self.cut_together and self.cut_after < math.inf:
-            truncated |= made.truncated
+            # Not where all end by themselves in this step.
+            cut = made.truncated or (cut and not has_ended)
+        truncated |= cut
         if self.cut_or_ended:
             truncated &= not terminated
         require(script.words == made.after, f"it would lead to {script.words}", made)
         ends = np.float32(reward) == np.float32(made.reward), made.terminated, made.truncated
         require(ends == (True, terminated, truncated), "another reward, or another end", made)
+        return has_ended

@@ -118,7 +118,7 @@ class Training(InContext):
             return options | {"wait_all": True, "num_transitions": width * rng.randint(1, 4)}
         if rng.random() < 0.7:
             options["min_results"] = rng.randint(1, 4)
-        return options | {"num_transitions": rng.randint(1, 4 * width)}
+        return options | {"num_transitions": rng.randint(1, rng.choice([3, 4 * width]))}
 
     def policy(self, batch: BatchedData) -> Any:
         """Choose actions; sometimes it fails."""
