@@ -18,12 +18,14 @@ import numpy as np
 from simulator.scripted import (
     DYING,
     RAISING,
+    TIMEOUT,
     Act,
     Outcome,
     Scripts,
     Words,
     decoded,
     element,
+    slow_seconds,
     words_of,
 )
 
@@ -422,9 +424,11 @@ class Model:
         if request.resets and env.saves and env.since_save:  # That is saved before a reset.
             env.before_reset = [state.copy() for state in env.possible()]
             env.saves += env.before_reset
-        effects = [effect for effect, _ in env.state.copy().faults(request)]
+        acts = env.state.copy().faults(request)
+        effects = [effect for effect, _ in acts]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
-        env.deadly |= request.kills
+        slowness = sum(slow_seconds(token) for effect, token in acts if effect == "slow")
+        env.deadly |= request.kills or slowness > TIMEOUT / 2
         if request.kills and env.entry.form == "awaitable" and "hang" in effects:
             env.hangs += 1
         elif request.kills:
@@ -581,7 +585,7 @@ class Model:
             waits = env.entry.form == "awaitable" and len(together) > 1
             require(waits, "suspects, and one env's code must have been running", suspects)
         self.counts["suspects"] += bool(suspects)
-        if self.calm and host.knows and not host.struck:
+        if self.calm and host.knows and not (host.struck or env.torn):
             deadly = at_fault is not None and self.envs[at_fault].deadly
             require(deadly, "an innocent env is blamed, or none", at_fault, suspects)
 

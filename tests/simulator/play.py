@@ -74,7 +74,7 @@ class Play(Session):
         self.written: dict[str, Any] = {}
         faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
         calm = replace(self.program.faults, lags=0.0, interrupts=0.0) == Faults()
-        calm = calm and "snapshots" not in self.features  # A state that is put back may kill.
+        calm = calm and not {"snapshots", "die"} <= self.features  # States that are put back kill.
         starts_fail = faults != Faults()
         self.model = Model(self.envs, self.counts, starts_fail=starts_fail, calm=calm)
         require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)

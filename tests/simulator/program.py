@@ -12,7 +12,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from simulator.model import Entry, Env, Host, State
-from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, broken
+from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, TIMEOUT, broken
 from simulator.world import Faults
 
 if TYPE_CHECKING:
@@ -241,8 +241,11 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     first = [Op("reset", rng.getrandbits(32))] if begins else []
     kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
     kinds += ["interrupts"] * ("async" not in features and "interrupts" in features)
-    share = rng.choice((0.2, 0.5))
-    chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds if rng.random() < share}
+    if rng.random() < 0.5:
+        kinds = rng.sample(kinds, 1)
+    else:
+        kinds = [kind for kind in kinds if rng.random() < 0.4]
+    chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds}
     faults = Faults(**chances) if "faults" in features else Faults()
     return Program(seed, kind, features, tuple(plans), (*first, *ops), faults)
 
@@ -272,7 +275,7 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
         limit=rng.choice([None, 3]),
     )  # fmt: skip
     if form == "stacked":
-        modes = ["disabled", "next_step", "same_step"]
+        modes = ["disabled", "disabled", "next_step", "same_step"]
         plan = replace(plan, num_envs=rng.randint(2, 3), mode=rng.choice(modes))
     if "extras" in features and rng.random() < 0.3:
         plan = replace(plan, min_results=rng.randint(1, plan.num_workers))
@@ -286,7 +289,7 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
         return replace(plan, placement=placement)
     plan = replace(plan, placement=placement, share=rng.randint(1, 3))
     if "hang" in features and placement != "split" and rng.random() < 0.7:
-        plan = replace(plan, timeout=2.0)
+        plan = replace(plan, timeout=TIMEOUT)
     if "raise deaths" in features and rng.random() < 0.3:
         return replace(plan, on_death="raise")
     if "resume" in features and form != "awaitable" and rng.random() < 0.5:

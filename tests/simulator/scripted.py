@@ -68,6 +68,8 @@ EFFECTS = (
 )  # fmt: skip
 """What a step does, by number. ``… next`` does it in the next reset; after ``keep state`` the env
 refuses one snapshot."""
+TIMEOUT = 2.0
+"""Of a step or a reset, in seconds, where an entry has one."""
 TOKENS = 64
 """Numbers that an action has in addition, to tell it from others."""
 RAISING = ("raise", "raise oddly", "ctrl-c")
@@ -85,10 +87,15 @@ class Odd(BaseException):
         return f"odd {self.code}"
 
 
+def slow_seconds(token: int) -> float:
+    """How long a slow step takes."""
+    return (token + 1) / 50
+
+
 def perform(effect: str, token: int) -> None:
     """Do to the process what `effect` says."""
     if effect == "slow":
-        machine.spend((token + 1) / 50)
+        machine.spend(slow_seconds(token))
     elif effect in DYING:
         machine.die(effect)
     elif effect == "hang":
@@ -100,7 +107,7 @@ def perform(effect: str, token: int) -> None:
 async def perform_awaiting(effect: str, token: int) -> None:
     """Like `perform`, in an awaitable env."""
     if effect == "slow":
-        await machine.await_for((token + 1) / 50)
+        await machine.await_for(slow_seconds(token))
     elif effect == "hang":
         await machine.await_for_ever()
     else:
