@@ -120,11 +120,14 @@ class Stepped(Contender):
 
 def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
     """Return one config entry for all envs of `work`."""
+    from rlightning_aio.sharing import num_cores
+
     workers: dict[str, Any] = {}
     if work.placement != "inline":
+        by_core = -(-work.num_requests // num_cores())  # `auto` gives own tasks a worker each.
         # With one worker on each core, pinning is best.
         workers = {
-            "envs_per_process": envs_per_process,
+            "envs_per_process": by_core if envs_per_process == "auto" else envs_per_process,
             "cpu_affinity": envs_per_process == "auto",
         }
     return {
@@ -153,7 +156,7 @@ class OursSync(Stepped):
     """`rlightning_aio.sync.EnvGroup`: all envs step, all results are awaited.
 
     Attributes:
-        envs_per_process: as in a config entry.
+        envs_per_process: as in a config entry; ``auto`` shares the envs by core.
         auto_reset: whether finished episodes are reset; not needed if episodes never end.
         implementation: of the hot path, see `use_implementation`.
     """

@@ -18,6 +18,8 @@ SLEEPS = "benchmarks/Sleeps-v0"
 SPENDS = "benchmarks/Spends-v0"
 WORKS_5_US = "benchmarks/Works5us-v0"
 WORKS_30_US = "benchmarks/Works30us-v0"
+WORKS_1_MS = "benchmarks/Works1ms-v0"
+NAPS_10_MS = "benchmarks/Naps10ms-v0"
 
 
 def work(seconds: float) -> None:
@@ -87,6 +89,18 @@ class Works(NoWork):
         return super().step(action)
 
 
+class Naps(NoWork):
+    """Sleeps in each step for the same time."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self._seconds = seconds
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        time.sleep(self._seconds)
+        return super().step(action)
+
+
 class Spends(NoWork):
     """Works and then sleeps for the seconds in its action; observes the time at its end.
 
@@ -115,5 +129,7 @@ for _id, _entry_point, _kwargs in (
     (SPENDS, Spends, {}),
     (WORKS_5_US, Works, {"seconds": 5e-6}),
     (WORKS_30_US, Works, {"seconds": 30e-6}),
+    (WORKS_1_MS, Works, {"seconds": 1e-3}),
+    (NAPS_10_MS, Naps, {"seconds": 1e-2}),
 ):
     gym.register(_id, _entry_point, disable_env_checker=True, order_enforce=False, kwargs=_kwargs)

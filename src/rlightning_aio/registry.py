@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast
@@ -21,18 +22,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
     from importlib.metadata import EntryPoints
 
+    from gymnasium.envs.registration import EnvSpec
+
 __all__ = [
     "BACKENDS",
+    "CALLABLE",
     "ENVS",
     "PLACEMENTS",
     "Backend",
     "Placement",
     "Registry",
     "did_you_mean",
+    "is_of_simulator",
     "load",
     "placement_of",
 ]
 
+CALLABLE: Final = "callable"
+"""Backend of envs that come from a callable."""
 ENTRY_POINT_GROUP = "rlightning_aio.backends"
 
 EnvClass = TypeVar("EnvClass", bound="type[Any]")
@@ -140,6 +147,44 @@ BACKENDS: dict[str, Backend] = {
     )
 }
 # fmt: on
+
+
+_SIMULATORS_CODE: Final = frozenset(
+    ["gymnasium", *(backend.module for backend in BACKENDS.values() if backend.cpu_bound)]
+)
+
+
+def is_of_simulator(spec: EnvSpec) -> bool:
+    """Return True if the code of a task of Gymnasium's registry is a simulator's that computes."""
+    made_by = spec.entry_point if spec.entry_point is not None else spec.vector_entry_point
+    module = made_by if isinstance(made_by, str) else getattr(made_by, "__module__", "")
+    return module.partition(":")[0].partition(".")[0] in _SIMULATORS_CODE
+
+
+def _is_simulators(task: Any) -> bool:
+    """Return True for the name of such a task, registered in this process."""
+    import gymnasium  # noqa: PLC0415  # Workers don't ask.
+
+    spec = gymnasium.registry.get(task) if isinstance(task, str) else None
+    return spec is not None and is_of_simulator(spec)
+
+
+def _computes(maker: Any) -> bool:
+    """Return True if a callable says that its envs compute, or names a simulator's task."""
+    said: Any = getattr(maker, "computes", None)
+    if said is not None:
+        return bool(said)
+    maker = getattr(maker, "__wrapped__", maker)  # Of `VectorEnv`.
+    named: list[Any] = []
+    while isinstance(maker, partial):
+        named += [*maker.args, *maker.keywords.values()]
+        maker = cast("Any", maker).func
+    code: Any = getattr(maker, "__code__", None)
+    if code is not None:
+        with suppress(ValueError):  # A cell may be empty.
+            named += [cell.cell_contents for cell in maker.__closure__ or ()]
+        named += [*code.co_consts, *(maker.__defaults__ or ())]
+    return any(map(_is_simulators, named))
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,6 +398,22 @@ class Registry:
         """Return True if envs of backend `name` are known to be CPU-bound."""
         backend = self.described(name)
         return self._cpu_bound.get(name, backend is not None and backend.cpu_bound)
+
+    def computes(self, name: str, task: Any) -> bool:
+        """Return True if envs of `task`, of backend `name`, are known to be CPU-bound.
+
+        Own ones aren't known: tasks whose code is neither Gymnasium's nor that of another backend
+        here, and callables that name no such task (in a constant, an argument or a closure) and
+        have no attribute ``computes`` that says so.
+        """
+        if not self.is_cpu_bound(name):
+            return False
+        if name in self._classes or name not in ("gymnasium", CALLABLE):
+            return True
+        if name == CALLABLE:
+            makers = cast("tuple[Any, ...]", task) if isinstance(task, tuple) else (task,)
+            return all(map(_computes, {id(maker): maker for maker in makers}.values()))
+        return _is_simulators(task)
 
     def is_awaitable(self, name: str) -> bool:
         """Return True if envs of backend `name` are known to do nothing but wait."""

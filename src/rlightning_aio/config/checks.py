@@ -10,9 +10,9 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rlightning_aio.config.entry import CALLABLE, MADE_BY_GYMNASIUM, EnvConfig, makers_of
+from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, makers_of
 from rlightning_aio.config.problems import Problems
-from rlightning_aio.registry import ENVS, placement_of
+from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -17,11 +17,10 @@ from pydantic import (
 )
 
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
-from rlightning_aio.registry import ENVS, PLACEMENTS, name_of, placement_of
+from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, name_of, placement_of
 from rlightning_aio.sharing import num_batches, num_cores
 
 __all__ = [
-    "CALLABLE",
     "MADE_BY_GYMNASIUM",
     "EnvConfig",
     "VideoConfig",
@@ -30,8 +29,6 @@ __all__ = [
     "moved",
 ]
 
-CALLABLE = "callable"
-"""Name of the backend whose envs come from a callable."""
 MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
 """Backends whose `env_kwargs` go to `gymnasium.make`."""
 

@@ -55,6 +55,7 @@ class EnvMaker:
         worker_index: the env's position in its group.
         preprocess_fn: the preprocess function, or None.
         env_id: the id that `BaseEnv` made, to be kept after a restart.
+        computes: its steps are known to keep a core busy.
     """
 
     kind: Any
@@ -62,6 +63,7 @@ class EnvMaker:
     worker_index: int
     preprocess_fn: Any
     env_id: str
+    computes: bool = False
 
     def __call__(self) -> HostedEnv:
         """Make the env and wrap it as one of ours."""

@@ -88,6 +88,8 @@ class Plan:
         if fields.get("placement") != "inline":
             if backend is None or not backend.cpu_bound:
                 fields.setdefault("envs_per_process", 1)
+            for maker in replicas:
+                maker.computes = backend is not None and backend.cpu_bound
             if backend is not None and backend.hardware:
                 fields.setdefault("on_worker_death", "raise")
         return EnvConfig(

@@ -65,8 +65,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         observation_mode: ``same``, ``different`` (equal shapes and dtypes), or a pair of the
             batched and the single observation space.
         autoreset_mode: when an env is reset after the end of its episode.
-        max_concurrency: maximum number of workers, each executing one env at a time; None for one
-            per core that this process may use.
+        max_concurrency: maximum number of workers, each executing one env at a time. None: one for
+            each env, up to eight for each core that this process may use; of tasks that are known
+            to compute (`make_vec`), one for each core.
         entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
 
     Attributes:

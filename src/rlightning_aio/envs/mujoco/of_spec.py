@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from rlightning_aio.registry import is_of_simulator
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
@@ -33,7 +35,7 @@ class OneOf:
         wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     ) -> None:
         self._spec, self._kwargs, self._wrappers = spec, kwargs, wrappers
-        self.__qualname__ = spec.id
+        self.__qualname__, self.computes = spec.id, is_of_simulator(spec)
 
     def __call__(self) -> gym.Env[Any, Any]:
         env: gym.Env[Any, Any] = gym.make(self._spec, **self._kwargs)
@@ -52,7 +54,7 @@ class BatchOf:
 
     def __init__(self, make_one: OneOf, *arguments: Any, **options: Any) -> None:
         self._make_one, self._arguments, self._options = make_one, arguments, options
-        self.__qualname__ = make_one.__qualname__
+        self.__qualname__, self.computes = make_one.__qualname__, True
 
     def __call__(self) -> gym.vector.VectorEnv[Any, Any, Any]:
         # Imported here because few workers need it.
@@ -66,7 +68,7 @@ class VectorOf:
 
     def __init__(self, spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> None:
         self._spec, self._num_envs, self._kwargs = spec, num_envs, kwargs
-        self.__qualname__ = spec.id
+        self.__qualname__, self.computes = spec.id, is_of_simulator(spec)
 
     def __call__(self) -> gym.vector.VectorEnv[Any, Any, Any]:
         return gym.make_vec(

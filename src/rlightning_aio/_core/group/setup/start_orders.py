@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import os
 from collections import Counter
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
 from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, filmed_alone, place_of
@@ -13,6 +14,7 @@ from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of, moved
 from rlightning_aio.registry import ENVS
+from rlightning_aio.sharing import envs_per_worker
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -113,10 +115,13 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
 
     With ``envs_per_process: auto``, entries of CPU-bound simulators share the cores in proportion
     to their envs. Entries on other machines don't, as the cores there are unknown here. Envs that
-    only wait are all in one worker, which keeps an event loop for them.
+    only wait are all in one worker, which keeps an event loop for them. Others may wait or compute:
+    own envs have a worker each, as far as `envs_per_worker` allows it for all of them.
     """
     nums: list[int] = []
     sharing: list[int] = []
+    own = sum(config.num_workers for config in configs if _is_own(config))
+    together = envs_per_worker(own, num_cores)
     for k, config in enumerate(configs):
         if not place_of(config).spreads:
             nums.append(1)
@@ -124,6 +129,8 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             nums.append(-(-config.num_workers // config.envs_per_process))
         elif ENVS.is_awaitable(config.backend):
             nums.append(1)
+        elif _is_own(config):
+            nums.append(-(-config.num_workers // together))
         elif ENVS.is_cpu_bound(config.backend) and place_of(config).local:
             nums.append(1)
             sharing.append(k)
@@ -136,6 +143,22 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             break
         nums[crowded] += 1
     return nums
+
+
+def _is_own(config: EnvConfig) -> bool:
+    """True for envs of the user, of which nobody knows whether they compute or wait.
+
+    Those of a class with coroutines wait on the event loop of a worker, so they may share it.
+    """
+    if not ENVS.is_cpu_bound(config.backend) or not place_of(config).local:
+        return False
+    task: Any = config.task
+    if isinstance(task, tuple):
+        task = cast("tuple[Any, ...]", task)[0]
+    return not (
+        ENVS.computes(config.backend, config.task)
+        or inspect.iscoroutinefunction(getattr(task, "step", None))
+    )
 
 
 def _shares(config: EnvConfig, fns: Sequence[PreprocessFn | None], num_hosts: int) -> list[Share]:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from rlightning_aio.sharing import envs_per_worker
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -33,8 +35,6 @@ _SHORT_US: Final = 1000.0
 _TINY_US: Final = 30.0
 _ENOUGH_NS: Final = 20_000_000
 _ENOUGH_RESULTS: Final = 16
-_WORKERS_PER_CORE: Final = 8
-"""Envs that wait have a worker each, up to this number."""
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -133,7 +133,7 @@ class Hints:
         self._since[name] = now
         config = records[0].config
         together = max(len(record.slots) for record in records)
-        best = -(-config.num_workers // (_WORKERS_PER_CORE * num_cores))
+        best = envs_per_worker(config.num_workers, num_cores)
         if waits(spent) and best < together:
             self._since[name] = None
             _log.warning("%s", _advice(name, together, best, spent))
