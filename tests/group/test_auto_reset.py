@@ -289,3 +289,59 @@ async def test_a_step_that_raises_does_not_count(start: Any) -> None:
         assert (await group.step(responses("probe-0")))[1] == [True]
         batch, _ = await group.step(responses("probe-0", what=RAISE))
         assert steps_of(batch) == [0], "the action of a reset is ignored"
+
+
+# -- outside
+
+
+def said(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the warnings of steps past an end, and forget them."""
+    found = [r.getMessage() for r in caplog.records if "although its episode is over" in r.message]
+    caplog.clear()
+    return found
+
+
+@pytest.mark.parametrize("what", [END, TRUNCATE])
+async def test_a_step_past_an_end_is_warned_of_once_for_each_entry(
+    start: Any, what: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It names the env and what to do; the step itself is made."""
+    group = await start([ENTRY, {**ENTRY, "name": "other"}])
+    ids = group.env_ids
+    await group.reset()
+    await group.step(responses("probe-1", what=what))
+    await group.step(responses("probe-0", "probe-2", "other-0"))
+    assert said(caplog) == [], "those are not over"
+    group.step_async(responses(*ids))
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(steps_of(batch)) == [1, 1, 2, 2, 2, 2]
+    (message,) = said(caplog)
+    assert message.startswith("env 'probe-1' (entry 'probe'")
+    assert "group.reset(env_ids=…)" in message
+    assert "auto_reset(" in message
+    for _ in range(2):
+        await group.step(responses(*ids[:3], what=what))
+    assert said(caplog) == [], "once for each entry"
+    await group["other-2"].step([what, 1.0])
+    await group["other-2"].step([DO_NOTHING, 1.0])
+    (message,) = said(caplog)
+    assert message.startswith("env 'other-2' (entry 'other'")
+
+
+async def test_no_step_past_an_end_is_warned_of_where_none_is_made(
+    start: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """After a reset, and inside a context, with `on_done=False` too."""
+    group = await start(ENTRY)
+    await group.reset()
+    await group.step(responses(*IDS, what=END))
+    await group.reset()
+    await group.step(responses(*IDS, what=END))
+    with group.auto_reset(9):
+        await group.step(responses(*IDS))
+        await group.step(responses(*IDS, what=END))
+    with group.auto_reset(9, on_done=False):
+        await group.step(responses(*IDS))
+    assert said(caplog) == []
+    await group.step(responses(*IDS))
+    assert len(said(caplog)) == 1

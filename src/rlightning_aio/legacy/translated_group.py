@@ -7,6 +7,7 @@ for them. What RLightning's operations mean is in `group`.
 from __future__ import annotations
 
 import contextlib
+import math
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -68,6 +69,8 @@ class TranslatedGroup:
         self._local_entries = [entry.name for entry in plan.entries if entry.backend == "callable"]
         self._core = build_env_group(plan.entries, mixed_actions=True)
         self._core.init()
+        # There, a step after an end is nothing unusual.
+        self._core.auto_reset(math.inf, on_done=False).__enter__()
         self.counter: EnvStepCounter | None = None
         # What Ctrl-C kept from its caller, or came before `collect_async` asked for it.
         self._kept: list[ResultRow] = []

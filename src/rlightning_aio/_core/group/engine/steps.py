@@ -24,7 +24,7 @@ from rlightning_aio._core.group.engine.actions import (
 )
 from rlightning_aio._core.group.engine.first_observations import FirstObservations
 from rlightning_aio._core.group.engine.newest import Newest
-from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, UNLIKE_ENVS
+from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio.batch.contents import slots_of
@@ -302,6 +302,8 @@ class Steps:
         if self._supervisor.members.possible:
             batch, slots = self._arrivals.without_gone(batch, slots)
         self._dispatch.check_sendable(now, slots, "step")
+        if self._conditions.unusual & PAST_END:
+            self._continuity.warn_of_ended(slots)
         if not len(slots):
             return slots, None
         out_of_band = write_actions(batch, slots, self._envs, self._layout)

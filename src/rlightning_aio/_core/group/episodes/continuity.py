@@ -9,6 +9,7 @@ and returned.
 
 from __future__ import annotations
 
+import logging
 import math
 import operator
 import warnings
@@ -21,7 +22,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rlightning_aio._core.group.state.conditions import CUT_BEFORE, LOST_EPISODE, Conditions
+from rlightning_aio._core.group.state.conditions import (
+    CUT_BEFORE,
+    LOST_EPISODE,
+    PAST_END,
+    Conditions,
+)
 from rlightning_aio.protocol.entries import Operation, op_of
 from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
 
@@ -41,6 +47,7 @@ __all__ = [
     "as_int",
 ]
 
+_log = logging.getLogger("rlightning_aio")
 _NO_LIMIT: Final = 1 << 62
 
 
@@ -185,6 +192,8 @@ class Continuity:
         # The last returned result reached the step limit; ended the episode by itself.
         self._cut = np.zeros(len(envs), np.bool_)
         self._ended = np.zeros(len(envs), np.bool_)
+        # Of entries that were warned of a step past an end.
+        self._warned = np.zeros(len(envs), np.bool_)
         self._limits: NDArray[np.int64] | None = None
         self._uses_own_limits = False
         self._resets_ended = True
@@ -203,16 +212,11 @@ class Continuity:
     def begin(
         self, max_episode_steps: float | None, *, on_done: bool, needs_limits: bool = True
     ) -> None:
-        """Open the `auto_reset` context.
-
-        Args:
-            max_episode_steps: see `EnvGroup.auto_reset`, as for `on_done`.
-            on_done: see there.
-            needs_limits: an env without a limit of its own is an error.
+        """Open the `auto_reset` context; without `needs_limits`, envs may lack limits of their own.
 
         Raises:
             ValueError: the limit is neither a positive int nor `math.inf`, or is None and an env
-                has none that needs one.
+                has none.
             RuntimeError: the context is open already.
         """
         if self.auto_reset_is_open:
@@ -222,7 +226,7 @@ class Continuity:
         self._margin = 0
         self._resets_ended = on_done
         self.auto_reset_is_open = True
-        self._conditions.note(CUT_BEFORE, False)
+        self._conditions.note(CUT_BEFORE | PAST_END, False)
         self._update_due()
 
     def _chosen_limits(self, given: float | None, *, needs_limits: bool) -> NDArray[np.int64]:
@@ -278,10 +282,27 @@ class Continuity:
             self._update_due()
         return self.due[slots]
 
+    def warn_of_ended(self, slots: NDArray[np.intp]) -> None:
+        """Warn, once for each entry, that envs of `slots` are stepped although they are over."""
+        entries = self._envs.names.entries
+        for slot in slots[self._ended[slots] & ~self._warned[slots]].tolist():
+            if not self._warned[slot]:
+                self._warned |= entries == entries[slot]
+                _log.warning(
+                    "%s is stepped although its episode is over: reset it (group.reset(env_ids=…))"
+                    ", or step inside `with group.auto_reset(math.inf):`, where envs are reset in "
+                    "place of such a step; this is not said again of entry %r",
+                    self._envs.describe(slot),
+                    self._envs.configs[slot].name,
+                )
+        self._update_due()
+
     def _update_due(self) -> None:
         if not self.auto_reset_is_open:
             self.due[:] = False
             self._conditions.note(CUT_BEFORE, len(self._cut.nonzero()[0]) > 0)
+            over = self._ended & ~self._warned
+            self._conditions.note(PAST_END, len(over.nonzero()[0]) > 0)
         elif self._resets_ended:
             np.logical_or(self._cut, self._ended, out=self.due)
         else:

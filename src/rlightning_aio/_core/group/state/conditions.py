@@ -16,6 +16,7 @@ __all__ = [
     "DEATH",
     "FAULT",
     "LOST_EPISODE",
+    "PAST_END",
     "UNLIKE_ENVS",
     "Conditions",
 ]
@@ -37,6 +38,9 @@ FAULT: Final = 1 << 6
 """An error waits for the collector."""
 ABORTING: Final = 1 << 7
 """A request is to end without its reply."""
+
+PAST_END: Final = 1 << 8
+"""Outside `auto_reset` an env is over, of an entry that was not warned that a step would go on."""
 
 
 class Conditions:
