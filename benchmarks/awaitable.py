@@ -151,7 +151,9 @@ class Episodes(InGroup):
 
     async def _start(self) -> None:
         await super()._start()
-        self.episodes = [self.group.episode(env_id) for env_id in self.group.env_ids]
+        self.episodes = [
+            self.group.episode(env_id, seed=k) for k, env_id in enumerate(self.group.env_ids)
+        ]
         await asyncio.gather(*(episode.__aenter__() for episode in self.episodes))
 
     async def _play(self, seconds: float) -> tuple[float, int]:
