@@ -206,7 +206,7 @@ async def test_an_unread_reply_while_the_loop_is_busy_is_no_hang() -> None:
         # Text doesn't fit in a row, so the reply comes through the channel.
         await group["faulty-0"].call("answer_with", info=lambda: {"word": "late"})
         (host,) = group._core.supervisor.hosts
-        while host.executing()[0]:
+        while host.current_request()[0]:
             os.sched_yield()
         stop(pid)
         group.step_async(tokens.steps(group.env_ids))

@@ -459,7 +459,7 @@ def test_env_that_hangs_in_a_step_does_not_delay_close(start: Start) -> None:
     """Whatever its own timeout is."""
     group, tokens = start(two_workers(step_timeout=10 * HANG)), Tokens()
     group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "deadlock with the GIL"}))
-    while op_of(group.group._core.supervisor.hosts[0].executing()[0]) != Operation.STEP:
+    while op_of(group.group._core.supervisor.hosts[0].current_request()[0]) != Operation.STEP:
         os.sched_yield()
     with pytest.warns(UserWarning, match="did not close in time and was killed"):
         group.close()

@@ -335,7 +335,7 @@ class FakeWorker(FakeHost):
                 self.on_readable()
             self.post(Reported(self.host_id, entries))
 
-    def executing(self) -> tuple[int, int]:
+    def current_request(self) -> tuple[int, int]:
         return 0, 0
 
     def catch_up(self) -> bool:

@@ -109,7 +109,7 @@ class Driven:
         self._ask([COMPANION], Operation.RESET, self.ticket.owner)
 
     def _free(self) -> None:
-        fault = self.table.collector.failed[SLOT]
+        fault = self.table.collector.errors[SLOT]
         assert self.table.collector.take_fault(fault).tolist() == [SLOT]
 
     def _result(self) -> None:
@@ -163,7 +163,7 @@ class Driven:
         assert table.collector.num_ready == (ready & collected).sum()
         assert table.collector.num_awaited == (busy & collected).sum()
         failed = (table.state == State.SPENT) & collected
-        assert sorted(table.collector.failed) == np.flatnonzero(failed).tolist()
+        assert sorted(table.collector.errors) == np.flatnonzero(failed).tolist()
         table.hand_out(np.array(self.settled, np.intp))
         for among in (None, np.array([True, True, False]), np.arange(3) == SLOT):
             chosen = collected if among is None else collected & among
@@ -257,7 +257,7 @@ def test_any_other_event_is_refused_or_has_no_effect(
     elif event in (Event.CLAIMED, Event.DROPPED):
         assert not table.joined(slots).any()
     elif event is Event.FREED:
-        assert SLOT not in table.collector.failed
+        assert SLOT not in table.collector.errors
     elif event is Event.HANDED_OUT:
         assert table.collector.num_ready == 0
     elif event is Event.SETTLED and owner is Owner.TICKET:

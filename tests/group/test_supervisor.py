@@ -134,7 +134,7 @@ class StandIn:
         assert len(arguments or entries) == len(entries) > 0
         self.asked += entries.tolist()
 
-    def executing(self) -> tuple[int, int]:
+    def current_request(self) -> tuple[int, int]:
         return self.current
 
     def catch_up(self) -> bool:

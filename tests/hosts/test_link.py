@@ -402,7 +402,7 @@ def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) 
     started.host.submit(steps(2))
     started.send(FrameKind.INFO_SCHEMA, 1, pickle.dumps(SCHEMA))
     started.rings.begin(step(2, 1), 5)
-    assert started.host.executing() == (step(2, 1), 5)
+    assert started.host.current_request() == (step(2, 1), 5)
     started.channel.close()
     started.read()
     started.host.on_exit(-signal.SIGSEGV, "last words")
@@ -417,7 +417,7 @@ def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) 
     started.host.on_fork_server_lost("it ended")
     assert started.posted() == []
     assert not started.watched
-    assert started.host.executing() == (0, 0)
+    assert started.host.current_request() == (0, 0)
     # Requests to a dead worker are dropped without an error.
     started.host.submit(steps(3))
     started.host.poll()

@@ -168,7 +168,7 @@ class Measured(Protocol):
 class Killable(Protocol):
     """A host that can hang, and that can be killed."""
 
-    def executing(self) -> tuple[int, int]:
+    def current_request(self) -> tuple[int, int]:
         """Return the entry being executed and its start (monotonic ns); entry 0 if none.
 
         The start is 0 while the worker waits for the trainer to read a reply.

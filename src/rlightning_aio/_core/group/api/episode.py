@@ -57,7 +57,7 @@ class EnvEpisode:
         try:
             seeds = None if self._seed is None else [self._seed]
             found = await self._answer(self._group.reset(seeds, self._options, [self.env.env_id]))
-            self._take(found)
+            self._note(found)
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
@@ -88,7 +88,7 @@ class EnvEpisode:
             answer = await self._answer(self._group.step(steps_of(self.env.env_id, response)))
             found = answer[0]
             if not found.restarted.any():
-                self._take(answer)
+                self._note(answer)
                 return self.last
             info = found.values()[0].info
             self.lost = str(info.get("worker_restarted") or info.get("client_lost"))
@@ -107,6 +107,6 @@ class EnvEpisode:
         self._tasks.remove(task)
         return found
 
-    def _take(self, found: tuple[BatchedData, Any]) -> None:
+    def _note(self, found: tuple[BatchedData, Any]) -> None:
         self.last = only_result(found)
         self.is_over = bool(all_agents(found[0].done).all())

@@ -210,7 +210,7 @@ class Core:
     ) -> Procedure[tuple[BatchedData, Flags]]:
         """Restore envs, and return their last results as first observations."""
         with self.observed.call("restore", now):
-            slots, positions, now = yield from self._snapshots.put_back(now, data, env_ids)
+            slots, positions, now = yield from self._snapshots.restore(now, data, env_ids)
             self.continuity.note_shows(slots.tolist(), positions)
             return self.steps.settled(*(yield from self._resets.show_restored(now, slots)))
 

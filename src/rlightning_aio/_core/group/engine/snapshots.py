@@ -99,7 +99,7 @@ class Snapshots:
             snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
         return snapshots, now
 
-    def put_back(
+    def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None
     ) -> Procedure[tuple[NDArray[np.intp], list[Position], float]]:
         """Put envs into the state of their snapshots, which a reset `AS_RESTORED` then shows.
@@ -115,7 +115,7 @@ class Snapshots:
             check_same(snapshot, own.identity, self._envs.describe(slot))
         try:
             states = [own.state for own, _ in before]
-            now = yield from self._put_back(now, slots, snapshots, states, deaths)
+            now = yield from self._restore(now, slots, snapshots, states, deaths)
         except EnvFault:
             raise
         except BaseException:
@@ -142,7 +142,7 @@ class Snapshots:
             )
         return self._dispatch.distinct(taken_of if env_ids is None else env_ids)
 
-    def _put_back(
+    def _restore(
         self,
         now: float,
         slots: NDArray[np.intp],

@@ -177,7 +177,7 @@ class Steps:
             else:
                 send = partial(self._send, slots, packed, now)
                 ticket, now = yield from self._waiting.ask(now, slots, send)
-                if ticket.failed:
+                if ticket.errors:
                     self._raise_faults(ticket)
             results, flags = self.hand_out(slots, synchronous=True)
         finally:
@@ -370,7 +370,7 @@ class Steps:
 
     def settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
         """Return the results of a call in its order, or raise its faults with the results."""
-        if ticket.failed:
+        if ticket.errors:
             self._raise_faults(ticket)
         return self.hand_out(slots, synchronous=True)
 
@@ -421,7 +421,7 @@ class Steps:
                 results.let_go(slots)
             self._requests.hand_out(slots)
         except BaseException:
-            self._requests.put_back(slots)
+            self._requests.requeue(slots)
             raise
         if observer is not None:
             observer.after_results(noted, parts)

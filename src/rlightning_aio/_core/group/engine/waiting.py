@@ -128,8 +128,8 @@ class Waiting:
         poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
         self.wanted[wanted] = self.wanted.get(wanted, 0) + 1
         try:
-            if poller.executing and poller.execute(1 if self._shares_thread else wanted, until):
-                now = yield TURN if len(poller.executing) == len(in_flight) else Wait(0.0)
+            if poller.inline and poller.execute(1 if self._shares_thread else wanted, until):
+                now = yield TURN if len(poller.inline) == len(in_flight) else Wait(0.0)
                 is_due = now >= supervisor.look_by
             else:
                 # Other calls may wait for fewer results.
@@ -259,7 +259,7 @@ class Poller:
 
     Attributes:
         bell, num_cores: as given.
-        executing: the inline hosts; the next is the first.
+        inline: the inline hosts; the next is the first.
     """
 
     def __init__(
@@ -271,7 +271,7 @@ class Poller:
     ) -> None:
         self.bell = bell
         self.num_cores = num_cores
-        self.executing: deque[tuple[int, Executing]] = deque()
+        self.inline: deque[tuple[int, Executing]] = deque()
         self._requests = requests
         self._clock = clock
         self._workers: dict[int, Polled] = {}
@@ -283,7 +283,7 @@ class Poller:
     def add(self, host: Host) -> None:
         """Add a host of the group."""
         if isinstance(host, Executing):
-            self.executing.append((host.host_id, host))
+            self.inline.append((host.host_id, host))
         elif isinstance(host, Membership):
             self._memberships[host.host_id] = host
         elif isinstance(host, Polled):
@@ -311,7 +311,7 @@ class Poller:
 
         Returns True if any request was executed.
         """
-        hosts, in_flight = self.executing, self._requests.in_flight
+        hosts, in_flight = self.inline, self._requests.in_flight
         if len(hosts) < len(in_flight):
             own = sum([in_flight[host_id] for host_id, _ in hosts])
             wanted = wanted if own == sum(in_flight) else 1

@@ -41,7 +41,7 @@ class Stage(Enum):
     """Dead, and to be restarted."""
     REBUILDING = auto()
     """A replacement is starting."""
-    FAILED = auto()
+    GIVEN_UP = auto()
     CLOSED = auto()
 
 

@@ -45,7 +45,7 @@ class Ticket(msgspec.Struct):
     Attributes:
         remaining: number of its requests that have not ended.
         method: name of the method that it calls; empty for steps and resets.
-        failed: the error that a request ended in, by slot.
+        errors: the error that a request ended in, by slot.
         values: returned by method calls, by slot.
     """
 
@@ -53,7 +53,7 @@ class Ticket(msgspec.Struct):
     slots: NDArray[np.intp]
     remaining: int
     method: str
-    failed: dict[int, EnvFault] = {}
+    errors: dict[int, EnvFault] = {}
     values: dict[int, Any] = {}
 
     def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -68,13 +68,13 @@ class Ticket(msgspec.Struct):
     @property
     def faults(self) -> list[EnvFault]:
         """The errors, each once."""
-        return list(dict.fromkeys(self.failed.values()))
+        return list(dict.fromkeys(self.errors.values()))
 
     def failures(self) -> list[tuple[EnvFault, NDArray[np.intp]]]:
         """Return each error, with its own slots; those of aborted requests are not its own."""
         own = set(self.slots.tolist())
         slots_of = {
-            fault: [slot for slot in self.failed if slot in own and self.failed[slot] is fault]
+            fault: [slot for slot in self.errors if slot in own and self.errors[slot] is fault]
             for fault in self.faults
         }
         return [(fault, np.array(slots, np.intp)) for fault, slots in slots_of.items()]
@@ -166,7 +166,7 @@ class CollectorQueue(UncollectedErrors):
         self.num_ready -= count
         return taken[0] if len(taken) == 1 else np.concatenate(taken)
 
-    def put_back(self, slots: NDArray[np.intp]) -> None:
+    def requeue(self, slots: NDArray[np.intp]) -> None:
         """Make taken results the next ones."""
         self.ready.appendleft(slots)
         self.num_ready += len(slots)
@@ -197,7 +197,7 @@ class Aborted:
         """Return which of `slots` are aborted."""
         return np.array([slot in self.faults for slot in slots.tolist()], np.bool_)
 
-    def take(self, slots: NDArray[np.intp]) -> list[EnvFault]:
+    def pop(self, slots: NDArray[np.intp]) -> list[EnvFault]:
         """Remove slots whose requests have ended; return their errors."""
         taken = [self.faults.pop(slot) for slot in slots.tolist()]
         self._conditions.note(ABORTING, bool(self.faults))
@@ -428,11 +428,11 @@ class Requests:
         """
         aborted = self.aborted.among(slots)
         for owner, mine in self.owners(slots[aborted]).items():
-            faults = self.aborted.take(mine)
+            faults = self.aborted.pop(mine)
             if owner > 0:
                 ticket = self.tickets.note_ended(owner, len(mine))
                 ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
-                ticket.failed.update(zip(mine.tolist(), faults, strict=True))
+                ticket.errors.update(zip(mine.tolist(), faults, strict=True))
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
             self._forget(mine)
@@ -494,7 +494,7 @@ class Requests:
         self.has_news = True
         if owner > 0:
             ticket = self.tickets.note_ended(owner, len(slots))
-            ticket.failed |= dict.fromkeys(slots.tolist(), fault)
+            ticket.errors |= dict.fromkeys(slots.tolist(), fault)
             self.state[slots] = _SPENT_CODE
         elif owner == COLLECTOR:
             self.collector.num_awaited -= len(slots)
@@ -517,11 +517,11 @@ class Requests:
         """Record that results were returned: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
 
-    def put_back(self, slots: NDArray[np.intp]) -> None:
+    def requeue(self, slots: NDArray[np.intp]) -> None:
         """Make results of `slots` that were not returned wait for the collector again."""
         kept = self.ready(slots)
         if len(kept):
-            self.collector.put_back(kept)
+            self.collector.requeue(kept)
 
     def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return which of `slots` have a first result that has not been collected."""
@@ -543,7 +543,7 @@ class Requests:
         """Close a ticket that has all replies: results may be returned, the rest is idle."""
         del self.tickets.waiting[ticket.owner]
         self.owner[ticket.slots] = COLLECTOR
-        if ticket.method or ticket.failed:
+        if ticket.method or ticket.errors:
             self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
 
     def give_up(self, ticket: Ticket) -> None:

@@ -76,7 +76,7 @@ class SlabLayout:
         self.row_is_slot = False
         self._places: list[tuple[int, int]] = []
 
-    def place(self, started: Sequence[EnvStarted], arena: Arena) -> None:
+    def lay_out(self, started: Sequence[EnvStarted], arena: Arena) -> None:
         """Give each local env a row in the slab of its layout.
 
         Args:

@@ -37,19 +37,19 @@ class UncollectedErrors:
 
     Attributes:
         faults: errors, in the order of their arrival.
-        failed: by slot, the error that its request ended in; the env is busy until that is raised.
+        errors: by slot, the error that its request ended in; the env is busy until that is raised.
     """
 
     def __init__(self, conditions: Conditions, state: NDArray[np.int8]) -> None:
         self._conditions = conditions
         self._state = state
         self.faults: deque[EnvFault] = deque()
-        self.failed: dict[int, EnvFault] = {}
+        self.errors: dict[int, EnvFault] = {}
 
     def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
         """Keep an error for the collector; the envs of `slots` are busy until it is raised."""
         self._state[slots] = _SPENT_CODE
-        self.failed |= dict.fromkeys(slots.tolist(), fault)
+        self.errors |= dict.fromkeys(slots.tolist(), fault)
         self.note_faults([fault])
 
     def note_faults(self, faults: Sequence[EnvFault]) -> None:
@@ -61,16 +61,16 @@ class UncollectedErrors:
         """Remove an error that the collector raises; return the slots that it frees."""
         self.faults.remove(fault)
         self._conditions.note(FAULT, bool(self.faults))
-        return self.free([slot for slot, own in self.failed.items() if own is fault])
+        return self.free([slot for slot, own in self.errors.items() if own is fault])
 
     def with_errors(self, slots: Sequence[int]) -> NDArray[np.intp]:
         """Return those of `slots` whose errors wait."""
-        return np.array([slot for slot in slots if slot in self.failed], np.intp)
+        return np.array([slot for slot in slots if slot in self.errors], np.intp)
 
     def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
         """Free those of `slots` whose errors wait, and return them; the errors stay."""
         free = self.with_errors(slots)
         self._state[free] = _IDLE_CODE
         for slot in free.tolist():
-            del self.failed[slot]
+            del self.errors[slot]
         return free

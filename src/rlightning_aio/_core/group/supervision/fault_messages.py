@@ -80,7 +80,7 @@ def _starting(record: HostRecord, death: Death) -> int:
 
 def culprits_of(
     record: HostRecord,
-    executing: Sequence[int],
+    entries: Sequence[int],
     requests: Requests,
     unanswered: NDArray[np.intp],
 ) -> tuple[int | None, tuple[int, ...]]:
@@ -88,7 +88,7 @@ def culprits_of(
 
     Args:
         record: of its host.
-        executing: entries, as in `Death.requests`.
+        entries: as in `Death.requests`.
         requests: of the group.
         unanswered: its slots with a request in flight.
 
@@ -99,10 +99,10 @@ def culprits_of(
         return record.aborted_slot, ()
     if record.awaits_several:
         # The worker marks whose code runs, and that of one whose request is over may run, too.
-        slot = slot_of(executing[0]) if executing and executing[0] else None
+        slot = slot_of(entries[0]) if entries and entries[0] else None
         return (slot, ()) if slot in record.slots else (None, tuple(unanswered.tolist()))
     slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
-    for entry in executing:
+    for entry in entries:
         if entry in slot_of_entry:
             return slot_of_entry[entry], ()
     return (int(unanswered[0]) if len(unanswered) else None), ()

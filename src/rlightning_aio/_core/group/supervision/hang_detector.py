@@ -117,7 +117,7 @@ class HangDetector:
         if record.stage is not Stage.UP or record.is_hung:
             return None
         assert record.killable is not None
-        entry, since_ns = record.killable.executing()
+        entry, since_ns = record.killable.current_request()
         shortest = min(record.limits.values())
         if not (entry and since_ns):
             # A stopped process executes none of its requests.
@@ -133,12 +133,12 @@ class HangDetector:
         slots = slice(record.slots.start, record.slots.stop)
         entries = int(self._requests.numbering.entry[slots].sum())
         # Where all envs wait, the worker says now and then that its event loop goes on.
-        executing = record.killable.executing()
-        return self._in_flight(record), entries, record.killable.traffic, *executing
+        current = record.killable.current_request()
+        return self._in_flight(record), entries, record.killable.traffic, *current
 
     def _check_hung(self, record: HostRecord) -> None:
         assert record.killable is not None
-        entry, since_ns = record.killable.executing()
+        entry, since_ns = record.killable.current_request()
         if not (entry and since_ns):
             progress = self._progress(record)
             if progress != record.idle:

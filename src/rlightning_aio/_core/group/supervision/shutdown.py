@@ -45,7 +45,7 @@ class Shutdown:
         alive = [r for r in self._group.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         for record in alive:
             record.held, record.restart_at = [], None
-            if record.stage in (Stage.FAILED, Stage.DOWN):
+            if record.stage in (Stage.GIVEN_UP, Stage.DOWN):
                 record.stage = Stage.CLOSED
             else:
                 record.host.close()

@@ -135,7 +135,7 @@ class Supervisor:
             for record in self.records:
                 self._launch_first(record)
             yield from self._until(Stage.BUILT)
-            self._place()
+            self._lay_out_rows()
             for record in self.records:
                 assert record.order is not None
                 record.stage = Stage.ATTACHING
@@ -200,14 +200,14 @@ class Supervisor:
     def _fail_start(self, fault: Exception) -> None:
         self._start_fault = self._start_fault or fault
 
-    def _place(self) -> None:
+    def _lay_out_rows(self) -> None:
         """Give each env a row in the slab of its layout."""
         started = [env for record in self.records for env in record.started]
         self.metas = [env.meta for env in started]
         if not self._group.mixed_actions:
             check_actions(self.metas)
         layout = self._group.layout
-        layout.place(started, self._group.arena)
+        layout.lay_out(started, self._group.arena)
         self._envs.note_started(started)
         for record in self.records:
             count = len(record.started)
@@ -282,7 +282,7 @@ class Supervisor:
         if not self._any_given_up:
             return
         for record in self.records:
-            if record.stage is Stage.FAILED and record.last_loss is not None:
+            if record.stage is Stage.GIVEN_UP and record.last_loss is not None:
                 asked = slots[np.isin(slots, record.slots)]
                 if len(asked):
                     raise record.last_loss.refusal(asked)
@@ -360,7 +360,7 @@ class Supervisor:
         loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None
         if not loss.replaced:
-            record.stage, record.held = Stage.FAILED, []
+            record.stage, record.held = Stage.GIVEN_UP, []
             self._any_given_up = True
             self._update_any_deaths()
             return loss
@@ -470,7 +470,7 @@ class Supervisor:
 
     def _update_any_deaths(self) -> None:
         self._note_deaths(
-            any(record.deaths for record in self.records if record.stage is not Stage.FAILED)
+            any(record.deaths for record in self.records if record.stage is not Stage.GIVEN_UP)
         )
 
     def _note_deaths(self, any_deaths: bool) -> None:

@@ -22,7 +22,7 @@ _STATES: Final = {
     Stage.NEW: "new",
     Stage.UP: "up",
     Stage.DOWN: "down",
-    Stage.FAILED: "failed",
+    Stage.GIVEN_UP: "failed",
     Stage.CLOSED: "closed",
 }
 
@@ -45,7 +45,7 @@ class Workers:
         env_ids, requests = self._envs.env_ids, self._group.requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
-        lost = record.slots if record.stage is Stage.FAILED else sorted(record.lost_slots)
+        lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.lost_slots)
         return {
             "entry": record.config.name,
             "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],

@@ -163,7 +163,7 @@ class Trace(Scope):
         killable = self._core.supervisor.records[host_id].killable
         # Only workers with time limits report the request that they execute. An actor's time may
         # be in the future, as it includes an allowance for the transfer.
-        entry, since = (0, 0) if killable is None else killable.executing()
+        entry, since = (0, 0) if killable is None else killable.current_request()
         if entry != requests.numbering.entry.item(slot) or not 0 < since <= now:
             since = requests.sent_ns.item(slot)
         name = f"{Operation(requests.numbering.op(slot)).name.lower()}, {state}"

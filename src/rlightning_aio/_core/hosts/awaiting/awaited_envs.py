@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any, Final
 from rlightning_aio._core.hosts.awaiting.awaited_env import CANCEL_SECONDS, AwaitedEnv, end_all
 from rlightning_aio._core.hosts.awaiting.event_loop import (
     TimeLimit,
+    awaited_calls,
     cancel,
     cancel_leftovers,
     leave_behind,
     log,
     new_task,
-    place_of,
     tasks_of,
     time_collector,
     watched,
@@ -53,12 +53,12 @@ _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
 
-class _Place:
-    """The place of an env in its host, which another env may take, and the request to it.
+class _EnvRecord:
+    """An index of the host: the env that has it now, and the request to it. Envs may be replaced.
 
     Attributes:
         index: in the host.
-        context: of all envs that take the place; each has a copy.
+        context: of all envs that come to have the index; each has a copy of it.
         env: that has it now; None while there is none.
         runner: of that env, or of the one before.
         entry: of the request that is being executed; 0 while there is none.
@@ -67,7 +67,7 @@ class _Place:
         lost: why there is no env.
         leaving: the task that puts the env before away.
         restoring: the task that makes another env.
-        fault: why the place is given up, if it is.
+        fault: why there will be no other env, if so.
     """
 
     def __init__(self, index: int, context: Context) -> None:
@@ -126,8 +126,8 @@ class AwaitedEnvs:
         self._enter = enter
         self._watch = partial(watched, report=self._report, enter=enter)
         self._loop: asyncio.AbstractEventLoop
-        self._places: list[_Place] = []
-        self._queue: deque[tuple[_Place, int, Any]] = deque()
+        self._records: list[_EnvRecord] = []
+        self._queue: deque[tuple[_EnvRecord, int, Any]] = deque()
         self.num_busy = 0
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
@@ -147,7 +147,7 @@ class AwaitedEnvs:
     @property
     def runners(self) -> list[AwaitedRunner]:
         """The envs' runners, by index."""
-        return [place.runner for place in self._places]
+        return [record.runner for record in self._records]
 
     # -- life ---------------------------------------------------------------------
 
@@ -156,10 +156,10 @@ class AwaitedEnvs:
         self._loop = asyncio.get_running_loop()
         context = copy_context()
         for index, runner in enumerate(runners):
-            place = _Place(index, context)
-            place.runner = runner
-            place.env = self._new_env(place, lambda runner=runner: runner)
-            self._places.append(place)
+            record = _EnvRecord(index, context)
+            record.runner = runner
+            record.env = self._new_env(record, lambda runner=runner: runner)
+            self._records.append(record)
 
     async def build(self) -> list[EnvStarted] | None:
         """Build the envs, one in each turn of the loop; None if one can't be, which is posted."""
@@ -168,10 +168,10 @@ class AwaitedEnvs:
         index = 0
         try:
             for index in range(len(self._order.worker_indices)):
-                place = _Place(index, context)
-                if (error := await self._build(place)) is not None:
+                record = _EnvRecord(index, context)
+                if (error := await self._build(record)) is not None:
                     raise error
-                self._places.append(place)
+                self._records.append(record)
             return [runner.started() for runner in self.runners]
         except BaseException as error:
             self._post(NotBuilt(self._host_id, index, ErrorText.of(error)))
@@ -179,28 +179,28 @@ class AwaitedEnvs:
                 raise
             return None
 
-    def _new_env(self, place: _Place, make: Callable[[], AwaitedRunner]) -> AwaitedEnv:
-        env = AwaitedEnv(place.index, make, place.context, self._watch, self._on_broken)
+    def _new_env(self, record: _EnvRecord, make: Callable[[], AwaitedRunner]) -> AwaitedEnv:
+        env = AwaitedEnv(record.index, make, record.context, self._watch, self._on_broken)
         self._envs.add(env)
         env.task.add_done_callback(lambda _: self._envs.discard(env))
         return env
 
-    async def _build(self, place: _Place) -> BaseException | None:
-        """Build an env for a place; return the error if that fails."""
-        make: Any = partial(built_env, self._order, place.index, inline=self._inline)
+    async def _build(self, record: _EnvRecord) -> BaseException | None:
+        """Build an env; return the error if that fails."""
+        make: Any = partial(built_env, self._order, record.index, inline=self._inline)
         if self._enter is not None:
-            entry = entry_of(0, self._first_slot + place.index, 0)
+            entry = entry_of(0, self._first_slot + record.index, 0)
             make = partial(_entered, make, self._enter, entry)
-        env = self._new_env(place, make)
+        env = self._new_env(record, make)
         try:
             error = await asyncio.shield(env.made)
         except BaseException:
             env.leave()
             raise
         if error is None:
-            if place.runner is not None:
-                env.runner.place_like(place.runner)
-            place.env, place.runner = env, env.runner
+            if record.runner is not None:
+                env.runner.use_rows_of(record.runner)
+            record.env, record.runner = env, env.runner
         return error
 
     async def close(self) -> list[tuple[int, ErrorText]]:
@@ -223,7 +223,7 @@ class AwaitedEnvs:
 
     def disconnect(self) -> None:
         """Bring the envs to a safe state: the trainer is gone."""
-        disconnect_all([place.runner for place in self._places if place.env is not None])
+        disconnect_all([record.runner for record in self._records if record.env is not None])
 
     def release(self) -> None:
         """Cancel everything without waiting, also tasks that envs have started. Idempotent."""
@@ -233,7 +233,7 @@ class AwaitedEnvs:
                 task.cancel()
         for env in self._envs if self._envs and not self._loop.is_running() else ():
             leave_behind(env.task)  # The warning about the group says enough.
-        self._places.clear()
+        self._records.clear()
 
     def _end(self) -> None:
         """Begin nothing more, and post nothing more."""
@@ -255,52 +255,52 @@ class AwaitedEnvs:
         """
         if self._ending:
             return
-        place = self._places[slot_of(entry) - self._first_slot]
-        self._queue.append((place, entry, arguments))
+        record = self._records[slot_of(entry) - self._first_slot]
+        self._queue.append((record, entry, arguments))
         self._begin_queued()
 
     def _begin_queued(self) -> None:
         while self._queue and self.num_busy < self._most_busy:
-            place, entry, arguments = self._queue.popleft()
-            if place.fault is not None:
+            record, entry, arguments = self._queue.popleft()
+            if record.fault is not None:
                 # Not at once: a completion never comes before its request was handed over.
-                fault = Failed(self._host_id, entry, copy(place.fault), for_good=True)
+                fault = Failed(self._host_id, entry, copy(record.fault), for_good=True)
                 self._loop.call_soon(self._post_unless_ending, fault)
                 continue
             self.num_busy += 1
-            place.entry, place.arguments = entry, arguments
-            if place.env is None:
-                self._restore(place)
+            record.entry, record.arguments = entry, arguments
+            if record.env is None:
+                self._restore(record)
             else:
-                self._give(place, place.env)
+                self._give(record, record.env)
 
     def _post_unless_ending(self, completion: Completion) -> None:
         if not self._ending:
             self._post(completion)
 
-    def _give(self, place: _Place, env: AwaitedEnv) -> None:
-        """Have an env execute the request to its place."""
-        op = op_of(place.entry)
-        env.give(op, place.entry, place.arguments, self._on_outcome)
+    def _give(self, record: _EnvRecord, env: AwaitedEnv) -> None:
+        """Have an env execute the request in its record."""
+        op = op_of(record.entry)
+        env.give(op, record.entry, record.arguments, self._on_outcome)
         if op in self._limits:
-            self._limits[op].begin(place, self._loop)
+            self._limits[op].begin(record, self._loop)
 
     def _on_outcome(
         self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
     ) -> None:
-        place = self._places[env.index]
+        record = self._records[env.index]
         if error is None and op_of(entry) == Operation.STEP:
-            place.losses = 0
-        self._finish(place, completion_of(self._host_id, entry, outcome, error))
+            record.losses = 0
+        self._finish(record, completion_of(self._host_id, entry, outcome, error))
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self._inline and isinstance(error, KeyboardInterrupt):
             self._loop.call_soon(_reraise, error)
 
-    def _finish(self, place: _Place, completion: Completion | None) -> None:
-        """Report that the request to a place has ended; None: its row holds the whole result."""
+    def _finish(self, record: _EnvRecord, completion: Completion | None) -> None:
+        """Report that a request has ended; None: its row holds the whole result."""
         if self._ending:
             return
-        entry, place.entry, place.arguments = place.entry, 0, None
+        entry, record.entry, record.arguments = record.entry, 0, None
         self.num_busy -= 1
         if completion is None:
             self._done(entry)
@@ -313,7 +313,7 @@ class AwaitedEnvs:
         log.warning(
             "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
             "meanwhile: await what it waits for, or run it by asyncio.to_thread()",
-            self._places[slot_of(entry) - self._first_slot].name,
+            self._records[slot_of(entry) - self._first_slot].name,
             self._order.config.name,
             1e3 * seconds,
             Operation(op_of(entry)).name.lower(),
@@ -323,14 +323,14 @@ class AwaitedEnvs:
         """End a request at once, if it has not ended; the env that executes it is replaced."""
         if self._ending:
             return
-        place = self._places[slot_of(entry) - self._first_slot]
+        record = self._records[slot_of(entry) - self._first_slot]
         aborted = Raised(self._host_id, entry, ErrorText.of(asyncio.CancelledError("aborted")))
-        if place.entry == entry:
-            if place.restoring is not None:
-                place.restoring.cancel()
-            if place.env is not None:
-                self._put_away(place, place.env, "was aborted")
-            self._finish(place, aborted)
+        if record.entry == entry:
+            if record.restoring is not None:
+                record.restoring.cancel()
+            if record.env is not None:
+                self._put_away(record, record.env, "was aborted")
+            self._finish(record, aborted)
             return
         queued = [one for one in self._queue if one[1] != entry]
         if len(queued) < len(self._queue):
@@ -339,45 +339,47 @@ class AwaitedEnvs:
 
     # -- envs that are lost -------------------------------------------------------
 
-    def _expire(self, place: _Place, seconds: float) -> None:
+    def _expire(self, record: _EnvRecord, seconds: float) -> None:
         """Replace an env whose request takes too long."""
-        env = place.env
+        env = record.env
         if self._ending or env is None:
             return
-        doing = Operation(op_of(place.entry)).name.lower()
-        waits_in = place_of(env.answering)
-        message = f"env {place.name!r} took longer than {seconds} s for a {doing} and was cancelled"
+        doing = Operation(op_of(record.entry)).name.lower()
+        waits_in = awaited_calls(env.answering)
+        message = (
+            f"env {record.name!r} took longer than {seconds} s for a {doing} and was cancelled"
+        )
         if waits_in:
             message += f" while it waited in {waits_in}"
-        self._put_away(place, env, f"hung in a {doing} and was cancelled")
-        self._restore(place, message)
+        self._put_away(record, env, f"hung in a {doing} and was cancelled")
+        self._restore(record, message)
 
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""
-        place = self._places[env.index]
-        if self._ending or place.env is not env:
+        record = self._records[env.index]
+        if self._ending or record.env is not env:
             return
-        place.env, place.lost = None, "ended while it was idle: something cancelled its task"
-        place.leaving = env.task
+        record.env, record.lost = None, "ended while it was idle: something cancelled its task"
+        record.leaving = env.task
 
         late = self._loop.call_later(self._close_seconds, env.cut_short, self._close_seconds)
 
         def closed(_: object) -> None:
             late.cancel()
             if env.close_error is not None:
-                place.lost = f"ended while it was idle: {env.close_error.summary}"
+                record.lost = f"ended while it was idle: {env.close_error.summary}"
             self._note_closed(env)
 
         # No task of ours waits for that: perhaps the event loop ends.
         env.task.add_done_callback(closed)
-        if place.entry:  # It has come at the same time.
-            self._restore(place)
+        if record.entry:  # It has come at the same time.
+            self._restore(record)
 
-    def _put_away(self, place: _Place, env: AwaitedEnv, cause: str) -> None:
+    def _put_away(self, record: _EnvRecord, env: AwaitedEnv, cause: str) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
         env.leave()
-        place.env, place.lost = None, cause
-        place.leaving = self._spawn(self._close(env))
+        record.env, record.lost = None, cause
+        record.leaving = self._spawn(self._close(env))
 
     async def _close(self, env: AwaitedEnv) -> None:
         await end_all([env], self._close_seconds)
@@ -408,44 +410,44 @@ class AwaitedEnvs:
         task.add_done_callback(self._tasks.discard)
         return task
 
-    def _restore(self, place: _Place, message: str = "") -> None:
-        """Give a place another env, which answers the request to it; see `_restored`."""
-        place.restoring = self._spawn(self._restored(place, message))
+    def _restore(self, record: _EnvRecord, message: str = "") -> None:
+        """Make another env, which answers the request; see `_restored`."""
+        record.restoring = self._spawn(self._restored(record, message))
 
-    async def _restored(self, place: _Place, message: str) -> None:
+    async def _restored(self, record: _EnvRecord, message: str) -> None:
         """Build another env. A step, and what the env before was lost in, is answered by its reset.
 
         Args:
-            place: without an env, and with a request.
+            record: without an env, and with a request.
             message: why the env was lost that has executed the request; empty if it was idle.
         """
-        entry, kind = place.entry, EnvHung
+        entry, kind = record.entry, EnvHung
         is_reset = bool(message) or op_of(entry) == Operation.STEP
         while True:
             if message:
-                failed = self._counted(place, kind, message)
+                failed = self._counted(record, kind, message)
                 if failed is not None:
-                    self._finish(place, failed)
+                    self._finish(record, failed)
                     return
-                await asyncio.sleep(restart_pause(place.losses))
-            if place.leaving is not None:
-                await asyncio.wait({place.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
-            error, env = await self._build(place), place.env
+                await asyncio.sleep(restart_pause(record.losses))
+            if record.leaving is not None:
+                await asyncio.wait({record.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
+            error, env = await self._build(record), record.env
             if env is None:
-                kind, message = WorkerDied, f"env {place.name!r} could not be rebuilt: {error!r}"
+                kind, message = WorkerDied, f"env {record.name!r} could not be rebuilt: {error!r}"
                 continue
             if not is_reset:
-                self._give(place, env)
+                self._give(record, env)
                 return
-            outcome = await self._reset(place, env)
+            outcome = await self._reset(record, env)
             if outcome is not None:
-                self._finish(place, outcome)
+                self._finish(record, outcome)
                 return
-            kind, message = EnvHung, f"env {place.name!r} took too long for the reset after that"
+            kind, message = EnvHung, f"env {record.name!r} took too long for the reset after that"
 
-    async def _reset(self, place: _Place, env: AwaitedEnv) -> Result | Raised | None:
+    async def _reset(self, record: _EnvRecord, env: AwaitedEnv) -> Result | Raised | None:
         """Begin an episode like the one that was lost; None if that takes too long."""
-        entry, cause = place.entry, place.lost
+        entry, cause = record.entry, record.lost
         ended: asyncio.Future[Result | Raised] = self._loop.create_future()
 
         def then(_: Any, entry: int, outcome: Any, error: BaseException | None) -> None:
@@ -462,24 +464,24 @@ class AwaitedEnvs:
         await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
         if ended.done():
             return ended.result()
-        self._put_away(place, env, cause)
+        self._put_away(record, env, cause)
         return None
 
-    def _counted(self, place: _Place, kind: type[WorkerDied], message: str) -> Failed | None:
+    def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Failed | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
-        place.losses += 1
-        outcome = self._restarts.outcome(place.losses)
-        if self._restarts.bears(place.losses):
+        record.losses += 1
+        outcome = self._restarts.outcome(record.losses)
+        if self._restarts.bears(record.losses):
             log.warning("%s; %s", message, outcome)
             return None
         for_good = self._restarts.raises
         if not for_good:
             outcome += ", so this request ends here; the next one tries again"
-        fault = kind(f"{message}; {outcome}", env_id=place.name, exit_code=None, stderr_tail="")
-        fault.env_ids = (place.name,)
+        fault = kind(f"{message}; {outcome}", env_id=record.name, exit_code=None, stderr_tail="")
+        fault.env_ids = (record.name,)
         if for_good:
-            place.fault = fault
-        return Failed(self._host_id, place.entry, fault, for_good)
+            record.fault = fault
+        return Failed(self._host_id, record.entry, fault, for_good)
 
 
 def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int) -> Any:

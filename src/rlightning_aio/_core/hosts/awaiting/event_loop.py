@@ -24,12 +24,12 @@ __all__ = [
     "LONG_TURN_SECONDS",
     "OWNER",
     "TimeLimit",
+    "awaited_calls",
     "cancel",
     "cancel_leftovers",
     "leave_behind",
     "log",
     "new_task",
-    "place_of",
     "run_loop",
     "tasks_of",
     "time_collector",
@@ -130,7 +130,7 @@ def new_task(
     return asyncio.Task(coroutine, loop=loop, context=context)
 
 
-def place_of(answering: Any) -> str:
+def awaited_calls(answering: Any) -> str:
     """Name the calls in which the env's code waits, from the outermost in."""
     frames: list[Any] = []
     while answering is not None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import WorkerPlace
 
 __all__ = [
-    "FAILED",
+    "REFUSED",
     "Exited",
     "Fork",
     "Forked",
@@ -93,7 +93,7 @@ class NotForked:
 
 Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited
 
-FAILED: Final = b"!"
+REFUSED: Final = b"!"
 """First byte of the only packet of a fork server that can't import its code; a text follows."""
 _MORE: Final = b"+"
 _LAST: Final = b"."
@@ -198,7 +198,7 @@ class MessageSocket:
                 os.set_inheritable(descriptor, False)
             if not packet:
                 raise EOFError
-            if packet.startswith(FAILED):
+            if packet.startswith(REFUSED):
                 return Received(Ready(packet[1:].decode(errors="replace")), [])
             self._begun += packet[1:]
             if packet.startswith(_LAST):

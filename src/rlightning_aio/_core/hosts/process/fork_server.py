@@ -70,7 +70,7 @@ main(int(sys.argv[2]), int(sys.argv[3]))
 """
 """Runs `main` of this package, even if the interpreter has another version of it installed.
 
-If that fails, the only packet is `FAILED` and the reason.
+If that fails, the only packet is `REFUSED` and the reason.
 """
 
 DUMP_SIGNAL: Final = signal.SIGRTMIN + 7

@@ -402,8 +402,8 @@ class ProcessHost:
         if self._link is not None:
             self._link.poll()
 
-    def executing(self) -> tuple[int, int]:
-        return (0, 0) if self._link is None else self._link.executing()
+    def current_request(self) -> tuple[int, int]:
+        return (0, 0) if self._link is None else self._link.current_request()
 
     def processor_times(self) -> tuple[int, int] | None:
         return None if self.pid is None else processor_times(self.pid)

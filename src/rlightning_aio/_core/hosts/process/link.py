@@ -190,7 +190,7 @@ class Link:
 
     # -- the state of the worker ------------------------------------------------------
 
-    def executing(self) -> tuple[int, int]:
+    def current_request(self) -> tuple[int, int]:
         return self._rings.current()
 
     def last_requests(self) -> tuple[int, ...]:

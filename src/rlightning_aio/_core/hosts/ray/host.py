@@ -248,7 +248,7 @@ class RayHost:
         then = partial(self._on_reply, sent)
         life.call(life.actor.execute, then, Batch(entries, columns, arguments))
 
-    def executing(self) -> tuple[int, int]:
+    def current_request(self) -> tuple[int, int]:
         """Return the entry being executed and its start, as of `base.Killable`.
 
         An actor reports a late request itself. Without a report, a batch may take as long as the

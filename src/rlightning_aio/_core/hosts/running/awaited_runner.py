@@ -36,7 +36,7 @@ class AwaitedRunner(EnvRunner):
     def _bind(self) -> None:
         """Prepare nothing: `answer` executes everything."""
 
-    def place_like(self, other: AwaitedRunner) -> None:
+    def use_rows_of(self, other: AwaitedRunner) -> None:
         """Take over the row of `other`, which this env replaces, and its episode."""
         self.attach(other._slab, other._row, other._announce)
         self.reset_with = other.reset_with
