@@ -19,9 +19,9 @@ from rlightning_aio import (
     EnvRet,
     MultiAgentEnvRet,
     PolicyResponse,
-    default_env_preprocess_fn,
     sync,
 )
+from rlightning_aio.types import default_env_preprocess_fn
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
