@@ -880,17 +880,17 @@ class Play(Session):
             try:
                 return await self.done(self.group.restore(data, [*requests]))
             except EnvFault as fault:
-                self.undone(fault, pairs)
+                if fault.results is None:
+                    self.undone(fault, pairs)
+                else:  # All were restored, and one could not show it.
+                    self.show(pairs)
                 raise
 
         def take(found: Any) -> None:
             batch, flags = found
             require(flags == [False] * len(pairs), "flags", flags)
             require(batch.env_ids() == [*requests], "another order", batch.env_ids())
-            for env, _, saved in pairs:
-                assert env.request is not None
-                env.request.kind = "show"
-                env.put_back(saved)
+            self.show(pairs)
             self.take(batch, flags, self.owner_of(requests))
 
         try:
@@ -905,6 +905,13 @@ class Play(Session):
             raise
         for env, _, _ in pairs:
             env.state.refuses = False
+
+    def show(self, pairs: Sequence[tuple[Env, list[State], list[State]]]) -> None:
+        """Note that envs are in states that were restored, which their results show."""
+        for env, _, saved in pairs:
+            assert env.request is not None
+            env.request.kind = "show"
+            env.put_back(saved)
 
     def undone(
         self, fault: EnvFault, pairs: Sequence[tuple[Env, list[State], list[State]]]
