@@ -67,7 +67,7 @@ async def test_columns_are_lists_next_to_arrays(placement: str) -> None:
         ]
         actions = say(batch)
         group.step_async(batch.respond(action=actions, tokens=[[1], [2, 3], []]))
-        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        batch, _ = await group.collect_async(wait_all=True)
         assert batch.sent.action == actions
         assert batch.sent.tokens == [[1], [2, 3], []]
         assert batch.observation["tokens"] == [[0], [0], [0]]

@@ -164,7 +164,7 @@ class VecEnv(_Base):
             self._has_lost = True
             options = [own or None for own in self._options]  # As Stable-Baselines3 does.
             self._rows.send_resets(self._seeds, options, range(self.num_envs))
-            batch, _ = self.group.collect_async(wait_all=True, ordered=True)
+            batch, _ = self.group.collect_async(wait_all=True)
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
@@ -212,7 +212,7 @@ class VecEnv(_Base):
             EnvRaised, WorkerDied, EnvHung: an env failed; the results of the others are dropped.
         """
         with self._dropping_the_rest():
-            batch, _ = self.group.collect_async(wait_all=True, ordered=True)
+            batch, _ = self.group.collect_async(wait_all=True)
         self._answerable, self._unfinished = batch, False
         rows = self._rows
         done = rows.flat(batch.done)

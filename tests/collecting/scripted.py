@@ -152,7 +152,7 @@ class Disturbed:
         return [*self.group.pending, *(env_id for row in self.pool for env_id in row.env_ids())]
 
     def collect_async(
-        self, min_results: int = 1, wait_all: bool = False, ordered: bool = False
+        self, min_results: int = 1, wait_all: bool = False
     ) -> tuple[BatchedData, list[bool]]:
         try:
             batch, _ = self.group.collect_async(wait_all=True)
@@ -168,8 +168,7 @@ class Disturbed:
         if not wait_all and count > min_results:
             count = min_results + self._choose(count - min_results + 1)
         chosen = [self.pool.pop(self._choose(len(self.pool))) for _ in range(count)]
-        if ordered:
-            chosen.sort(key=lambda row: int(row.index.min()))
+        chosen.sort(key=lambda row: int(row.index.min()))
         self.last = joined(chosen)
         return self.last, self.last.limit_reached.reshape(count, -1).any(axis=1).tolist()
 

@@ -234,7 +234,7 @@ class Machine(RuleBasedStateMachine):
         await self._reset(ids)
         await self._step(ids)
         asked = dict(self.asked)
-        batch, _ = await self.group.collect_async(wait_all=True, ordered=True)
+        batch, _ = await self.group.collect_async(wait_all=True)
         assert not (batch.truncated | batch.is_reset).any()
         assert [one["answers"] for one in batch.observation] == [asked[i] for i in ids]
         self.resetting.__exit__(None, None, None)

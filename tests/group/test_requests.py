@@ -165,12 +165,6 @@ class Driven:
         failed = (table.state == State.SPENT) & collected
         assert sorted(table.collector.errors) == np.flatnonzero(failed).tolist()
         table.hand_out(np.array(self.settled, np.intp))
-        for among in (None, np.array([True, True, False]), np.arange(3) == SLOT):
-            chosen = collected if among is None else collected & among
-            assert table.pending(among) == (
-                (ready & chosen).sum(),
-                ((ready | busy) & chosen).sum(),
-            )
 
 
 # The events that lead to each situation; of method calls where it matters.
@@ -291,7 +285,7 @@ def test_every_situation_of_the_table_is_reachable() -> None:
 def test_the_value_of_a_cancelled_method_call_has_no_owner() -> None:
     """Unlike a step or a reset: a collect can't return it."""
     driven = brought_to(State.BUSY, Owner.NOBODY)
-    assert driven.table.pending() == (0, 0)
+    assert driven.table.collector.num_ready == driven.table.collector.num_awaited == 0
     driven.events[Event.FAULT]()
     assert not driven.table.collector.faults
 
@@ -682,23 +676,19 @@ class RequestsMachine(RuleBasedStateMachine):
 
     # -- the collector
 
-    def collectable(self, among: list[int]) -> list[int]:
-        return [slot for slot in self.those(State.READY) if not self.slots[slot].owner
-                and slot in among]  # fmt: skip
+    def collectable(self) -> list[int]:
+        return [slot for slot in self.those(State.READY) if not self.slots[slot].owner]
 
-    @precondition(lambda self: self.collectable(list(range(len(self.slots)))))
-    @rule(data=st.data(), most=st.integers(1, 6), choosy=st.booleans())
-    def take(self, data: st.DataObject, most: int, choosy: bool) -> None:
+    @precondition(collectable)
+    @rule(most=st.integers(1, 6))
+    def take(self, most: int) -> None:
         """Collect: first come, first served; results that came together are in any order."""
-        among = list(range(len(self.slots)))
-        if choosy:
-            among = self.some(data, among)
-        mask = np.isin(np.arange(len(self.slots)), among) if choosy else None
-        here = self.collectable(among)
-        taken = self.table.collector.take(most, mask).tolist()
+        here = self.collectable()
+        taken = self.table.collector.take(most).tolist()
         assert len(taken) == len(set(taken)) == min(most, len(here))
         assert set(taken) <= set(here)
-        came = [self.slots[slot].came for slot in taken]
+        assert taken == sorted(taken)
+        came = sorted(self.slots[slot].came for slot in taken)
         assert came == sorted(self.slots[slot].came for slot in here)[:most]
         self.table.hand_out(np.array(taken, np.intp))
         for slot in taken:
@@ -751,12 +741,8 @@ class RequestsMachine(RuleBasedStateMachine):
         assert set(table.collector.faults) == set(self.faults)
         assert len(table.collector.faults) == len(self.faults)
         mine = [s for s in busy if slots[s].owner is None and not slots[s].nobodys]
-        ready = self.collectable(list(range(len(slots))))
+        ready = self.collectable()
         assert (table.collector.num_ready, table.collector.num_awaited) == (len(ready), len(mine))
-        assert table.pending() == (len(ready), len(ready) + len(mine))
-        for host in range(num_hosts):
-            here = [int(np.sum(self.host_of[found] == host)) for found in (ready, mine)]
-            assert table.pending(self.host_of == host) == (here[0], sum(here))
         assert table.owed(np.arange(len(slots))).tolist() == busy
         not_idle = [slot for slot, asked in enumerate(slots) if asked.state is not State.IDLE]
         assert table.first_not_idle(np.arange(len(slots))) == (not_idle[0] if not_idle else None)

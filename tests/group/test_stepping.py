@@ -377,7 +377,7 @@ async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
     group.step_async(responses(["probe-1"], 3))
     with pytest.raises(EnvBusy, match=r"can't reset env 'probe-0'.*nothing was sent"):
         group.reset_async()
-    batch, _ = await group.collect_async(wait_all=True, ordered=True)
+    batch, _ = await group.collect_async(wait_all=True)
     assert batch.ids() == ["probe-0", "probe-1", "probe-2"]
     assert batch.is_reset.tolist() == [True, False, True]
     assert batch.observation[:, 3].tolist() == [-1, 6, 9]

@@ -146,7 +146,6 @@ class Twins(RuleBasedStateMachine):
         wait_all=st.booleans(),
         min_results=st.integers(1, 4),
         max_results=st.sampled_from((None, None, 4)),
-        ordered=st.booleans(),
     )
     def collect(self, **rules: Any) -> None:
         self.collectors = self.both(

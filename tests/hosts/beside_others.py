@@ -31,7 +31,7 @@ async def both_ways(number: int, group: Any, batch: Any, action: Any) -> tuple[A
     if number % 2:
         return await group.step(batch.respond(action=action))
     group.step_async(batch.respond(action=action))
-    return await group.collect_async(wait_all=True, ordered=True)
+    return await group.collect_async(wait_all=True)
 
 
 def check_three_are_equal(batch: Any, flags: Any) -> None:

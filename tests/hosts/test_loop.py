@@ -103,7 +103,7 @@ async def test_all_envs_of_an_entry_are_in_flight_at_once() -> None:
         group.step_async(batch.respond(action=np.full(count, GATE)))
         await until_at_gate(*group.env_ids)
         gate.set()
-        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        batch, _ = await group.collect_async(wait_all=True)
         assert batch.observation[:, 2].tolist() == [1.0] * count
 
 
@@ -153,7 +153,7 @@ async def test_max_concurrency_limits_how_many_are_busy() -> None:
             opened.append(time.monotonic_ns())
             for env_id in pair:
                 gates[env_id].set()
-        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        batch, _ = await group.collect_async(wait_all=True)
         assert not batch.restarted.any()
         assert batch.observation[:, 2].tolist() == [1.0] * 6
         assert (batch.busy_ns[4:] < time.monotonic_ns() - opened[1]).all()
@@ -464,7 +464,7 @@ async def test_time_during_which_the_event_loop_was_blocked_is_nobodys() -> None
         group.step_async(batch.respond(action=np.full(20, STEP)))
         await asyncio.sleep(0)
         time.sleep(2 * SOON)  # noqa: ASYNC251
-        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        batch, _ = await group.collect_async(wait_all=True)
         assert not batch.restarted.any()
 
 
@@ -688,7 +688,7 @@ async def test_a_worker_waits_until_the_trainer_has_read_a_big_info() -> None:
         await group.reset()
         for _ in range(3):
             group.step_async(steps(b_0=BIG, b_1=BIG, b_2=STEP))
-            batch, _ = await group.collect_async(wait_all=True, ordered=True, deadline=LONG)
+            batch, _ = await group.collect_async(wait_all=True, deadline=LONG)
             sizes = [len(info.get("blob", b"")) for info in batch.info()]
             assert sizes == [BIG_BYTES, BIG_BYTES, 0]
 

@@ -404,29 +404,6 @@ def test_a_client_that_takes_the_slot_of_another_takes_nothing_else(
         other.join()
 
 
-def test_the_error_of_a_client_whose_slot_another_took_is_of_its_entry(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A collect of its entry raises it once; a collect of other entries leaves it."""
-    place = replace(registry.placement_of("env_server", "process"), max_members=1)
-    monkeypatch.setitem(registry._PLACED_BY_BACKEND, "env_server", place)
-    with (
-        sync.build_env_group([entry(), entry("others")]) as group,
-        clients(group, CountingEnv(0)),
-        clients(group, CountingEnv(1), server="others-0"),
-    ):
-        batch, _ = group.collect_async(entries=["others"], deadline=HANG)
-        fault = EnvAway("it has left", env_id="robots-0/former")
-        group._core.requests.collector.note_faults([fault])
-        group.step_async(batch.respond(action=actions(batch)))
-        group.collect_async(entries=["others"], deadline=HANG)
-        with pytest.raises(EnvAway, match="it has left"):
-            group.collect_async(entries=["robots"], deadline=HANG)
-        batch, _ = group.collect_async(entries=["robots"], deadline=HANG)
-        assert batch.env_ids() == ["robots-0/c0"]
-        group.close()
-
-
 def test_a_response_to_a_forgotten_client_disturbs_no_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -430,10 +430,6 @@ class Play(Session):
             rules["timeout"] = rng.choice([0.001, 0.5])
         if "timeouts" in self.features and rng.random() < 0.4:
             rules["deadline"] = rng.choice([0.001, 0.2, self.hang])
-        if self.program.plans[1:] and rng.random() < 0.2:
-            names = [plan.name for plan in self.program.plans]
-            rules["entries"] = rng.sample(names, rng.randint(1, len(names)))
-        rules["ordered"] = rng.random() < 0.3
         await self.collect(**rules)
 
     async def collect(self, **rules: Any) -> None:
@@ -442,12 +438,12 @@ class Play(Session):
             with self.expected(RLightningError, "a second collect"):
                 await self.done(self.group.collect_async(**rules))
             return
-        self.collecting, nothing = True, not self.collectable(rules)
+        self.collecting, nothing = True, not self.collectable()
         try:
             batch, flags = await self.done(self.group.collect_async(**rules))
         except TimeoutError as error:
             if isinstance(error, EnvFault):
-                self.take_fault(error, rules)
+                self.take_fault(error)
                 return
             require(
                 rules.get("deadline", self.hang) < self.hang,
@@ -457,11 +453,11 @@ class Play(Session):
             self.counts["deadline"] += 1
             return
         except EnvFault as fault:
-            self.take_fault(fault, rules)
+            self.take_fault(fault)
             return
         except NothingPending as error:
             self.count(error)
-            require(nothing or not self.collectable(rules), "nothing pending, and something is")
+            require(nothing or not self.collectable(), "nothing pending, and something is")
             return
         finally:
             self.collecting = False
@@ -469,40 +465,27 @@ class Play(Session):
         require(len(flags) == len(batch), "flags", flags)
         self.take(batch, flags, COLLECTOR)
 
-    def collectable(self, rules: dict[str, Any]) -> list[Env]:
-        names = rules.get("entries")
-        return [
-            env for env in self.model.pending(COLLECTOR) if names is None or env.entry.name in names
-        ]
+    def collectable(self) -> list[Env]:
+        return self.model.pending(COLLECTOR)
 
-    def take_fault(self, fault: EnvFault, rules: dict[str, Any]) -> None:
+    def take_fault(self, fault: EnvFault) -> None:
         self.note_faults(fault)
         require(fault.results is None and not fault.others, "an error of one request", repr(fault))
-        ended = self.model.failed(fault, COLLECTOR, self.group.pending)
-        names = rules.get("entries")
-        require(names is None or any(env.entry.name in names for env in ended), "another entry's")
+        self.model.failed(fault, COLLECTOR, self.group.pending)
 
     def check_count(self, batch: BatchedData, rules: dict[str, Any]) -> None:
         """As many results as the rules say."""
-        there = len(self.collectable(rules))
+        there = len(self.collectable())
         most = min(rules.get("max_results") or there, there)
-        usual = 1 if rules.get("wait_all") else self.usual_min_results(rules)
+        usual = 1 if rules.get("wait_all") else self.usual_min_results()
         need = most if rules.get("wait_all") else min(rules.get("min_results") or usual, most)
         require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
-        names = rules.get("entries")
-        own = [self.model.envs[env_id].entry.name for env_id in batch.env_ids()]
-        require(names is None or set(own) <= set(names), "results of other entries", own)
-        if rules.get("ordered"):
-            order = list(self.model.envs)
-            places = [order.index(env_id) for env_id in batch.env_ids()]
-            require(places == sorted(places), "not in the group's order", places)
+        order = list(self.model.envs)
+        places = [order.index(env_id) for env_id in batch.env_ids()]
+        require(places == sorted(places), "not in the group's order", places)
 
-    def usual_min_results(self, rules: dict[str, Any]) -> int:
-        names = rules.get("entries")
-        given = [
-            plan.min_results for plan in self.program.plans if names is None or plan.name in names
-        ]
-        return sum(one or 0 for one in given) or 1
+    def usual_min_results(self) -> int:
+        return sum(plan.min_results or 0 for plan in self.program.plans) or 1
 
     async def op_reset(self, rng: Random) -> None:
         envs = self.some(rng, self.model.idle())

@@ -282,7 +282,7 @@ class Collector(Generic[G, R]):
         """
         while True:
             try:
-                batch, _ = yield partial(self._group.collect_async, wait_all=True, ordered=True)
+                batch, _ = yield partial(self._group.collect_async, wait_all=True)
             except EnvFault as fault:
                 self._start_fault = self._start_fault or fault
             except NothingPending:
@@ -299,8 +299,8 @@ class Collector(Generic[G, R]):
 
     def _receive(self) -> Any:
         if self._block:
-            return self._group.collect_async(wait_all=True, ordered=True)
-        return self._group.collect_async(min_results=self._min_results, ordered=True)
+            return self._group.collect_async(wait_all=True)
+        return self._group.collect_async(min_results=self._min_results)
 
     def _split_received(self, batch: BatchedData) -> None:
         self._unstored = self._parts(batch)

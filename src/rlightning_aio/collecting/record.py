@@ -226,7 +226,7 @@ class ReplayedGroup(_WrappedGroup[G]):
                 return
             options: dict[str, Any] = {"min_results": len(missing), "deadline": deadline}
             try:
-                batch, flags = yield partial(self.group.collect_async, ordered=True, **options)
+                batch, flags = yield partial(self.group.collect_async, **options)
             except NothingPending:
                 raise self._diverged(missing[0], "it has no request to answer") from None
             except EnvFault as fault:

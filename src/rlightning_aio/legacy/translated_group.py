@@ -66,7 +66,6 @@ class TranslatedGroup:
         num_local = len(plan.local)
         self._names = names_in_use()
         self._local_core_ids = plan.core_ids[:num_local]
-        self._local_entries = [entry.name for entry in plan.entries if entry.backend == "callable"]
         self._core = build_env_group(plan.entries, mixed_actions=True)
         self._core.init()
         # There, a step after an end is nothing unusual.
@@ -145,6 +144,9 @@ class TranslatedGroup:
     def collected(self, **how: Any) -> list[ResultRow]:
         """Return results of our `collect_async`, with arguments `how`."""
         self._raise_kept()
+        return self._collected(**how)
+
+    def _collected(self, **how: Any) -> list[ResultRow]:
         with self._own_ids():
             batch, _ = self._core.collect_async(**how)
         return self.rows_of(batch)
@@ -204,8 +206,17 @@ class TranslatedGroup:
         return [found[env_id] for env_id in env_ids if env_id in found], faults
 
     def _local_results(self) -> list[ResultRow]:
-        """Wait for all outstanding results of local envs."""
-        return self.collected(wait_all=True, entries=self._local_entries)
+        """Wait for outstanding results of local envs; keep what clients answer meanwhile."""
+        awaited = self.pending.intersection(self.local_ids)
+        try:
+            rows = self._collected(min_results=len(awaited))
+        except EnvFault as fault:
+            if fault.env_id in self.local_ids:
+                raise
+            self._faults.append(fault)
+            return []
+        self.keep([row for row in rows if row.batch_id in self.server_ids])
+        return [row for row in rows if row.batch_id not in self.server_ids]
 
     def settle(self) -> None:
         """Wait for what local envs owe, and keep results for `take_kept`; raise kept errors."""

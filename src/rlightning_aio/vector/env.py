@@ -375,7 +375,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return found
 
     def _collect(self, deadline: float | None = None) -> BatchedData:
-        batch, _ = self.group.collect_async(wait_all=True, ordered=True, deadline=deadline)
+        batch, _ = self.group.collect_async(wait_all=True, deadline=deadline)
         return batch
 
     def _observed(self, observations: Any) -> Any:

@@ -87,12 +87,8 @@ class EnvGroup(GroupInterface):
         min_results: int | None = None,
         max_results: int | None = None,
         deadline: float | None = None,
-        entries: Sequence[str] | None = None,
-        ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
-        procedure = self._collect(
-            timeout, wait_all, min_results, max_results, deadline, entries, ordered
-        )
+        procedure = self._collect(timeout, wait_all, min_results, max_results, deadline)
         return await self._driver.run(procedure)
 
     async def abort(self, env_ids: Sequence[str] | None = None) -> None:

@@ -271,14 +271,12 @@ class Facade:
         min_results: int | None,
         max_results: int | None,
         deadline: float | None,
-        entries: Sequence[str] | None,
-        ordered: bool,
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
         if timeout is not None or deadline is not None:
             _check_seconds("timeout", timeout)
             _check_seconds("deadline", deadline)
         if min_results is None:
-            usual = 1 if wait_all else self._core.envs.usual_min_results(entries)
+            usual = 1 if wait_all else self._core.envs.usual_min_results
             min_results = usual if max_results is None else max(1, min(usual, max_results))
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
@@ -295,8 +293,6 @@ class Facade:
             min_results=min_results,
             max_results=max_results,
             deadline=deadline,
-            entries=entries,
-            ordered=ordered,
         )
         return self._steps.collect(time.monotonic(), rules)
 

@@ -104,8 +104,6 @@ class GroupInterface(Facade):
         min_results: int | None = None,
         max_results: int | None = None,
         deadline: float | None = None,
-        entries: Sequence[str] | None = None,
-        ordered: bool = False,
     ) -> Any:
         """Wait for results of `step_async`; never returns an empty batch.
 
@@ -120,17 +118,13 @@ class GroupInterface(Facade):
             max_results: leave results above this number to the next call, first come, first
                 served.
             deadline: limit in seconds, from now.
-            entries: take results of these config entries only; those of others stay.
-            ordered: return results in the group's order instead of that of arrival. With
-                ``wait_all`` that makes a run reproducible.
 
-        Returns results, in fresh arrays (views, if the group was built with ``zero_copy``), and
-        a flag for each: inside `auto_reset` True where the result reached the step limit, as in
-        `BatchedData.limit_reached`. Cancelled, it loses no result.
+        Returns results in the group's order, in fresh arrays (views, if the group was built with
+        ``zero_copy``), and a flag for each: inside `auto_reset` True where the result reached the
+        step limit, as in `BatchedData.limit_reached`. Cancelled, it loses no result.
 
         Raises:
-            NothingPending: no request is outstanding (of `entries`), and no client can join.
-            UnknownEnv: no config entry has such a name.
+            NothingPending: no request is outstanding, and no client can join.
             ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
                 `max_results`.
             TimeoutError: `deadline` has passed; the next call returns the results.

@@ -91,12 +91,8 @@ class EnvGroup(GroupInterface):
         min_results: int | None = None,
         max_results: int | None = None,
         deadline: float | None = None,
-        entries: Sequence[str] | None = None,
-        ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
-        procedure = self._collect(
-            timeout, wait_all, min_results, max_results, deadline, entries, ordered
-        )
+        procedure = self._collect(timeout, wait_all, min_results, max_results, deadline)
         return self._driver.run(procedure)
 
     def abort(self, env_ids: Sequence[str] | None = None) -> None:

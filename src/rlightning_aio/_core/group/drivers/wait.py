@@ -7,7 +7,7 @@ collect waits.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
 
@@ -124,8 +124,6 @@ class CollectRules(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     min_results: int = 1
     max_results: int | None = None
     deadline: float | None = None
-    entries: Sequence[str] | None = None
-    ordered: bool = False
 
 
 def earliest(*times: float | None) -> float | None:

@@ -188,7 +188,7 @@ class Core:
         collector.note_faults(self.calls.drop())
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
-            slots = np.sort(collector.take(collector.num_ready))
+            slots = collector.take(collector.num_ready)
             results = self.steps.hand_out(slots, synchronous=False)
         if collector.faults:
             faults = [*collector.faults]

@@ -191,7 +191,6 @@ class Steps:
         try:
             if self.collecting or self._conditions.unusual:
                 self.check_collectable()
-            among = None if rules.entries is None else self._envs.of_entries(rules.entries)
             limits = None if rules.timeout is rules.deadline is None else _Limits(rules, now)
             self.collecting = True
             try:
@@ -201,10 +200,8 @@ class Steps:
                     waiting.poll()
                     ready = collector.num_ready
                     total = ready + collector.num_awaited
-                    if among is not None:
-                        ready, total = self._requests.pending(among)
                     if collector.faults or not total:
-                        self._check_possible(rules, among, total)
+                        self._check_possible(total)
                     most = min(total, rules.max_results or total)
                     need = most if rules.wait_all else min(rules.min_results, most)
                     wanted, until = (need or 1) - ready, None
@@ -215,8 +212,9 @@ class Steps:
                     now = yield from waiting.turn(wanted, until)
             finally:
                 self.collecting = False
-            slots = collector.take(most, among)
-            slots = self._in_order(slots) if rules.ordered else slots
+            slots, local = collector.take(most), self._envs.all
+            if len(slots) == len(local) > slots[-1]:
+                slots = local  # The same slots, which lie side by side.
             return self.hand_out(slots, synchronous=False)
         finally:
             if self._observed.observer is not None:
@@ -230,24 +228,15 @@ class Steps:
                 "another collect_async is already waiting on this group; one collector at a time"
             )
 
-    def _check_possible(
-        self, rules: CollectRules, among: NDArray[np.bool_] | None, total: int
-    ) -> None:
-        """Raise the collector's oldest error of these slots, or else if no result can come."""
+    def _check_possible(self, total: int) -> None:
+        """Raise the collector's oldest error, or else if no result can come."""
         for fault in self._requests.collector.faults:
-            if among is None or among[self._envs.one_of_entry(fault.env_id)]:
-                self.note_raised(fault)
-                raise fault
+            self.note_raised(fault)
+            raise fault
         if not total and not self._supervisor.members.possible:
-            whose = "" if rules.entries is None else f" of entries {', '.join(rules.entries)}"
             raise NothingPending(
-                f"nothing to collect: no request{whose} is outstanding; send one with step_async"
+                "nothing to collect: no request is outstanding; send one with step_async"
             )
-
-    def _in_order(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        slots = slots.copy()
-        slots.sort()
-        return self._envs.all if len(slots) == len(self._envs.all) == len(self._envs) else slots
 
     def note_raised(self, fault: EnvFault) -> None:
         """Note that an error of the collector is raised, so that its envs are free."""

@@ -181,34 +181,15 @@ class EnvTable:
         except KeyError:
             raise UnknownEnv(self._unknown(env_id)) from None
 
-    def one_of_entry(self, env_id: str) -> int:
-        """A slot of the entry of `env_id`, which may be of a member that has left."""
-        slot = self._slot_of.get(env_id)
-        return self.names.shared_ids.index(env_id.rpartition("/")[0]) if slot is None else slot
-
     def _unknown(self, env_id: Any) -> str:
         ids = list(self._slot_of)
         known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")
         return f"no env of this group is called {env_id!r}; its envs are {known}"
 
-    def of_entries(self, names: Sequence[str]) -> NDArray[np.bool_]:
-        """A mask of the slots that belong to the config entries called `names`.
-
-        Raises:
-            UnknownEnv: the group has no entry of that name.
-        """
-        entry_names = self.names.entry_names
-        for name in names:
-            if name not in entry_names:
-                known = ", ".join(entry_names)
-                raise UnknownEnv(f"no entry of this group is called {name!r}; they are {known}")
-        return np.isin(self.names.entries, [entry_names.index(name) for name in names])
-
-    def usual_min_results(self, names: Sequence[str] | None) -> int:
-        """The default `min_results` of a collect of the entries `names`, or of all entries."""
-        wanted = self._min_results
-        known = wanted.values() if names is None else (wanted.get(name, 0) for name in names)
-        return max(1, sum(known))
+    @property
+    def usual_min_results(self) -> int:
+        """The default `min_results` of a collect."""
+        return max(1, sum(self._min_results.values()))
 
     def describe(self, slot: int) -> str:
         """The name of an env in messages, with its entry, backend and task."""

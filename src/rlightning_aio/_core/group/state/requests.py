@@ -141,30 +141,21 @@ class CollectorQueue(UncollectedErrors):
         self.num_ready += len(slots)
         self.num_awaited -= len(slots)
 
-    def take(self, most: int, among: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
-        """Return slots of the collector's ready results, first come, first served.
-
-        Args:
-            most: how many at most.
-            among: of these slots only.
-        """
+    def take(self, most: int) -> NDArray[np.intp]:
+        """Return the slots of the first `most` results that are ready, in ascending order."""
         taken: list[NDArray[np.intp]] = []
-        left: list[NDArray[np.intp]] = []
         count = 0
         while self.ready and count < most:
             slots = self.ready.popleft()
-            if among is not None:
-                left.append(slots[~among[slots]])
-                slots = slots[among[slots]]
             if count + len(slots) > most:
                 self.ready.appendleft(slots[most - count :])
                 slots = slots[: most - count]
             taken.append(slots)
             count += len(slots)
-        if left:
-            self.ready.extendleft(slots for slots in reversed(left) if len(slots))
         self.num_ready -= count
-        return taken[0] if len(taken) == 1 else np.concatenate(taken)
+        found = taken[0].copy() if len(taken) == 1 else np.concatenate(taken)
+        found.sort()
+        return found
 
     def requeue(self, slots: NDArray[np.intp]) -> None:
         """Make taken results the next ones."""
@@ -263,19 +254,6 @@ class Requests:
     def ready(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the slots of `slots` whose results are ready."""
         return slots[self.state[slots] == _READY_CODE]
-
-    def pending(self, among: NDArray[np.bool_] | None = None) -> tuple[int, int]:
-        """Return the number of the collector's ready results, and with outstanding ones added.
-
-        Args:
-            among: count these slots only.
-        """
-        if among is None:
-            num_ready = self.collector.num_ready
-            return num_ready, num_ready + self.collector.num_awaited
-        states = self.state[among & (self.owner == COLLECTOR)]
-        num_ready = int(np.count_nonzero(states == _READY_CODE))
-        return num_ready, num_ready + int(np.count_nonzero(states == _BUSY_CODE))
 
     # -- asking -------------------------------------------------------------------
 
