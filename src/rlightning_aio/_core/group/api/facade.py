@@ -104,8 +104,8 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
 
 def default_min_results(group: Any) -> int:
     """Number of results that a policy waits for: the sum of the entries', or half of the envs."""
-    configured: int = group._core.envs.usual_min_results(None)  # noqa: SLF001
-    return configured if configured > 1 else max(1, len(group.env_ids) // 2)
+    core: Core = group._core  # noqa: SLF001
+    return core.envs.configured_min_results or max(1, len(group.env_ids) // 2)
 
 
 class Facade:
@@ -276,7 +276,7 @@ class Facade:
             _check_seconds("timeout", timeout)
             _check_seconds("deadline", deadline)
         if min_results is None:
-            usual = 1 if wait_all else self._core.envs.usual_min_results
+            usual = 1 if wait_all else self._core.envs.configured_min_results or 1
             min_results = usual if max_results is None else max(1, min(usual, max_results))
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")

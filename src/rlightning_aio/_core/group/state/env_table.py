@@ -187,9 +187,9 @@ class EnvTable:
         return f"no env of this group is called {env_id!r}; its envs are {known}"
 
     @property
-    def usual_min_results(self) -> int:
-        """The default `min_results` of a collect."""
-        return max(1, sum(self._min_results.values()))
+    def configured_min_results(self) -> int:
+        """The sum of the entries' ``min_results``; 0 if none has any."""
+        return sum(self._min_results.values())
 
     def describe(self, slot: int) -> str:
         """The name of an env in messages, with its entry, backend and task."""
