@@ -21,7 +21,8 @@ MOST = {
     "the same, asynchronous": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
     "step": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
     "VectorEnv.step": {"calls": 80},
-    "Collector.collect, 16 transitions": {"calls": 300},
+    # 12 of them only if the second of its two steps, whose workers are not held, takes long.
+    "Collector.collect, 16 transitions": {"calls": 312},
     "death with resume: files": {"files of src": 23},
 }
 
