@@ -284,7 +284,7 @@ class Continuity:
 
     def warn_of_ended(self, slots: NDArray[np.intp]) -> None:
         """Warn, once for each entry, that envs of `slots` are stepped although they are over."""
-        entries = self._envs.names.entries
+        names, entries = self._envs.names.entry_names, self._envs.names.entries
         for slot in slots[self._ended[slots] & ~self._warned[slots]].tolist():
             if not self._warned[slot]:
                 self._warned |= entries == entries[slot]
@@ -293,7 +293,7 @@ class Continuity:
                     ", or step inside `with group.auto_reset(math.inf):`, where envs are reset in "
                     "place of such a step; this is not said again of entry %r",
                     self._envs.describe(slot),
-                    self._envs.configs[slot].name,
+                    names[entries[slot]],
                 )
         self._update_due()
 
