@@ -149,6 +149,17 @@ def test_the_steps_before_a_restore_are_not_lost_by_a_death_after_it() -> None:
     assert continuity.take_answers(SLOT) == [Report(0, "was killed", None, 0)]
 
 
+def test_an_env_that_is_put_back_after_a_death_knows_how_many_steps_it_has_lost() -> None:
+    """It is put back to its checkpoint, whatever the caller has seen."""
+    continuity = new_continuity()
+    continuity.save(0, b"a reset", 1, before=True, is_step=False)
+    for _ in range(3):
+        continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
+    continuity.lose([0], "was killed", from_checkpoint=True)
+    continuity.save(0, b"put back", 2, before=True, is_step=False)
+    assert continuity.positions(SLOT) == [Position(0, is_cut=False)]
+
+
 @pytest.mark.parametrize("shown", [LossPhase.SHOWING, LossPhase.RESUMING])
 def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: LossPhase) -> None:
     """The reset after that begins at 0, whatever position was to be shown."""

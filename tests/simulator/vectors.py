@@ -113,6 +113,9 @@ class Vectors(Session):
         except EnvFault as fault:
             self.fail(fault)
             return
+        except KeyboardInterrupt:
+            self.shown = []  # Perhaps nothing was sent, and steps are not refused.
+            raise
         words = self.words(observation)
         self.say(f"   {words}")
         for k, one in enumerate(words):

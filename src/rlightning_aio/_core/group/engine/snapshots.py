@@ -88,16 +88,22 @@ class Snapshots:
     ) -> Procedure[tuple[list[tuple[EnvSnapshot, bool]], float]]:
         """Take one snapshot per env, and say whether it was ever reset; return the time, too."""
         op, nothing = Operation.SNAPSHOT, [()] * len(slots)
-        send = partial(self._calls.send, now, slots, op, nothing, "nothing")
-        ticket, now = yield from self._waiting.ask(now, slots, send, "snapshot")
+        positions: list[Position] = []
+
+        def send(ticket: Ticket) -> None:
+            self._calls.send(now, slots, op, nothing, "nothing", ticket)
+            # A worker that has replied may die before others reply.
+            positions.extend(self._continuity.positions(slots))
+
+        ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
         each: list[int] = slots.tolist()
-        replies = zip(each, self._continuity.positions(slots), values_of([ticket]), strict=True)
+        replies = zip(each, positions, values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, bool]] = []
         for slot, (num_steps, is_cut), (versions, was_reset, state) in replies:
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
             env_id = self._envs.env_ids[slot]
             snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
-        return snapshots, now
+        return snapshots, later
 
     def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None

@@ -548,7 +548,8 @@ class Continuity:
         """
         answered = self._pending.pop(slot, None)
         if before:
-            self._checkpoints[slot] = _Checkpoint(content, entry, self._num_steps.item(slot))
+            num_steps = self.positions(np.array([slot]))[0].num_steps
+            self._checkpoints[slot] = _Checkpoint(content, entry, num_steps)
             return
         if answered is not None:
             self._checkpoints[slot] = answered
@@ -565,8 +566,7 @@ class Continuity:
     def drop_unfinished(self, slots: Iterable[int], unanswered: Container[int]) -> None:
         """Drop checkpoints that a replacement of the host of `slots` must not start from.
 
-        They are of requests that were not answered (entries), or of a restore that was not
-        completed: see `note_shows`.
+        They are of requests in `unanswered`, or of a restore that is not complete: `note_shows`.
         """
         for slot in slots:
             pending = self._pending.get(slot)
