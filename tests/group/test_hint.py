@@ -87,20 +87,23 @@ class Worker:
 
 @dataclass
 class Machine:
-    """Two workers of a group, and the measurements of its results, in place of `Stats`.
+    """Workers of a group, and the measurements of its results, in place of `Stats`.
 
     `at_ns` is the time.
     """
 
     per_worker: int = 4
+    num_workers: int = 2
+    envs_per_process: int | str = "auto"
     num_batches: int = 0
     at_ns: int = 5 * MS
     steps: list[tuple[int, int, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         count = self.per_worker
-        self.workers = [Worker(0, count), Worker(count, count)]
-        config = entry(num_workers=2 * count)
+        self.workers = [Worker(k * count, count) for k in range(self.num_workers)]
+        total = self.num_workers * count
+        config = entry(num_workers=total, envs_per_process=self.envs_per_process)
         self.records = [HostRecord(worker, config) for worker in self.workers]
         self.hints = Hints(self.records)
 
@@ -144,7 +147,29 @@ def test_envs_that_share_workers_and_wait_get_one_warning(
     (text,) = warned(caplog)
     assert "entry 'pole': 4 envs share each worker" in text
     assert "10 % of their time keeps a core busy" in text
+    assert "up to 4.0 times as fast" in text
     assert "set envs_per_process: 1 (in VectorEnv, envs_per_process=1)" in text
+
+
+@pytest.mark.parametrize("busy", [MS // 20, MS // 4], ids=["50 µs", "250 µs"])
+@pytest.mark.parametrize("said", ["auto", 1])
+def test_envs_with_a_worker_each_and_short_steps_get_one_warning(
+    busy: int, said: int | str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It has the setting; steps above 200 µs, and a number that was asked for, get none."""
+    machine = Machine(per_worker=1, envs_per_process=said, num_workers=6)
+    machine.look()
+    for _ in range(4):
+        machine.step_all(4, busy, ran=busy)
+        machine.look()
+    warnings = warned(caplog)
+    if busy > MS // 5 or said == 1:
+        assert warnings == []
+        return
+    (text,) = warnings
+    assert "entry 'pole': each of 6 envs has a worker, 3.0 times as many as cores" in text
+    assert "a step takes 50 µs" in text
+    assert "set envs_per_process: 3 (in VectorEnv, max_concurrency=2)" in text
 
 
 def test_many_envs_that_wait_need_not_have_a_worker_each(caplog: pytest.LogCaptureFixture) -> None:

@@ -32,6 +32,8 @@ _FIRST_LOOK: Final = 8
 """Number of batches after which envs are past their first steps, which may compile and load."""
 _SHORT_US: Final = 1000.0
 """Limit of steps that compute, as in simulators; robots wait longer."""
+_BRIEF_US: Final = 200.0
+"""Limit of steps that are no longer than what it costs to wake the process of each."""
 _TINY_US: Final = 30.0
 _ENOUGH_NS: Final = 20_000_000
 _ENOUGH_RESULTS: Final = 16
@@ -108,12 +110,16 @@ class Hints:
         """
         is_last = self.due >= HINT_AFTER_BATCHES
         self.due = float("inf") if is_last else min(2 * self.due, HINT_AFTER_BATCHES)
-        sharing: dict[str, list[HostRecord]] = {}
+        measured: dict[str, list[HostRecord]] = {}
         for record in self._records:
-            if len(record.slots) > 1 and record.measured is not None:
-                sharing.setdefault(record.config.name, []).append(record)
-        for name, records in sharing.items():
-            self._look_at(name, records, stats, num_cores)
+            if record.measured is not None:
+                measured.setdefault(record.config.name, []).append(record)
+        for name, records in measured.items():
+            sharing = [record for record in records if len(record.slots) > 1]
+            if sharing:
+                self._look_at(name, sharing, stats, num_cores)
+            elif records[0].config.envs_per_process == "auto" and len(records) > num_cores:
+                self._look_at_separate(name, records, stats, num_cores)
         if is_last:
             self._look_at_latencies(stats, num_cores)
 
@@ -138,13 +144,34 @@ class Hints:
             self._since[name] = None
             _log.warning("%s", _advice(name, together, best, spent))
 
+    def _look_at_separate(
+        self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
+    ) -> None:
+        """Warn if envs that have a worker each make steps so short that sharing is faster."""
+        restarts, since = [record.restarts for record in records], self._since.get(name)
+        if since is None and name in self._since:
+            return
+        now_ns = time.monotonic_ns()
+        if since is None or since.restarts != restarts:
+            self._since[name] = _Since(now_ns, restarts, 0, 0)
+            return
+        slots, begun, done = stats.executed(since.at_ns)
+        own = np.isin(slots, [record.slots.start for record in records])
+        if np.count_nonzero(own) < _ENOUGH_RESULTS:
+            return
+        step_us = float(np.median((done - begun)[own])) / 1e3
+        if step_us < _BRIEF_US:
+            self._since[name] = None
+            _log.warning("%s", _advice_to_share(name, len(records), num_cores, step_us))
+
     def _look_at_latencies(self, stats: Stats, num_cores: int) -> None:
         workers = Counter(
             record.config.name
             for record in self._records
             if record.killable is not None and record.is_local
         )
-        configs = [record.config for record in self._records]
+        warned = {name for name, since in self._since.items() if since is None}
+        configs = [r.config for r in self._records if r.config.name not in warned]
         text = hint(configs, workers, num_cores, stats.summary()["latency_us"])
         if text is not None:
             _log.info("%s; `rlightning-aio tune` measures what is best", text)
@@ -182,11 +209,23 @@ def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
 
 
 def _advice(name: str, together: int, best: int, spent: Spent) -> str:
-    share = 100 * spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
+    share = spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
+    factor = min(together / best, 1 / max(share, 1e-9))
     return (
         f"entry {name!r}: {together} envs share each worker, where only one is stepped at a time, "
-        f"and their steps wait ({share:.0f} % of their time keeps a core busy); to have them wait "
-        f"at the same time, set envs_per_process: {best} (in VectorEnv, envs_per_process={best})"
+        f"and their steps wait ({100 * share:.0f} % of their time keeps a core busy); to have them "
+        f"wait at the same time, up to {factor:.1f} times as fast, set envs_per_process: {best} "
+        f"(in VectorEnv, envs_per_process={best})"
+    )
+
+
+def _advice_to_share(name: str, num_workers: int, num_cores: int, step_us: float) -> str:
+    together = -(-num_workers // num_cores)
+    return (
+        f"entry {name!r}: each of {num_workers} envs has a worker, {num_workers / num_cores:.1f} "
+        f"times as many as cores, and a step takes {step_us:.0f} µs, no longer than the switch "
+        f"between two processes; to have envs share workers, set envs_per_process: {together} (in "
+        f"VectorEnv, max_concurrency={num_cores})"
     )
 
 
