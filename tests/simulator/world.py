@@ -26,6 +26,7 @@ import asyncio
 import gc
 import heapq
 import itertools
+import math
 import os
 import secrets
 import select
@@ -52,6 +53,7 @@ from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 from rlightning_aio import sharing
 from rlightning_aio._core.group.engine import first_observations
 from rlightning_aio._core.group.setup import start_orders
+from rlightning_aio._core.group.supervision import overdue
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
@@ -214,6 +216,8 @@ class World:
             (rings, "IN_ORDER", False),
             (exchange, "new_fence", lambda: self.point),
             (rings, "new_fence", lambda: self.point),
+            # A call that would wait for ever must be found to.
+            (overdue, "OWED_SECONDS", math.inf),
             # So that steps are ordinary sooner.
             (first_observations, "_NUM_CHECKED", 1),
             (

@@ -8,7 +8,7 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rlightning_aio._core.group.drivers.wait import Parked, forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import Parked, Patient, forked_from, this_process
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class AioDriver:
         self.drain: Callable[[], None]
         # The future of each waiting call, until it is woken.
         self._waiting: list[asyncio.Future[None]] = []
+        self._nudge: asyncio.TimerHandle | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = os.getpid()
         self._descriptors: dict[Source, int] = {}
@@ -104,6 +105,7 @@ class AioDriver:
         if ours.is_running():
             raise self._elsewhere(ours)
         self.wake()
+        self._end_nudge()
         self._loop = loop
         for source, descriptor in self._descriptors.items():
             self._forget(ours, descriptor)
@@ -238,8 +240,19 @@ class AioDriver:
         self.move()
         kept, self._raised = self._raised, None
         await self.run(procedure)
+        self._end_nudge()
         if kept is not None:
             raise kept
+
+    def _end_nudge(self) -> None:
+        if self._nudge is not None:
+            self._nudge.cancel()
+            self._nudge = None
+
+    def _on_nudge(self) -> None:
+        """Wake calls that wait patiently, as they may have waited for long."""
+        self._nudge = None
+        self.wake()
 
     async def _block(self, wait: Wait) -> None:
         timeout = None if wait.until is None else wait.until - time.monotonic()
@@ -252,7 +265,12 @@ class AioDriver:
             wait.unpark = partial(_wake, woken)
             await woken
             return
-        timer = None if timeout is None else loop.call_later(timeout, _wake, woken)
+        timer = None
+        if type(wait) is Patient:
+            if timeout is not None and self._nudge is None:
+                self._nudge = loop.call_later(timeout, self._on_nudge)
+        elif timeout is not None:
+            timer = loop.call_later(timeout, _wake, woken)
         self._waiting.append(woken)
         try:
             await woken

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from collections.abc import Sized
 
 __all__ = [
-    "ANY",
     "TURN",
     "CollectRules",
     "Driver",
     "Parked",
+    "Patient",
     "Procedure",
     "Wait",
     "earliest",
@@ -45,6 +45,14 @@ class Wait:
     until: float | None = None
 
 
+@dataclass(slots=True, eq=False)
+class Patient(Wait):
+    """A request to block until a source is readable, or until some time after `until`.
+
+    An asynchronous group keeps one timer for all such waits.
+    """
+
+
 def _nobody_waits() -> None:
     """Do nothing."""
 
@@ -62,8 +70,6 @@ class Parked(Wait):
     unpark: Callable[[], None] = _nobody_waits
 
 
-ANY: Final = Wait()
-"""Block until a source is readable."""
 TURN: Final = Wait(0.0)
 """The result is ready; let other waiting calls run first. Does nothing in a synchronous group,
 where no other call can wait.

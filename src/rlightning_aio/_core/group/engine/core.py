@@ -93,6 +93,7 @@ class Core:
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
         self.steps.begin(shares_thread=self.shares_thread)
+        self.supervisor.overdue.begin(self.parts.tables.clock())
         return metas
 
     def close(self, now: float) -> Procedure[None]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rlightning_aio._core.group.drivers.wait import ANY, TURN, Parked, Procedure, Wait
+from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
 from rlightning_aio._core.hosts.spinner import Spinner
@@ -118,8 +118,8 @@ class Waiting:
     def check(self, now: float) -> None:
         """Check all hosts for deaths and hangs, and apply the outcome."""
         self.intake.now = now
-        if self._supervisor.detector.timed:
-            self.poll()  # An env that has replied is not hung.
+        if self._supervisor.detector.timed or now >= self._supervisor.overdue.due:
+            self.poll()  # An env that has replied is not hung, and owes nothing.
         self._supervisor.check(now)
         self.poll()
 
@@ -143,7 +143,8 @@ class Waiting:
                 else:
                     is_due = until is not None or supervisor.detector.timed
                     is_due = is_due or self._conditions.unusual != 0
-                    now = yield Wait(supervisor.next_check(until)) if is_due else ANY
+                    patient = supervisor.overdue.wait
+                    now = yield Wait(supervisor.next_check(until)) if is_due else patient
                     if may_spin:
                         poller.slept()
                     if not is_due:
@@ -154,7 +155,7 @@ class Waiting:
                 self.wanted[wanted] = calls - 1
             elif not self.wanted:
                 self._bell.disarm()
-        if is_due:
+        if is_due or now >= supervisor.overdue.due:
             self.check(now)
         return now
 

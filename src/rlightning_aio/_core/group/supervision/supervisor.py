@@ -31,6 +31,7 @@ from rlightning_aio._core.group.supervision.fault_messages import (
 from rlightning_aio._core.group.supervision.hang_detector import HangDetector, has_news
 from rlightning_aio._core.group.supervision.hint import Hints
 from rlightning_aio._core.group.supervision.members import Members
+from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
 from rlightning_aio._core.hosts.limits import restart_pause
@@ -83,7 +84,7 @@ class Supervisor:
         members: the envs that join and leave.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
-            their deaths.
+            their deaths; overdue: names envs that owe a result for long.
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died, and its replacement has not completed a step yet.
         close_errors: env id and error of each env whose `close` raised.
@@ -108,6 +109,7 @@ class Supervisor:
         self.shutdown = Shutdown(group)
         self.workers = Workers(group)
         self.hints = Hints(self.records)
+        self.overdue = Overdue(group)
         self.crash_log = CrashLog()
         self._start_fault: Exception | None = None
         self._now = 0.0
@@ -306,7 +308,7 @@ class Supervisor:
 
     def next_check(self, until: float | None = None) -> float | None:
         """Return the time by which `check` must be called, or `until` if that is earlier."""
-        times = [until]
+        times = [until, self.overdue.wait.until]
         if self.detector.timed or self.detector.any_ending:
             times += self.detector.expiries()
         if self.any_deaths:
@@ -329,6 +331,8 @@ class Supervisor:
             self.members.tick(now)
         if self.detector.timed or self.detector.any_ending:
             self.detector.check(now)
+        if now >= self.overdue.due:
+            self.overdue.look(now)
         if now >= self.crash_log.due:
             self.crash_log.flush(now)
 

@@ -1,0 +1,150 @@
+"""Envs that owe a result for a minute, and that nothing ends, are named in the log."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from patience import HANG
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio._core.group.supervision import overdue
+
+
+class Stuck(gym.Env[Any, Any]):
+    """Waits in a step with action 1 until a file is there."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, gate: Any) -> None:
+        self._gate = gate
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        while action == 1 and not self._gate.exists():
+            threading.Event().wait(0.01)
+        return np.zeros(1, np.float32), 1.0, False, False, {}
+
+
+@pytest.fixture
+def gate(tmp_path: Any) -> Any:
+    """Return a path; envs that are stuck go on once the file is there."""
+    return tmp_path / "gate"
+
+
+def watch(group: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a group whose envs have been reset wait no more than a moment."""
+    monkeypatch.setattr(overdue, "OWED_SECONDS", 0.3)
+    group._core.supervisor.overdue.begin(time.monotonic())
+
+
+def said(caplog: pytest.LogCaptureFixture) -> list[Any]:
+    return [r for r in caplog.records if "has owed a result" in r.getMessage()]
+
+
+def opened_by_warning(gate: Any, caplog: pytest.LogCaptureFixture) -> threading.Thread:
+    """Open the gate once something is said, in a thread."""
+
+    def watch() -> None:
+        for _ in range(int(HANG * 100)):
+            if said(caplog):
+                break
+            threading.Event().wait(0.01)
+        gate.touch()
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    return thread
+
+
+def check(caplog: pytest.LogCaptureFixture) -> None:
+    (record,) = said(caplog)
+    assert record.levelname == "WARNING"
+    assert record.getMessage().startswith("env 'env-1' (entry 'env'")
+    assert "set step_timeout of its entry" in record.getMessage()
+
+
+def entry(gate: Any, **fields: Any) -> dict[str, Any]:
+    return {"name": "env", "task": lambda: Stuck(gate), "num_workers": 3, **fields}
+
+
+@pytest.mark.parametrize("fields", [{}, {"reset_timeout": HANG}], ids=["no limit", "of resets"])
+def test_a_call_that_waits_says_for_whom(
+    gate: Any, fields: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once for each entry, in a synchronous group."""
+    with sync.build_env_group(entry(gate, **fields)) as group:
+        batch, _ = group.reset()
+        watch(group, monkeypatch)
+        thread = opened_by_warning(gate, caplog)
+        batch, _ = group.step(batch.respond([0, 1, 1]))
+        thread.join()
+        assert len(batch) == 3
+        gate.unlink()
+        threading.Timer(1, gate.touch).start()
+        group.step(batch.respond([1, 0, 0]))
+    check(caplog)
+
+
+async def test_an_asynchronous_call_that_waits_says_for_whom(
+    gate: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a call with a deadline waits."""
+    async with rl.build_env_group(entry(gate)) as group:
+        batch, _ = await group.reset()
+        watch(group, monkeypatch)
+        thread = opened_by_warning(gate, caplog)
+        group.step_async(batch.respond([0, 1, 0]))
+        await group.collect_async(wait_all=True)
+        thread.join()
+    check(caplog)
+    caplog.clear()
+    gate.unlink()
+    async with rl.build_env_group(entry(gate)) as group:
+        batch, _ = await group.reset()
+        watch(group, monkeypatch)
+        group.step_async(batch.respond([0, 1, 0]))
+        with pytest.raises(TimeoutError):
+            await group.collect_async(wait_all=True, deadline=1)
+        gate.touch()
+        await group.collect_async(wait_all=True)
+    check(caplog)
+
+
+def test_nothing_is_said_of_envs_with_a_limit_or_that_reply(
+    gate: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor of others, before a minute has passed."""
+    with sync.build_env_group(entry(gate, step_timeout=HANG)) as group:
+        batch, _ = group.reset()
+        watch(group, monkeypatch)
+        threading.Timer(1, gate.touch).start()
+        batch, _ = group.step(batch.respond([0, 1, 0]))
+    with sync.build_env_group(entry(gate)) as group:
+        batch, _ = group.reset()
+        group._core.supervisor.overdue.due = 0.0  # It looks at each wait.
+        for _ in range(10):
+            batch, _ = group.step(batch.respond([0, 0, 0]))
+    assert said(caplog) == []
+
+
+def test_a_loop_keeps_no_timer_of_a_closed_group(gate: Any) -> None:
+    """Nor of one that has nothing left to say."""
+
+    async def main() -> None:
+        async with rl.build_env_group(entry(gate)) as group:
+            batch, _ = await group.reset()
+            await group.step(batch.respond([0, 0, 0]))
+            driver = group._driver
+        assert driver._nudge is None
+
+    asyncio.run(main())
