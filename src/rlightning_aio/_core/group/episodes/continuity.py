@@ -284,16 +284,16 @@ class Continuity:
 
     def warn_of_ended(self, slots: NDArray[np.intp]) -> None:
         """Warn, once for each entry, that envs of `slots` are stepped although they are over."""
-        names, entries = self._envs.names.entry_names, self._envs.names.entries
-        for slot in slots[self._ended[slots] & ~self._warned[slots]].tolist():
+        entries = self._envs.names.entries
+        over: list[int] = slots[self._ended[slots] & ~self._warned[slots]].tolist()
+        for slot in over:
             if not self._warned[slot]:
                 self._warned |= entries == entries[slot]
                 _log.warning(
                     "%s is stepped although its episode is over: reset it (group.reset(env_ids=…))"
                     ", or step inside `with group.auto_reset(math.inf):`, where envs are reset in "
-                    "place of such a step; this is not said again of entry %r",
+                    "place of such a step; this is not said again of its entry",
                     self._envs.describe(slot),
-                    names[entries[slot]],
                 )
         self._update_due()
 
