@@ -1,8 +1,8 @@
-"""The size of the public interface: names, members, arguments, fields, commands, options, extras.
+"""How large is the public interface? Names, members, arguments, fields, commands, options, extras.
 
-A name is public if the `__all__` of a module below lists it; those that several modules list are
-counted once. Members are the public attributes that classes of this package define, arguments those
-of their constructors and methods and of functions, without `self`.
+A name is public if the `__all__` of a module below lists it, or if it is named below; those that
+several modules list are counted once. Members are the public attributes that classes of this
+package define, arguments those of their constructors and methods and of functions, without `self`.
 
     python benchmarks/interface.py
     python benchmarks/interface.py --names
@@ -20,10 +20,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
-import click
 import typer
 
-from rlightning_aio.cli import app
+from rlightning_aio.cli.app import app
 from rlightning_aio.config import EnvConfig
 
 MODULES: Final = {
@@ -31,9 +30,11 @@ MODULES: Final = {
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
     "policies": "evaluation", "policy_servers": "evaluation", "export": "evaluation",
     "remote": "remote", "serving": "remote", "errors": "errors", "spaces": "envs",
-    "envs.contract": "envs", "legacy": "legacy",
+    "envs.contract": "envs", "registry": "envs", "legacy": "legacy",
 }  # fmt: skip
 """Modules that the documentation imports names from, each with its row of the table."""
+ONLY: Final = {"registry": ["Backend"]}
+"""Modules of which it imports these alone."""
 PACKAGE: Final = "rlightning_aio"
 
 
@@ -54,7 +55,7 @@ def inventory() -> dict[str, Row]:
     for suffix, part in MODULES.items():
         module = importlib.import_module(".".join(filter(None, (PACKAGE, suffix))))
         row = rows.setdefault(part, Row())
-        for name in module.__all__:
+        for name in ONLY.get(suffix, module.__all__):
             value = getattr(module, name)
             if any(value is other for other in seen):
                 continue
@@ -97,10 +98,9 @@ def _stand_in_for_sb3() -> None:
 
 def commands() -> dict[str, list[str]]:
     """Return the options of each command."""
-    group = typer.main.get_command(app)
-    assert isinstance(group, click.Group)
+    group: Any = typer.main.get_command(app)
     return {
-        name: [p.opts[-1] for p in command.params if isinstance(p, click.Option)]
+        name: [p.opts[-1] for p in command.params if p.param_type_name == "option"]
         for name, command in group.commands.items()
     }
 
@@ -120,7 +120,7 @@ def sizes() -> dict[str, int]:
         "arguments": sum(row.arguments for row in rows),
         "fields": len(EnvConfig.model_fields),
         "commands": len(commands()),
-        "options": sum(map(len, commands().values())),
+        "options": len(set().union(*commands().values())),
         "extras": len(extras()),
     }
 
