@@ -14,7 +14,8 @@ from combinations.played import Uneven
 from faults.striking import hear_of_interrupt, struck
 
 from rlightning_aio import sync
-from rlightning_aio.collecting import Collector, RecordedGroup
+from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting.record import RecordedGroup
 from rlightning_aio.errors import NothingPending
 
 if TYPE_CHECKING:

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
-from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
+from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting.record import Record, RecordedGroup, RecordFile, ReplayedGroup
 from rlightning_aio.errors import EnvFault, EnvRaised, ReplayDiverged
 
 if TYPE_CHECKING:
@@ -53,11 +54,11 @@ class Learner:
         self.weights += 0.01 * rollout.observation.T @ direction / len(rollout)
 
 
-async def trained(group: Any) -> Any:
+async def trained(group: Any, **order: Any) -> Any:
     """Weights after some asynchronous updates, and their rollouts."""
     learner, seen = Learner(), []
     with group.auto_reset():
-        collector = Collector(group, learner, num_transitions=60, seed=3)
+        collector: Any = Collector(group, learner, num_transitions=60, seed=3, **order)
         for _ in range(6):
             rollout = await collector.collect()
             learner.learn(rollout)
@@ -70,14 +71,11 @@ async def trained(group: Any) -> Any:
 async def test_an_asynchronous_training_is_repeated_bit_for_bit(tmp_path: Path) -> None:
     """Including weights; first in workers, then in this process, where the order differs."""
     async with rl.build_env_group({**POLE, "envs_per_process": 2}) as group:
-        recorded = RecordedGroup(group)
-        weights, seen = await trained(recorded)
-    recorded.record.save(tmp_path / "order")
-    record = Record.load(tmp_path / "order")
-    assert 0 < (tmp_path / "order").stat().st_size < 100 + 4 * 2 * (6 * 60 + 50)
+        weights, seen = await trained(group, record=tmp_path / "order")
+    assert 0 < (tmp_path / "order").stat().st_size < 100 + 6 * 70 + 4 * 2 * (6 * 60 + 50)
     for placement in ("process", "inline"):
         async with rl.build_env_group({**POLE, "placement": placement}) as group:
-            again, seen_again = await trained(ReplayedGroup(group, record))
+            again, seen_again = await trained(group, replay=tmp_path / "order")
         assert weights.any()
         assert weights.tobytes() == again.tobytes()
         for one, other in zip(seen, seen_again, strict=True):
@@ -250,9 +248,9 @@ for calls in ([("a-0", 1), ("b-1", 0)], [("a-0", 0)], [("b-1", 2)], [("a-0", 3)]
 
 
 def sealed(record: Record) -> bytes:
-    with tempfile.NamedTemporaryFile() as file:
-        record.save(file.name)
-        return Path(file.name).read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        RecordFile(record, path := Path(folder, "order")).write()
+        return path.read_bytes()
 
 
 def load(data: bytes) -> Record:
@@ -264,6 +262,44 @@ def load(data: bytes) -> Record:
 @pytest.mark.parametrize("record", [Record(), RECORD], ids=["empty", "of two envs"])
 def test_a_saved_record_is_loaded_unchanged(record: Record) -> None:
     assert vars(load(sealed(record))) == vars(record)
+
+
+def test_a_record_that_grows_is_added_to_its_file(tmp_path: Path) -> None:
+    """Also where a write failed before, and wrote a part."""
+    record = Record()
+    file = RecordFile(record, tmp_path / "order")
+    for k in range(3):
+        record.note([(f"a-{k}", 1), ("a-0", 0)])
+        file.write()
+        file.write()
+        assert vars(Record.load(tmp_path / "order")) == vars(record)
+        with (tmp_path / "order").open("ab") as torn:
+            torn.write(b"a part")
+
+
+def test_the_order_of_a_run_that_ends_in_an_error_is_recorded(tmp_path: Path) -> None:
+    """So the error can be replayed."""
+    entry = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
+
+    def policy(batch: BatchedData) -> Any:
+        return np.array(
+            [[3.0 * (k == 0 and not batch.is_reset[k]), 1.0] for k in range(len(batch))]
+        )
+
+    def run(**order: Any) -> str:
+        with sync.build_env_group({**entry, "placement": "inline"}) as group:
+            collector: Any = Collector(group, policy, num_transitions=8, **order)
+            with pytest.raises(EnvRaised) as raised:
+                collector.collect()
+            return raised.value.env_id
+
+    path = tmp_path / "order"
+    assert run(record=path) == run(replay=path)
+    with sync.build_env_group({**entry, "placement": "inline"}) as group:
+        with pytest.raises(ValueError, match="record and replay exclude each other"):
+            Collector(group, policy, num_transitions=8, record=path, replay=path)
+        with pytest.raises(OSError, match="missing"):
+            Collector(group, policy, num_transitions=8, record=tmp_path / "missing" / "order")
 
 
 @given(st.data())

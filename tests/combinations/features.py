@@ -15,7 +15,8 @@ from combinations.options import NUM_ENVS, SEED, Books, Use, assert_as_played
 from combinations.played import Transition, as_tuple
 from timelines import Seen
 
-from rlightning_aio.collecting import Collector, RecordedGroup, ReplayedGroup, Rollout
+from rlightning_aio.collecting import Collector, Rollout
+from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.evaluation import evaluate
 

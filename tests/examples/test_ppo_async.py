@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from rlightning_aio.collecting import Collector, RecordedGroup, ReplayedGroup
+from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 
 if TYPE_CHECKING:
     from types import ModuleType

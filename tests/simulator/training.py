@@ -15,7 +15,8 @@ from simulator.scripted import TOKENS, Script, decoded, element, mixed, words_of
 from simulator.session import Session, action_of, stacked
 from simulator.trails import Trail, Transition
 
-from rlightning_aio.collecting import Collector, RecordedGroup, ReplayedGroup
+from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import (
     EnvFault,
     EnvRaised,

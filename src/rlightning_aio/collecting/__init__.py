@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from rlightning_aio.collecting.advantages import VTrace
 from rlightning_aio.collecting.collector import Collector
-from rlightning_aio.collecting.record import Record, RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import EndedEpisode, Lag, Rollout, Seconds
 
 __all__ = [
     "Collector",
     "EndedEpisode",
     "Lag",
-    "Record",
-    "RecordedGroup",
-    "ReplayedGroup",
     "Rollout",
     "Seconds",
     "VTrace",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
@@ -22,13 +23,14 @@ from rlightning_aio._core.group.engine.newest import newest_of
 from rlightning_aio.collecting.clock import Clock
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
-from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
+from rlightning_aio.collecting.record import Record, RecordedGroup, RecordFile, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
 from rlightning_aio.policies.random_actions import RandomPolicy
 from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Coroutine, Sequence
 
     import gymnasium as gym
@@ -75,7 +77,7 @@ class Collector(Generic[G, R]):
     With a group of `rlightning_aio.sync`, call ``collector.collect()`` without ``await``.
 
     Args:
-        group: an initialised group, or a `RecordedGroup` or `ReplayedGroup` around one.
+        group: an initialised group.
         policy: called with a batch of results (`BatchedData`); returns actions, a dict of columns
             with ``action``, or what `BatchedData.respond` returns. A column has one row for each
             result, ``[n, …]``, or for each sub-environment, ``[n, num_envs, …]``: arrays, or CPU
@@ -93,20 +95,26 @@ class Collector(Generic[G, R]):
             of the rollout, NaN where the info of a transition has no such number. A name that no
             info has had when the first episode ends is warned of.
         seed: of the first reset; see `EnvGroup.reset`.
+        record: file for the order in which results arrive, a few bytes for each; written with each
+            rollout, and when `collect` raises. An existing file is replaced.
+        replay: such a file, of a run with the same program, seeds and settings: results are taken
+            in its order, so every transition is the same, bit for bit.
 
     Attributes:
         policy_version: set it to the version of the policy. Each transition records the version
             that chose its action.
 
     Raises:
-        ValueError: a number is below 1, both `min_results` and `wait_all` are given, or a name of
-            `infos` is that of a column of every rollout.
+        ValueError: a number is below 1, both `min_results` and `wait_all` or `record` and `replay`
+            are given, a name of `infos` is that of a column of every rollout, or the file to replay
+            is none or is damaged.
+        OSError: the file to record can't be written, or the file to replay can't be read.
     """
 
     @overload
     def __init__(
         self: Collector[H, Rollout],
-        group: H | RecordedGroup[H] | ReplayedGroup[H],
+        group: H,
         policy: Callable[[BatchedData], Any] | None,
         *,
         num_transitions: int,
@@ -114,12 +122,14 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
+        record: str | os.PathLike[str] | None = None,
+        replay: str | os.PathLike[str] | None = None,
     ) -> None: ...
 
     @overload
     def __init__(
         self: Collector[H, dict[str, Rollout]],
-        group: H | RecordedGroup[H] | ReplayedGroup[H],
+        group: H,
         policy: Mapping[str, Callable[[BatchedData], Any] | None],
         *,
         num_transitions: int,
@@ -127,6 +137,8 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
+        record: str | os.PathLike[str] | None = None,
+        replay: str | os.PathLike[str] | None = None,
     ) -> None: ...
 
     def __init__(
@@ -139,6 +151,8 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
+        record: str | os.PathLike[str] | None = None,
+        replay: str | os.PathLike[str] | None = None,
     ) -> None:
         for name, number in (("num_transitions", num_transitions), ("min_results", min_results)):
             if number is not None and number < 1:
@@ -150,7 +164,7 @@ class Collector(Generic[G, R]):
         for name in (OWN_NAMES | {"action"}).intersection(infos):
             raise ValueError(f"infos: a rollout already has {name!r}; rename the env's info")
         self.policy_version = 0
-        self._group = group
+        self._group, self._order = _in_order(group, record, replay)
         self._infos = infos
         self._are_infos_known = not infos
         self._policy: Any = policy
@@ -197,6 +211,8 @@ class Collector(Generic[G, R]):
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
                 takes part again in the next call, and one whose worker is not replaced doesn't.
             RLightningError: a robot's or a client's env has raised and was not reset since.
+            ReplayDiverged: the results are not those of `replay`, or it has ended.
+            OSError: the order can't be written to `record`; the next call tries again.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """
         group = self._group
@@ -225,6 +241,7 @@ class Collector(Generic[G, R]):
                         self._received = None
                     if not self._store():
                         yield BREAK  # After this, it would wait for the learner's next collect.
+                        self._write_order()
                         return self._full()
                     if not is_resumed:
                         self._resume()
@@ -234,9 +251,17 @@ class Collector(Generic[G, R]):
                     while self._unanswered:
                         yield from self._answer(self._unanswered[0])
                     yield from self._wait()
+            except BaseException:
+                with suppress(OSError):
+                    self._write_order()
+                raise
             finally:
                 self._collecting = False
                 self._clock.leave()
+
+    def _write_order(self) -> None:
+        if self._order is not None:
+            self._order.write()
 
     def _wait(self) -> Procedure[None]:
         """Wait for the next results."""
@@ -543,3 +568,17 @@ def _newest_parts(parts: list[Part], newest: Newest) -> list[Part]:
 
 def _is_server(meta: EnvMeta) -> bool:
     return meta.observation_space is None
+
+
+def _in_order(
+    group: Any, record: str | os.PathLike[str] | None, replay: str | os.PathLike[str] | None
+) -> tuple[Any, RecordFile | None]:
+    """Return `group`, or one around it that records or replays the order of its results."""
+    if record is not None and replay is not None:
+        raise ValueError("record and replay exclude each other: give one of them")
+    if replay is not None:
+        return ReplayedGroup(group, Record.load(replay)), None
+    if record is None:
+        return group, None
+    recorded = RecordedGroup(group)
+    return recorded, RecordFile(recorded.record, record)

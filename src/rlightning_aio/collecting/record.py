@@ -1,4 +1,4 @@
-"""Records the order of a group's results, and replays it.
+"""Records the order of a group's results, and replays it, for a `Collector`.
 
 With the same seeds and the same policy, everything else follows from that order, so an asynchronous
 run can be repeated bit for bit. Both groups here wrap an `EnvGroup` and have all of its methods.
@@ -25,15 +25,20 @@ from rlightning_aio.files import write_file
 from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Iterable
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["Record", "RecordedGroup", "ReplayedGroup"]
+__all__ = ["Record", "RecordFile", "RecordedGroup", "ReplayedGroup"]
 
 G = TypeVar("G", AsyncEnvGroup, SyncEnvGroup)
 
-_BEGINNING: Final = b"rlightning-aio record 2\n"
+_BEGINNING: Final = b"rlightning-aio record 3\n"
+_START: Final = len(seal(_BEGINNING, b""))
+_BLOCK: Final = b"block"
+_SIZE: Final = 8
+"""Bytes of a number before each block: that of the block's bytes."""
 _HEAD: Final = struct.Struct("<QQ")
 _STEP, _RESET, _RESTARTED, _FAULT = range(4)
 _NAMES: Final = ("a step", "a reset", "the first result of a replaced worker", "an error")
@@ -44,7 +49,7 @@ _COLLECT: Final = inspect.signature(SyncEnvGroup.collect_async)
 class Record:
     """The order of results, call by call: four bytes for each result, and for each call.
 
-    It can be saved, loaded and pickled.
+    A `RecordFile` saves it.
     """
 
     def __init__(self) -> None:
@@ -78,36 +83,80 @@ class Record:
         """Number of entries: one for each call, and one for each result."""
         return len(self._entries)
 
-    def save(self, path: str | Path) -> None:
-        """Write the record to a file, atomically.
+    def since(self, calls: int, names: int, entries: int) -> bytes:
+        """Return what was added to a record that had so many calls, env ids and entries."""
+        new_names = "\n".join(self._env_ids[names:]).encode()
+        head = _HEAD.pack(self.num_calls - calls, len(new_names))
+        new = self._entries[entries:]
+        return head + new_names + struct.pack(f"<{len(new)}I", *new)
 
-        Raises:
-            OSError: the file can't be written.
-        """
-        names = "\n".join(self._env_ids).encode()
-        head = _HEAD.pack(self.num_calls, len(names))
-        entries = struct.pack(f"<{len(self._entries)}I", *self._entries)
-        write_file(path, seal(_BEGINNING, head + names + entries))
+    def sizes(self) -> tuple[int, int, int]:
+        """Return the numbers of calls, env ids and entries."""
+        return self.num_calls, len(self._env_ids), len(self._entries)
+
+    def add(self, content: bytes) -> None:
+        """Add what `since` returned."""
+        calls, length = _HEAD.unpack_from(content)
+        names, entries = content[_HEAD.size :][:length], content[_HEAD.size + length :]
+        for env_id in filter(None, names.decode().split("\n")):
+            self._number(env_id)
+        self._entries.extend(struct.unpack(f"<{len(entries) // 4}I", entries))
+        self.num_calls += calls
 
     @classmethod
-    def load(cls, path: str | Path) -> Record:
-        """Read a record that was written by `save`.
+    def load(cls, path: str | os.PathLike[str]) -> Record:
+        """Read the record that a `RecordFile` has written.
 
         Raises:
             ValueError: the file holds something else, or was changed or truncated.
             OSError: the file can't be read.
         """
+        record = cls()
+        data = Path(path).read_bytes()
         try:
-            content = unseal(_BEGINNING, Path(path).read_bytes())
+            unseal(_BEGINNING, data[:_START])
+            place = _START
+            while place < len(data):
+                size = int.from_bytes(data[place : place + _SIZE], "little")
+                end = place + _SIZE + size
+                record.add(unseal(_BLOCK, data[place + _SIZE : end]))
+                place = end
         except ValueError as error:
             raise ValueError(f"the record in {path} can't be replayed: it {error}") from None
-        record = cls()
-        record.num_calls, length = _HEAD.unpack_from(content)
-        names, entries = content[_HEAD.size :][:length], content[_HEAD.size + length :]
-        for env_id in filter(None, names.decode().split("\n")):
-            record._number(env_id)
-        record._entries.extend(struct.unpack(f"<{len(entries) // 4}I", entries))
         return record
+
+
+class RecordFile:
+    """Writes a record to a file while it grows.
+
+    Args:
+        record: not yet written anywhere.
+        path: an existing file is replaced.
+
+    Raises:
+        OSError: the file can't be written.
+    """
+
+    def __init__(self, record: Record, path: str | os.PathLike[str]) -> None:
+        self._record, self._path = record, Path(path).absolute()
+        write_file(self._path, seal(_BEGINNING, b""))
+        self._size, self._written = _START, (0, 0, 0)
+
+    def write(self) -> None:
+        """Add what is new; if that fails, the next call does it.
+
+        Raises:
+            OSError: it can't be written.
+        """
+        sizes = self._record.sizes()
+        if sizes == self._written:
+            return
+        block = seal(_BLOCK, self._record.since(*self._written))
+        with self._path.open("r+b") as file:
+            file.seek(self._size)
+            file.write(len(block).to_bytes(_SIZE, "little") + block)
+            file.truncate()
+        self._size, self._written = self._size + _SIZE + len(block), sizes
 
 
 class _WrappedGroup(Generic[G]):
