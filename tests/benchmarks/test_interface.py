@@ -8,9 +8,9 @@ from pathlib import Path
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "interface.py"
 MOST = {
-    "names": 81,
-    "members": 358,
-    "arguments": 417,
+    "names": 78,
+    "members": 350,
+    "arguments": 408,
     "fields": 26,
     "commands": 10,
     "options": 33,
