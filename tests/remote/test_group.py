@@ -19,7 +19,7 @@ from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
-from rlightning_aio import registry, sync
+from rlightning_aio import BatchedData, registry, sync
 from rlightning_aio.errors import (
     BadAction,
     ClientRefused,
@@ -116,17 +116,36 @@ def test_results_have_the_time_of_their_clients_clock() -> None:
         group.close()
 
 
-def test_a_step_of_a_client_must_be_asynchronous() -> None:
-    """The message names the calls to use."""
+def test_a_step_of_clients_waits_for_their_answers() -> None:
+    """In the given order, beside local envs, and by a handle."""
     with (
-        sync.build_env_group(entry()) as group,
-        clients(group, CountingEnv()),
+        sync.build_env_group([entry(min_clients=2), CARTPOLE], mixed_actions=True) as group,
+        clients(group, CountingEnv(), CountingEnv()),
     ):
+        parts = group.reset()[0].by_entry()
+        robots = parts["robots"].respond(action=np.zeros((2, 2), np.float32))
+        poles = parts["pole"].respond(action=np.zeros(2, int))
+        mixed = BatchedData([*robots.ids(), *poles.ids()], [*robots.values(), *poles.values()])
+        for count in (1.0, 2.0):
+            batch, flags = group.step(mixed)
+            assert batch.env_ids() == [*robots.env_ids(), "pole-0", "pole-1"]
+            assert flags is None
+            seen = [ret.observation.tolist()[2] for ret in batch.values()[:2]]
+            assert seen == [count] * 2
+        ret = group["robots-0"].step(robots.values()[1])
+        assert (ret.env_id, ret.observation.tolist()[2]) == (robots.env_ids()[1], 3.0)
+        group.close()
+
+
+def test_a_step_of_a_client_that_is_lost_ends_with_a_marked_result() -> None:
+    """The caller that waits isn't left waiting."""
+    robot = CountingEnv()
+    with sync.build_env_group(entry()) as group, clients(group, robot):
         batch, _ = group.reset()
-        with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
-            group.step(batch.respond(action=actions(batch)))
-        with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
-            group["robots-0"].step(batch.respond(action=actions(batch)).values()[0])
+        robot.finished = True
+        batch, _ = group.step(batch.respond(action=actions(batch)))
+        assert batch.truncated.tolist() == [True]
+        assert "client_lost" in batch.info()[0] or "session_lost" in batch.info()[0]
         group.close()
 
 

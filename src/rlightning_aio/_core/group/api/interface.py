@@ -78,7 +78,7 @@ class GroupInterface(Facade):
 
         Args:
             batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
-                `PolicyResponse` values; any of the local envs, in any order.
+                `PolicyResponse` values; any of the envs, in any order.
 
         Returns results with the same ids in the same order, in fresh arrays (views, if the
         group was built with ``zero_copy``), and None; inside `auto_reset` a flag for each
@@ -90,8 +90,7 @@ class GroupInterface(Facade):
                 batch. Nothing was sent.
             EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
-            NotImplementedError: the env is a client's, which answers when it can.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
+            EnvRaised, EnvAway, WorkerDied, EnvHung: an env failed; the others' results are in the
                 error's ``results``.
             GroupClosed: the group was not initialised, or is closed.
         """
@@ -460,12 +459,6 @@ class ServerHandleInterface(EnvHandleInterface):
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError
-
-    def step(self, response: PolicyResponse | Any) -> Any:
-        """Raise NotImplementedError, because remote envs answer when they can."""
-        raise NotImplementedError(
-            f"{self.env_id} is an env_server; use the group's step_async and collect_async"
-        )
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Raise NotImplementedError, because methods of remote envs can't be called."""

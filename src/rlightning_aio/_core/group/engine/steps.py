@@ -170,7 +170,7 @@ class Steps:
         """Send a batch of steps and wait for all of them."""
         began = now
         try:
-            slots, packed = self._write(batch, now, is_local=True)
+            slots, packed = self._write(batch, now)
             at_once = self._alone is not None and len(slots) > 0
             if at_once and not (self._conditions.unusual or self._continuity.due[0]):
                 self._step_at_once(now)
@@ -244,15 +244,12 @@ class Steps:
 
     # -- check, write, send -----------------------------------------------------------
 
-    def _write(
-        self, batch: BatchedData, now: float, *, is_local: bool = False
-    ) -> tuple[NDArray[np.intp], Packed | None]:
+    def _write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Write the actions of a batch into the rows of its envs, all of which are idle.
 
         Args:
             batch: of responses.
             now: monotonic seconds.
-            is_local: refuse envs of clients.
 
         Returns their slots, and what goes out of band.
 
@@ -263,10 +260,10 @@ class Steps:
             self._intake.drain()
         answer = None if self._conditions.unusual else answer_of(batch, self._group)
         if answer is None:
-            return self._write_any(batch, now, is_local=is_local)
+            return self._write_any(batch, now)
         slots, columns = answer
         if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
-            return self._write_any(batch, now, is_local=is_local)
+            return self._write_any(batch, now)
         slab = self._layout.slabs[0]
         rows: Rows = self._all_rows if slots is self._envs.all else slots
         action = columns["action"]
@@ -280,13 +277,9 @@ class Steps:
         self._results.note_sent(slots, columns)
         return slots, None
 
-    def _write_any(
-        self, batch: BatchedData, now: float, *, is_local: bool
-    ) -> tuple[NDArray[np.intp], Packed | None]:
+    def _write_any(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Do the same for any batch."""
         slots = self._slots_of(batch)
-        if is_local:
-            self._dispatch.check_local(slots, "step")
         self._intake.now = now
         if self._supervisor.members.possible:
             batch, slots = self._arrivals.without_gone(batch, slots)
