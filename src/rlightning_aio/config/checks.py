@@ -100,7 +100,7 @@ def _check_backend(config: EnvConfig) -> str | None:
 def _check_task(config: EnvConfig) -> str | None:
     task = config.task
     if isinstance(task, str):
-        if task.endswith((".yaml", ".yml")):
+        if config.backend in MADE_BY_GYMNASIUM and task.endswith((".yaml", ".yml")):
             return f"should be a name, got {task!r}; load_config reads files"
         if config.backend == CALLABLE and not all(task.partition(":")):
             return f"should be a callable or look like module:function, got {task!r}"
