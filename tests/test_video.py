@@ -274,6 +274,17 @@ def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -
     assert films(tmp_path / "taken") == {"env-0-episode-0.mp4": [0, 1, 2, 3]}
 
 
+def test_all_local_envs_are_filmed_by_default(tmp_path: Path) -> None:
+    """Those of clients belong to an env_server, which films none."""
+    server = {"name": "robots", "backend": "env_server"}
+    with sync.build_env_group([entry(Brighter) | {"num_workers": 2}, server]) as group:
+        group.record_video(tmp_path)
+        batch, _ = group.reset(env_ids=["env-0", "env-1"])
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=[0, 0]))
+    assert films(tmp_path) == {f"env-{k}-episode-0.mp4": [0, 1, 2, 3] for k in range(2)}
+
+
 def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
     """With all earlier frames; the replacement isn't filmed."""
     with two() as group:

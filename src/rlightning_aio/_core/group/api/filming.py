@@ -46,7 +46,7 @@ def video_of(
 
 def film(core: Core, env_ids: Sequence[str] | None, video: VideoConfig | None) -> Procedure[None]:
     """Let envs begin to film, or end it; if one of them can't, none films."""
-    ids = core.envs.env_ids if env_ids is None else dict.fromkeys(env_ids)
+    ids = core.envs.local_ids if env_ids is None else dict.fromkeys(env_ids)
     slots = [core.envs.find_one(env_id) for env_id in ids]
     for place, slot in enumerate(slots):
         try:
