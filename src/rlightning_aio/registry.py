@@ -33,6 +33,7 @@ __all__ = [
     "Placement",
     "Registry",
     "did_you_mean",
+    "is_mujocos",
     "is_of_simulator",
     "load",
     "placement_of",
@@ -159,6 +160,11 @@ def is_of_simulator(spec: EnvSpec) -> bool:
     made_by = spec.entry_point if spec.entry_point is not None else spec.vector_entry_point
     module = made_by if isinstance(made_by, str) else getattr(made_by, "__module__", "")
     return module.partition(":")[0].partition(".")[0] in _SIMULATORS_CODE
+
+
+def is_mujocos(spec: EnvSpec) -> bool:
+    """Return True for one of Gymnasium's MuJoCo tasks."""
+    return str(spec.entry_point).startswith("gymnasium.envs.mujoco")
 
 
 def _is_simulators(task: Any) -> bool:

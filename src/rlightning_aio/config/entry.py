@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
-from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, name_of, placement_of
+from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, is_mujocos, name_of, placement_of
 from rlightning_aio.sharing import num_batches, num_cores
 
 __all__ = [
@@ -263,8 +263,7 @@ def _backend_of(task: Any) -> str:
     import gymnasium  # noqa: PLC0415  # Workers are given their backend.
 
     spec = gymnasium.registry.get(task)
-    is_mujoco = spec is not None and str(spec.entry_point).startswith("gymnasium.envs.mujoco")
-    return "mujoco" if is_mujoco else "gymnasium"
+    return "mujoco" if spec is not None and is_mujocos(spec) else "gymnasium"
 
 
 def _name_of(task: Any, backend: object) -> str:

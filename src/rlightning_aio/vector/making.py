@@ -12,7 +12,7 @@ from rlightning_aio.envs.mujoco.of_spec import BatchOf, OneOf, VectorOf
 from rlightning_aio.envs.mujoco.tasks import is_batched
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import PLACEMENTS
+from rlightning_aio.registry import PLACEMENTS, is_mujocos
 from rlightning_aio.sharing import check_threads, num_batches, num_cores
 from rlightning_aio.vector.env import VectorEnv, per_worker
 from rlightning_aio.vector.reset_arguments import checked_mode
@@ -199,5 +199,4 @@ def _laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, 
 def imports_of(spec: EnvSpec) -> dict[str, Any]:
     """Fields that an entry of the task needs."""
     # Imported before the first env is made, mujoco doesn't warn each time that assets are old.
-    is_mujoco = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
-    return {"imports": ("mujoco",)} if is_mujoco else {}
+    return {"imports": ("mujoco",)} if is_mujocos(spec) else {}
