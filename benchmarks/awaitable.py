@@ -38,9 +38,7 @@ from waiting import MEAN, Awaiting, Sleeping
 import rlightning_aio as rl
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from rlightning_aio import EnvEpisode
+    from collections.abc import Callable, Sequence
 
 ENVS, PROCESSES, MANY, AGENTS = 1000, 100, 10_000, 2000
 ROUNDS, SECONDS = 5, 8.0
@@ -145,6 +143,21 @@ class InGroup(Way):
         super().teardown()
 
 
+async def steps_of_all(envs: Sequence[Any], seconds: float) -> int:
+    """Step each of `envs` in a coroutine of its own; count all steps but the first of each."""
+    until = time.perf_counter() + seconds
+
+    async def play(env: Any) -> int:
+        steps = 0
+        await env.step(0)
+        while time.perf_counter() < until:
+            steps += 1
+            await env.step(0)
+        return steps
+
+    return sum(await asyncio.gather(*map(play, envs)))
+
+
 @dataclass
 class Episodes(InGroup):
     """A coroutine for each env of the group, which plays one episode of it."""
@@ -157,17 +170,7 @@ class Episodes(InGroup):
         await asyncio.gather(*(episode.__aenter__() for episode in self.episodes))
 
     async def _play(self, seconds: float) -> tuple[float, int]:
-        until = time.perf_counter() + seconds
-
-        async def play(episode: EnvEpisode) -> int:
-            steps = 0
-            await episode.step(0)
-            while time.perf_counter() < until:
-                steps += 1
-                await episode.step(0)
-            return steps
-
-        steps = sum(await asyncio.gather(*map(play, self.episodes)))
+        steps = await steps_of_all(self.episodes, seconds)
         return steps / seconds, steps + self.count
 
 
@@ -186,17 +189,7 @@ class Gather(Way):
         return self.runner.run(self._play(seconds))
 
     async def _play(self, seconds: float) -> tuple[float, int]:
-        until = time.perf_counter() + seconds
-
-        async def episode(env: Awaiting) -> int:
-            steps = 0
-            await env.step(0)
-            while time.perf_counter() < until:
-                steps += 1
-                await env.step(0)
-            return steps
-
-        steps = sum(await asyncio.gather(*(episode(env) for env in self.envs)))
+        steps = await steps_of_all(self.envs, seconds)
         return steps / seconds, steps + self.count
 
 
