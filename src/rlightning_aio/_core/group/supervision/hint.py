@@ -123,15 +123,21 @@ class Hints:
         if is_last:
             self._look_at_latencies(stats, num_cores)
 
+    def _last_look(self, name: str, now: _Since) -> _Since | None:
+        """Return when an entry was looked at last; None if it was warned of or begins anew."""
+        since = self._since.get(name)
+        if since is not None and since.restarts == now.restarts:
+            return since
+        if since is not None or name not in self._since:
+            self._since[name] = now
+        return None
+
     def _look_at(
         self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
     ) -> None:
         """Warn if envs that share workers wait."""
-        now, since = _now(records), self._since.get(name)
-        if now is None or (since is None and name in self._since):
-            return
-        if since is None or since.restarts != now.restarts:
-            self._since[name] = now
+        now = _now(records)
+        if now is None or (since := self._last_look(name, now)) is None:
             return
         spent = _spent(records, stats, since, now)
         if not spent.is_enough:
@@ -148,12 +154,9 @@ class Hints:
         self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
     ) -> None:
         """Warn if envs that have a worker each make steps so short that sharing is faster."""
-        restarts, since = [record.restarts for record in records], self._since.get(name)
-        if since is None and name in self._since:
-            return
-        now_ns = time.monotonic_ns()
-        if since is None or since.restarts != restarts:
-            self._since[name] = _Since(now_ns, restarts, 0, 0)
+        restarts = [record.restarts for record in records]
+        since = self._last_look(name, _Since(time.monotonic_ns(), restarts, 0, 0))
+        if since is None:
             return
         slots, begun, done = stats.executed(since.at_ns)
         own = np.isin(slots, [record.slots.start for record in records])
