@@ -77,7 +77,7 @@ class RandomPolicy:
     def _meet(self, env_id: str, batch: BatchedData, row: int) -> Sampler:
         space = self._space_of(env_id)
         if space is None:
-            raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
+            raise ConfigError(f"env {env_id!r} reports no action space; give a policy")
         sampler = next((sampler for known, sampler in self._kinds if known == space), None)
         if sampler is None:
             sampler = sampler_of(space, self._rng)

@@ -230,7 +230,8 @@ class Steps:
 
     def _check_possible(self, total: int) -> None:
         """Raise the collector's oldest error, or else if no result can come."""
-        for fault in self._requests.collector.faults:
+        fault = next(iter(self._requests.collector.faults), None)
+        if fault is not None:
             self.note_raised(fault)
             raise fault
         if not total and not self._supervisor.members.possible:
