@@ -1,7 +1,7 @@
 # The two commands of the README are `make run` and `make test`; `make help` lists the rest.
 # Every target makes the virtual environment it needs, once, and again only after pyproject.toml,
-# constraints.txt or the compiled kernel changed. Without a C compiler, Python twins take the
-# kernel's place (CC=/bin/false make test).
+# constraints.txt, requirements/ or the compiled kernel changed. Without a C compiler, Python twins
+# take the kernel's place (CC=/bin/false make test).
 
 # The versions in constraints.txt were resolved for Python 3.11; later ones work as well.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -52,7 +52,7 @@ test-programs: $(VENV)/installed-test ## the tests of the command line, benchmar
 # No stamp: what is newest changes every day.
 test-newest: PY := $(NEWEST)/bin/python
 test-newest: | $(NEWEST)/bin/python ## all of these tests, with the newest versions that pyproject.toml allows
-	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager --editable '.[test]'
+	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager --editable . --requirement requirements/test.txt
 	$(PY) -m pip list --disable-pip-version-check
 	$(PYTEST)
 
@@ -170,25 +170,26 @@ clean: ## remove the virtual environments and every cache
 	@$(PYTHON) -m venv $* \
 	    || { rm -rf $*; echo 'On Debian: apt install python3-venv' >&2; exit 1; }
 
-# Each stamp is one set of extras. Only the stamp that is asked for is brought up to date,
-# so `make run` never waits for the test tools.
-$(VENV)/installed: extras :=
-$(VENV)/installed-test: extras := [test]
-$(VENV)/installed-check: extras := [test,check]
-$(VENV)/installed-bench: extras := [bench]
-$(VENV)/installed-docs: extras := [test,docs]
-$(VENV)/installed-ray: extras := [test,ray]
-$(VENV)/installed-release: extras := [test,release]
+# Each stamp is one set of tools (requirements/) and extras. Only the stamp that is asked for is
+# brought up to date, so `make run` never waits for the test tools.
+$(VENV)/installed-test: tools := test
+$(VENV)/installed-check: tools := test check
+$(VENV)/installed-bench: tools := bench
+$(VENV)/installed-docs: tools := test docs
+$(VENV)/installed-ray: tools := test
+$(VENV)/installed-ray: extras := [ray]
+$(VENV)/installed-release: tools := test release
+$(SIMULATORS)/installed: tools := test examples notebook
+$(SIMULATORS)/installed: extras := [ale,envpool,maniskill,pettingzoo,piper,sb3,torchrl,websockets]
 # Two libraries whose pages it runs, too.
 $(SIMULATORS)/installed: pages := skrl tianshou
-$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,openenv,pettingzoo,piper,sb3,torchrl]
 # What an installation is made from.
-SOURCES := pyproject.toml setup.py constraints.txt $(wildcard src/rlightning_aio/*/*.c)
+SOURCES := pyproject.toml setup.py constraints.txt $(wildcard requirements/*.txt src/rlightning_aio/*/*.c)
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
 $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(STAMPS) $(SIMULATORS)/installed: $(SOURCES)
-	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)' $(pages)
+	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)' $(tools:%=--requirement requirements/%.txt) $(pages)
 	@touch $@
 
 # It pins versions that nobody else does, of which its vector environments need none. Where it
@@ -215,17 +216,19 @@ $(LEROBOT)/installed: pyproject.toml integrations/lerobot/pyproject.toml | $(LER
 	$(PIP_INSTALL) --no-deps ./integrations/lerobot
 	@touch $@
 
-$(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python
+$(RLLIB)/installed: pyproject.toml constraints.txt requirements/test.txt | $(RLLIB)/bin/python
 	grep -v '^gymnasium==' constraints.txt > $(RLLIB)/constraints.txt
-	$(PIP_INSTALL) --constraint $(RLLIB)/constraints.txt --editable '.[ray,test]' 'ray[rllib]' torch
+	$(PIP_INSTALL) --constraint $(RLLIB)/constraints.txt --editable '.[ray]' \
+	    --requirement requirements/test.txt 'ray[rllib]' torch
 	@touch $@
 
-$(PEERS_VENV)/installed: pyproject.toml constraints.txt | $(PEERS_VENV)/bin/python
-	$(PIP_INSTALL) --constraint constraints.txt --editable '.[ale,examples,sb3,test]' box2d hydra-core moviepy pandas
+$(PEERS_VENV)/installed: pyproject.toml constraints.txt requirements/test.txt | $(PEERS_VENV)/bin/python
+	$(PIP_INSTALL) --constraint constraints.txt --editable '.[ale,sb3]' \
+	    --requirement requirements/test.txt --requirement requirements/examples.txt box2d hydra-core moviepy pandas
 	@touch $@
 
-$(ISAAC)/installed: pyproject.toml tests/simulators/isaac.txt | $(ISAAC)/bin/python
+$(ISAAC)/installed: pyproject.toml requirements/test.txt tests/simulators/isaac.txt | $(ISAAC)/bin/python
 	$(PIP_INSTALL) --requirement tests/simulators/isaac.txt
 	$(PIP_INSTALL) --ignore-requires-python --no-deps isaaclab==3.0.0
-	$(PIP_INSTALL) --editable '.[isaac,test]'
+	$(PIP_INSTALL) --editable '.[isaac]' --requirement requirements/test.txt
 	@touch $@

@@ -1,6 +1,6 @@
 """Train with every training example for a few minutes, and keep the learning curves.
 
-    python benchmarks/curves.py            # four runs, some ten minutes; needs the extra `examples`
+    python benchmarks/curves.py            # four runs, ten minutes; requirements/examples.txt
     python benchmarks/curves.py sac        # one of them
 
 Writes `results/curves.json`, and `results/curves.png` where matplotlib is installed. The curves

@@ -3,7 +3,7 @@
 Gymnasium's AsyncVectorEnv with shared memory and its SyncVectorEnv, Stable-Baselines3's
 SubprocVecEnv, Tianshou's ShmemVectorEnv, TorchRL's ParallelEnv and AsyncEnvPool, PufferLib's
 multiprocessing backend, EnvPool, a plain loop in one process, and this library. Peers that aren't
-installed are left out: pip install 'rlightning-aio[bench]' brings all but PufferLib, which `make
+installed are left out: pip install -r requirements/bench.txt brings all but PufferLib, which `make
 bench` adds. Gymnasium is always there. `stragglers.py` compares them with uneven step times.
 """
 

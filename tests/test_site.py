@@ -52,7 +52,7 @@ new Promise(done => {
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if find_spec("mkdocs") is None:
-        pytest.skip("mkdocs is not installed: pip install '.[docs]'")
+        pytest.skip("mkdocs is not installed: pip install -r requirements/docs.txt")
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True)

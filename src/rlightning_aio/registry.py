@@ -144,7 +144,7 @@ BACKENDS: dict[str, Backend] = {
         Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
                 extra="aloha", cpu_bound=True, preload=(f"{_SIMULATORS}.lerobot_tasks",)),
         Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets", "websockets",
-                extra="openenv", awaitable=True),
+                extra="websockets", awaitable=True),
     )
 }
 # fmt: on

@@ -14,7 +14,7 @@ MOST = {
     "fields": 26,
     "commands": 10,
     "options": 33,
-    "extras": 23,
+    "extras": 15,
 }
 
 

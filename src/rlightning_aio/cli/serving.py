@@ -55,7 +55,7 @@ async def _serve(config: EnvConfig, host: str, port: int, session_timeout: float
     try:
         from rlightning_aio.serving import OpenEnvServer  # noqa: PLC0415
     except ImportError as error:
-        raise ConfigError(f"{error}: pip install 'rlightning-aio[openenv]'") from error
+        raise ConfigError(f"{error}: pip install 'rlightning-aio[websockets]'") from error
     async with (
         rlightning_aio.build_env_group(config) as group,
         OpenEnvServer(group, config.name, host, port, session_timeout=session_timeout) as server,
