@@ -1,0 +1,169 @@
+"""What does a step cost the trainer's thread, outside of the part that all cores share?
+
+More cores shorten the simulations, not this part. It is the thread's own processor time
+(`time.thread_time`), so other programs hardly matter. Of `make_vec`, calls of MuJoCo's batches are
+left out; of EnvPool, whose simulations run in threads of their own, all of the main thread counts,
+short spinning for results included. The second table is a model, not a measurement: a step of all
+takes the trainer's part, and all other processor time divided by the cores.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from typing import TYPE_CHECKING, Any
+
+from contenders import EnvPool, MakeVec, Work
+from harness import Contender, arguments, machine_facts, modules_of, number_text, say, take_turns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+WORKS = {
+    ("HalfCheetah-v5", 32): 0.75,
+    ("HalfCheetah-v5", 256): 0.5,
+    ("HalfCheetah-v5", 1024): 0.5,
+    ("Hopper-v5", 256): 0.5,
+    ("Ant-v5", 256): 0.5,
+    ("Humanoid-v5", 256): 0.5,
+}
+"""The maximum ratio to EnvPool of a task and a number of simulations."""
+MODELLED = (16, 64, 128)
+"""Numbers of cores of the model."""
+PARALLEL = ("mjb_step", "mjb_apply", "mjb_forward", "mjb_reset")
+"""Calls that MuJoCo's threads share."""
+WARM_UP = 60
+"""Steps before the first round, after which falls no longer come all at once."""
+
+
+class Serial:
+    """A contender whose rounds return the trainer's µs in a step of all, and steps per second."""
+
+    step: Callable[[], int]
+    _inside = 0.0
+
+    def prepare(self) -> None:
+        for _ in range(WARM_UP):
+            self.step()
+
+    def round(self, seconds: float) -> tuple[float, float]:
+        for _ in range(3):
+            self.step()
+        count, began, self._inside = 0, time.perf_counter(), 0.0
+        busy = time.thread_time()
+        while time.perf_counter() < began + seconds:
+            self.step()
+            count += 1
+        busy = time.thread_time() - busy - self._inside
+        return 1e6 * busy / count, count / (time.perf_counter() - began)
+
+
+class Ours(Serial, MakeVec):
+    """`make_vec`, with MuJoCo's parallel calls left out."""
+
+    def setup(self) -> None:
+        from rlightning_aio.envs.mujoco import threads
+
+        library = threads._library()  # noqa: SLF001  # As its calls are timed.
+        for name in PARALLEL:
+            setattr(library, name, self._timed(getattr(library, name)))
+        super().setup()
+        self.prepare()
+
+    def _timed(self, call: Callable[..., int]) -> Callable[..., int]:
+        def timed(*args: Any) -> int:
+            began = time.thread_time()
+            found = call(*args)
+            self._inside += time.thread_time() - began
+            return found
+
+        return timed
+
+
+class Pool(Serial, EnvPool):
+    """EnvPool's main thread."""
+
+    def setup(self) -> None:
+        super().setup()
+        self.prepare()
+
+
+def name_of(task: str, count: int) -> str:
+    return f"{task.removesuffix('-v5')} x {count:,}"
+
+
+contenders: list[Contender] = []
+for task, count in WORKS:
+    work = Work(task, count, backend="mujoco")
+    contenders += [
+        Ours(f"make_vec, {name_of(task, count)}", work),
+        Pool(f"EnvPool, {name_of(task, count)}", work),
+    ]
+
+
+def medians(rounds: list[tuple[Any, Any]]) -> tuple[float, float]:
+    """µs of the trainer and other µs of processor time, in a step of all."""
+    outside = statistics.median(value[0] for value, _ in rounds)
+    all_us = statistics.median(1e6 * load.cores / value[1] for value, load in rounds)
+    return outside, all_us - outside
+
+
+def serial_tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
+    """Return the measured table, and the model."""
+    lines = [
+        "| Trainer's µs in a step of all | make_vec | EnvPool | ratio | low to high | target | |",
+        "|---|---:|---:|---:|---:|---:|---|",
+    ]
+    model = [
+        "| model, not measured: env steps/s | "
+        + " | ".join(f"{cores} cores" for cores in MODELLED)
+        + " |",
+        "|---|" + "---:|" * len(MODELLED),
+    ]
+    for (task, count), bound in WORKS.items():
+        pair = [
+            turns.get(f"{kind}, {name_of(task, count)}", []) for kind in ("make_vec", "EnvPool")
+        ]
+        values = [[value[0] for value, _ in rounds] for rounds in pair]
+        texts = [number_text(statistics.median(found)) if found else "" for found in values]
+        ratios = [ours / theirs for ours, theirs in zip(*values, strict=False)]
+        judged = "| | | |"
+        if ratios:
+            middle = statistics.median(ratios)
+            met = "met" if middle <= bound else "missed"
+            judged = f"{middle:.2f} | {min(ratios):.2f} to {max(ratios):.2f} | ≤ {bound} | {met} |"
+        lines.append(f"| {name_of(task, count)} | {' | '.join(texts)} | {judged}")
+        for kind, rounds in zip(("make_vec", "EnvPool"), pair, strict=True):
+            if rounds:
+                outside, rest = medians(rounds)
+                rates = (number_text(1e6 * count / (outside + rest / n)) for n in MODELLED)
+                model.append(f"| {kind}, {name_of(task, count)} | {' | '.join(rates)} |")
+    return "\n".join([*lines, "", *model])
+
+
+def main() -> None:
+    args = arguments(__doc__, 7, 1.0)
+    machine = machine_facts(modules_of(contenders))
+    turns, skipped = take_turns(
+        contenders, args.rounds, args.seconds, args.only, lambda found: f"{found[0]:.0f} µs"
+    )
+    report = {
+        "name": "serial",
+        "title": "The trainer's thread in a step",
+        "rounds": args.rounds,
+        "machine": machine,
+        "results": {
+            name: dict(zip(("outside_us", "other_us"), medians(rounds), strict=True))
+            for name, rounds in turns.items()
+        },
+        "tables": serial_tables(turns),
+        "skipped": skipped,
+    }
+    say(report["tables"])
+    if args.json:
+        args.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
