@@ -66,12 +66,12 @@ for (task, count), (pool, half_of_pool) in FIGURES.items():
 
 cheetahs = Work("HalfCheetah-v5", 32, backend="mujoco")
 made = MakeVec("make_vec, HalfCheetah x 32", cheetahs)
-# Two batches, one of them in a worker: the layout before MuJoCo had its own threads.
-former = MakeVec("make_vec, placement split, HalfCheetah x 32", cheetahs, {"placement": "split"})
+# A batch in each of as many workers as cores: the layout before MuJoCo had its own threads.
+former = MakeVec("make_vec in workers, HalfCheetah x 32", cheetahs, {"placement": "process"})
 against(made, former, 1.5)
 against(made, GymnasiumAsync("Gymnasium AsyncVectorEnv, 32 HalfCheetahs", cheetahs), 4.0)
 
-carts = Work("CartPole-v1", 1024, together=1024 // CORES, placement="split")
+carts = Work("CartPole-v1", 1024, together=1024 // CORES)
 against(
     OursSync("rlightning_aio, CartPole x 1,024", carts),
     VectorEntryPoint("Gymnasium's vector_entry_point, CartPole x 1,024", carts),

@@ -156,10 +156,8 @@ def learn(
 
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
-    # MuJoCo's threads step its simulations in this process; of others it steps a share itself.
-    entry = {} if args.backend == "mujoco" else {"placement": "split"}
     run = Run(args.total_steps, args.folder, args.resume)
-    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **entry)
+    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep")
     with closing(envs):
         group = envs.group
         observations, actions = envs.single_observation_space, envs.single_action_space

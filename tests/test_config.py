@@ -344,7 +344,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         (
             "placement",
             "inlin",
-            "should be 'process', 'loop', 'inline', 'split' or 'ray', got 'inlin'",
+            "should be 'process', 'loop', 'inline' or 'ray', got 'inlin'",
         ),
         ("on_worker_death", "ignore", "should be 'restart', 'raise' or 'resume', got 'ignore'"),
         ("envs_per_process", "many", "should be a valid integer or 'auto', got 'many'"),
@@ -451,11 +451,10 @@ SERVER = {"name": "robots", "backend": "env_server"}
     ("entry", "refuses"),
     [
         (INLINE, PLACEMENTS["inline"].refuses),
-        (HOPPER | {"placement": "split"}, PLACEMENTS["split"].refuses),
         (HOPPER | {"placement": "loop"}, PLACEMENTS["loop"].refuses),
         (SERVER, placement_of("env_server", "").refuses),
     ],
-    ids=["inline", "split", "loop", "env_server"],
+    ids=["inline", "loop", "env_server"],
 )
 def test_a_field_without_meaning_for_the_placement_is_refused(
     entry: dict[str, Any], refuses: Mapping[str, str]

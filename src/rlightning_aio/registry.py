@@ -203,7 +203,6 @@ class Placement:
         refuses: fields of an entry that have no effect there, with the reason. (`num_cpus` and
             `num_gpus` are refused nowhere, because configs for any place contain them.)
         local: its workers use this machine's cores and see this process's modules.
-        own_share: this process takes the last share of the envs, as if it were a worker.
         awaits: if awaitable envs (`async def` reset and step) can live there, or only such.
         extra: the extra of this package that it needs; empty for none.
         max_members: the most envs of an entry that join and leave while the group runs; 0 where
@@ -215,7 +214,6 @@ class Placement:
     spreads: bool
     refuses: Mapping[str, str] = field(default_factory=dict[str, str])
     local: bool = True
-    own_share: bool = False
     awaits: Literal["never", "also", "only"] = "never"
     extra: str = ""
     max_members: int = 0
@@ -225,7 +223,6 @@ class Placement:
 _THIS_PROCESS = "the envs live in this process, which is already running"
 _NO_WORKER = "there is no worker that could die or be replaced"
 _NO_LIMIT = "nothing can end what an env does in this process"
-_OWN_SHARE = "this process, which is already running, has a share of the envs"
 _CLIENTS_OWN = "its clients start the envs, on machines of their own"
 _NOT_RAYS = "it applies to Ray actors (placement: ray)"
 _NOT_ON_LOOP = "it limits the envs on the trainer's event loop (placement: loop)"
@@ -269,21 +266,6 @@ PLACEMENTS: dict[str, Placement] = {
             "ray_options": _NOT_RAYS,
             "max_concurrency": _NOT_ON_LOOP,
         },
-    ),
-    "split": Placement(
-        "rlightning_aio._core.hosts.process.host:ProcessHost",
-        spreads=True,
-        refuses={
-            "step_timeout": _NO_LIMIT,
-            "reset_timeout": _NO_LIMIT,
-            "start_timeout": _NO_LIMIT,
-            "close_timeout": _NO_LIMIT,
-            "interpreter": _OWN_SHARE,
-            "env_vars": _OWN_SHARE,
-            "ray_options": _NOT_RAYS,
-            "max_concurrency": _NOT_ON_LOOP,
-        },
-        own_share=True,
     ),
     "ray": Placement(
         "rlightning_aio._core.hosts.ray.host:RayHost",

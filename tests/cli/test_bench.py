@@ -271,7 +271,7 @@ def test_numbers_of_workers_to_try(fields: dict[str, Any], workers: list[int]) -
     """They go from one to one for each env, up to a limit; this process is tried if possible."""
     sizes = [(fields["num_workers"], 1)]
     tried = [(where, count) for where, count, own in found(entry(**fields)) if own == sizes]
-    assert [count for where, count in tried if where != "split"] == workers
+    assert [count for _, count in tried] == workers
     assert [where for where, count in tried if count == 0] == ["inline"] * workers.count(0)
 
 
@@ -279,11 +279,10 @@ def test_simulations_that_can_share_an_env_are_also_tried_that_way() -> None:
     """CartPole-v1 can, because it has a vector entry point."""
     tried = found(entry(num_workers=8))
     eight, four, one = [(8, 1)], [(2, 4)], [(1, 8)]
-    assert {"inline", "split"} == {where for where, _, own in tried if own == eight} - {"process"}
+    assert {"inline", "process"} == {where for where, _, own in tried if own == eight}
     assert ("inline", 0, one) in tried
     assert ("process", 1, one) in tried
     assert ("process", 2, four) in tried
-    assert ("split", 1, four) in tried
     # In any configuration, also together with entries that can't do this.
     assert found(entry(num_envs=8))[:1] == [("process", 1, one)]
     assert ("process", 2, four) in found(entry(num_envs=8))

@@ -216,7 +216,7 @@ def evaluation(use: Use, folder: Path | None = None, /, **options: Any) -> None:
             episodes = split(own)
             episode = episodes[n if resets_itself else 0]
             total = sum(transition.reward for transition in episode)
-            expected[f"env-{k}", sub_env, n] = total, len(episode)
+            expected[use.group.env_ids[k], sub_env, n] = total, len(episode)
     assert rows == expected
 
 

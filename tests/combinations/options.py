@@ -27,15 +27,15 @@ SEED, NUM_ENVS = 7, 3
 PLACEMENTS: dict[str, dict[str, Any]] = {
     "inline": {"placement": "inline"},
     "process": {"envs_per_process": 2},
-    # Two envs in a worker, and one here.
-    "split": {"placement": "split", "envs_per_process": 2},
     "ray": {"placement": "ray", "num_cpus": 0, "envs_per_process": 2, "start_timeout": HANG},
 }
-HERE = ("inline", "process", "split")
+HERE = ("inline", "process")
 """Those that need no cluster."""
+BOTH = "both"
+"""Two envs in a worker, and one in this process, in an entry of its own."""
 FACTORS: dict[str, tuple[Any, ...]] = {
     "kind": tuple(KINDS),
-    "placement": HERE,
+    "placement": (*HERE, BOTH),
     "zero_copy": (True, False),
     "task": tuple(TASKS),
     "limit": (math.inf, 4),
@@ -115,18 +115,18 @@ class Use:
 
     def __init__(self, options: Options) -> None:
         self.options, self.kind = options, KINDS[options.kind]
-        entry = {
-            "name": "env",
-            "task": partial(self.kind.make, options.task),
-            "num_workers": NUM_ENVS,
-            "snapshot_every": options.snapshot_every,
-            **PLACEMENTS[options.placement],
-        }
+        task = partial(self.kind.make, options.task)
+        placement = "process" if options.placement == BOTH else options.placement
+        entry = {"name": "env", "task": task, "num_workers": NUM_ENVS, **PLACEMENTS[placement]}
         if options.snapshot_every is not None:
-            entry["on_worker_death"] = "resume"
+            entry |= {"snapshot_every": options.snapshot_every, "on_worker_death": "resume"}
+        entries = [entry]
+        if options.placement == BOTH:
+            entry["num_workers"] = NUM_ENVS - 1
+            entries.append({"name": "here", "task": task, **PLACEMENTS["inline"]})
         build = rlightning_aio if options.is_async else rlightning_aio.sync
         self._runner = asyncio.Runner() if options.is_async else None
-        self.group: Any = build.build_env_group(entry, zero_copy=options.zero_copy)
+        self.group: Any = build.build_env_group(entries, zero_copy=options.zero_copy)
         self.done(self.group.init())
 
     def done(self, result: Any) -> Any:

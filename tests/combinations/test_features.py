@@ -40,7 +40,7 @@ def test_each_pair_of_options(
 
 
 _PLACES = itertools.cycle(
-    [("process", True, False), ("split", True, True), ("process", False, True)]
+    [("process", True, False), ("both", True, True), ("process", False, True)]
 )
 _MORTAL = [
     Options(kind, placement, zero_copy, "uneven", math.inf, 3, (1, None), is_async)

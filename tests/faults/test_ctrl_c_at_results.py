@@ -16,11 +16,11 @@ from rlightning_aio.errors import EnvRaised, NothingPending
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-PLACES: dict[str, dict[str, Any]] = {
-    "alone": {"placement": "inline"},
-    "inline": {"placement": "inline", "num_workers": 3},
-    "workers": {"num_workers": 3, "envs_per_process": 2},
-    "split": {"num_workers": 3, "envs_per_process": 1, "placement": "split"},
+PLACES: dict[str, list[dict[str, Any]]] = {
+    "alone": [{"placement": "inline"}],
+    "inline": [{"placement": "inline", "num_workers": 3}],
+    "workers": [{"num_workers": 3, "envs_per_process": 2}],
+    "both": [{"num_workers": 2, "envs_per_process": 1}, {"placement": "inline"}],
 }
 STRIDE = int(os.environ.get("RLIGHTNING_AIO_STRIDE", "17"))
 """Every so many lines, Ctrl-C is pressed; 1 takes minutes."""
@@ -123,8 +123,8 @@ def test_no_result_is_lost_wherever_a_call_is_interrupted(
     """The call raises KeyboardInterrupt, and its results are collected; or it returns them, and the
     next call raises it.
     """
-    entry = {"name": "e", "task": Serial, **PLACES[place]}
-    with rlightning_aio.sync.build_env_group(entry) as group:
+    entries = [{"name": f"e{k}", "task": Serial, **one} for k, one in enumerate(PLACES[place])]
+    with rlightning_aio.sync.build_env_group(entries) as group:
         answers = Answers(group)
         batch, flags = group.reset()
         answers.take((batch, flags))

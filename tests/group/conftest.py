@@ -73,7 +73,10 @@ class Place:
     def build(self, entries: Any, **kwargs: Any) -> Any:
         """Build a group of `entries` in this place."""
         listed = entries if isinstance(entries, list) else [entries]
-        placed = [{**entry, **self.fields} for entry in listed]
+        fields = [self.fields] * len(listed)
+        if self.name == "mixed" and len(listed) > 1:
+            fields[-1] = INLINE.fields
+        placed = [entry | own for entry, own in zip(listed, fields, strict=True)]
         with awaitable_twins() if self.awaitable else nullcontext():
             if self.synchronous:
                 group = rlightning_aio.sync.build_env_group(placed, **kwargs)
@@ -86,8 +89,8 @@ LOOP = Place("loop", {"placement": "loop"}, awaitable=True)
 INLINE = Place("inline", {"placement": "inline"})
 INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
 SEVERAL = Place("several workers", {"envs_per_process": 2})
-SPLIT_SYNC = Place("split", {"placement": "split", "envs_per_process": 2}, synchronous=True)
-"""Two envs in each worker, and the last two in this process."""
+MIXED_SYNC = Place("mixed", {"envs_per_process": 2}, synchronous=True)
+"""Two envs in each worker, and the last of several entries in this process."""
 # Each actor is a separate Python; on a busy machine, four of them may take minutes to start.
 ON_ACTORS = {"placement": "ray", "num_cpus": 0, "start_timeout": HANG}
 RAY = Place("ray", {**ON_ACTORS, "envs_per_process": 2})
@@ -96,7 +99,7 @@ RAY_SYNC = Place("ray", {**ON_ACTORS, "envs_per_process": 100}, synchronous=True
 ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
 AWAITING = Place("awaiting workers", {"envs_per_process": 2}, synchronous=True, awaitable=True)
 """Awaitable envs in workers. Only `test_stepping` runs on them; it is representative."""
-PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, SPLIT_SYNC, SEVERAL, LOOP, AWAITING]
+PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, MIXED_SYNC, SEVERAL, LOOP, AWAITING]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

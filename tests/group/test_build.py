@@ -100,7 +100,6 @@ def test_the_repr_of_a_group_lists_its_envs_and_their_placement() -> None:
         POLE | {"name": "pole", "num_workers": 4, "envs_per_process": 2},
         POLE | {"name": "many", "num_envs": 16, "placement": "inline"},
         POLE | {"name": "one", "envs_per_process": 1},
-        POLE | {"name": "both", "num_workers": 4, "placement": "split", "envs_per_process": 2},
         {"name": "arms", "backend": "env_server", "env_kwargs": {"port": 0, "insecure": True}},
     ]
     group = sync.build_env_group(entries)
@@ -110,7 +109,6 @@ def test_the_repr_of_a_group_lists_its_envs_and_their_placement() -> None:
         "EnvGroup(pole: 4 envs, placement process, 2 worker processes; "
         "many: 1 env of 16 sub-environments, placement inline, 0 worker processes; "
         "one: 1 env, placement process, 1 worker process; "
-        "both: 4 envs, placement split, 1 worker process; "
         "arms: env_server)"
     )
     group.close()

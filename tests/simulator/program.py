@@ -153,7 +153,7 @@ class Program:
         host_of: dict[str, Host] = {}
         for number, worker in enumerate(workers):
             plan = next(plan for plan in self.plans if plan.name == worker["entry"])
-            here = plan.placement == "inline" or worker["pid"] is None
+            here = plan.placement == "inline"
             process = "an actor" if plan.placement == "ray" else f"worker {number}"
             count = None if world is None else partial(world.deaths.__getitem__, process)
             on_ray = plan.placement == "ray"
@@ -281,14 +281,14 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
         plan = replace(plan, min_results=rng.randint(1, plan.num_workers))
     places = ["inline"] if form != "awaitable" else ["loop"] if "async" in features else []
     if "processes" in features or not places:
-        places += ["process"] if form == "awaitable" else ["process"] * 4 + ["split"]
+        places += ["process"] if form == "awaitable" else ["process"] * 5
     if "ray" in features and form != "awaitable":
         places += ["ray"] * 3
     placement = rng.choice(places)
     if placement in ("inline", "loop"):
         return replace(plan, placement=placement)
     plan = replace(plan, placement=placement, share=rng.randint(1, 3))
-    if "hang" in features and placement != "split" and rng.random() < 0.7:
+    if "hang" in features and rng.random() < 0.7:
         plan = replace(plan, timeout=TIMEOUT)
     if "raise deaths" in features and rng.random() < 0.3:
         return replace(plan, on_death="raise")

@@ -82,13 +82,13 @@ def test_envs_that_are_stepped_together_need_no_worker(monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-def test_batches_here_and_in_a_worker_form_one_vector_env(mode: AutoresetMode) -> None:
-    """Results of this process are passed as objects, those of a worker in shared memory."""
-    kwargs: dict[str, Any] = {"placement": "split", "envs_per_process": 2, "autoreset_mode": mode}
+def test_batches_in_two_workers_form_one_vector_env(mode: AutoresetMode) -> None:
+    """A batch of two in each."""
+    kwargs: dict[str, Any] = {"placement": "process", "envs_per_process": 2, "autoreset_mode": mode}
     ours = make_vec(PENDULUM, 4, vector_kwargs=kwargs, max_episode_steps=5)
     make = functools.partial(gym.make, PENDULUM, disable_env_checker=True, max_episode_steps=5)
     theirs = SyncVectorEnv([make] * 4, autoreset_mode=mode)
-    assert [worker["pid"] is None for worker in ours.group.get_workers()] == [False, True]
+    assert [worker["pid"] is None for worker in ours.group.get_workers()] == [False, False]
     assert_alike(ours.reset(seed=2), theirs.reset(seed=2))
     ours.action_space.seed(0)
     for turn in range(12):

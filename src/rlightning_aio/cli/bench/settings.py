@@ -63,7 +63,7 @@ class Setting:
         """Return the total number of worker processes."""
         if not self.has_workers:
             return 0
-        return sum(_num_shares(c) - (c.placement == "split") for c in self.configs)
+        return sum(map(_num_shares, self.configs))
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that define it, for JSON."""
@@ -86,10 +86,10 @@ def _num_shares(config: EnvConfig) -> int:
 def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
     """Return the settings worth trying.
 
-    The envs as configured: in several numbers of workers, in this process, in both. Then, for
+    The envs as configured: in several numbers of workers, and in this process. Then, for
     simulators that step several simulations in one env (``num_envs``), the same simulations in one
-    env for each core, in workers or in both, and all in one env in this process. Awaitable envs
-    of the event loop: there and, without `max_concurrency`, in several numbers of workers.
+    env for each core, in workers, and all in one env in this process. Awaitable envs of the event
+    loop: there and, without `max_concurrency`, in several numbers of workers.
 
     Raises:
         ConfigError: an entry's placement can't be chosen.
@@ -116,7 +116,6 @@ def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
         yield _in_workers(configs, count)
     if here:
         yield _inline(configs)
-        yield from _split(configs, cores)
     for num_shares in (1, cores):
         batched = [_batched(config, num_shares) for config in configs]
         if batched == list(configs):
@@ -124,8 +123,6 @@ def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
         yield _in_workers(batched, num_shares)
         if here and num_shares == 1:
             yield _inline(batched)
-        elif here:
-            yield from _split(batched, cores)
 
 
 def _awaiting(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
@@ -145,7 +142,7 @@ def _worker_counts(configs: Sequence[EnvConfig], cores: int) -> list[int]:
 
 
 def _in_workers(configs: Sequence[EnvConfig], count: int) -> Setting:
-    placed = tuple(_shared_out(config, count, "process") for config in configs)
+    placed = tuple(_shared_out(config, count) for config in configs)
     workers = counted(sum(map(_num_shares, placed)), "worker process")
     return Setting(placed, workers + _sizes(placed))
 
@@ -155,28 +152,20 @@ def _inline(configs: Sequence[EnvConfig]) -> Setting:
     return Setting(placed, "inline" + _sizes(placed))
 
 
-def _split(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
-    """Yield the setting with one share for each core, one of them here, if it is possible."""
-    if cores == 1 or any(c.num_workers == 1 or not ENVS.is_cpu_bound(c.backend) for c in configs):
-        return
-    placed = tuple(_shared_out(moved(config, "split"), cores, "split") for config in configs)
-    workers = sum(_num_shares(config) - 1 for config in placed)
-    yield Setting(placed, f"split, {counted(workers, 'worker process')}{_sizes(placed)}")
-
-
 def _sizes(configs: Sequence[EnvConfig]) -> str:
     if all(config.num_envs == 1 for config in configs):
         return ""
     return ", " + " + ".join(f"{config.num_workers} x {config.num_envs}" for config in configs)
 
 
-def _shared_out(config: EnvConfig, count: int, placement: str) -> EnvConfig:
+def _shared_out(config: EnvConfig, count: int) -> EnvConfig:
+    """Return the entry with its envs in about so many workers."""
     backend = ENVS.described(config.backend)
     if backend is not None and not backend.cpu_bound:
         # A simulator that uses a device or its own threads needs a process for each env.
         count = config.num_workers
     per_process = -(-config.num_workers // count) if count < config.num_workers else 1
-    return config.model_copy(update={"placement": placement, "envs_per_process": per_process})
+    return config.model_copy(update={"placement": "process", "envs_per_process": per_process})
 
 
 def _batched(config: EnvConfig, num_shares: int) -> EnvConfig:

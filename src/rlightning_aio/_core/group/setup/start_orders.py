@@ -12,7 +12,7 @@ from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_ou
 from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, filmed_alone, place_of
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
-from rlightning_aio.config import EnvConfig, makers_of, moved
+from rlightning_aio.config import EnvConfig, makers_of
 from rlightning_aio.registry import ENVS
 from rlightning_aio.sharing import envs_per_worker
 
@@ -64,17 +64,11 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
         if not place_of(config).max_members
     ]
     nums_hosts = _nums_hosts([config for config, _ in local], num_cores)
-    shares = [
+    return [
         (config, share)
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
         for share in _shares(config, fns, num_hosts)
     ]
-    # This process runs the envs of one worker, whatever the number of entries.
-    for k, (config, share) in list(enumerate(shares))[::-1]:
-        if place_of(config).own_share:
-            shares[k] = moved(config, "inline"), share
-            break
-    return shares
 
 
 def _order_of_members(config: EnvConfig) -> StartOrder:
