@@ -23,7 +23,7 @@ Next:
   docs/start.md                 five minutes with your own script
   docs/tutorial.md              train on your own env
   docs/training.md              training loops
-  rlightning-aio tune CONFIG    the best settings for your env on this machine (in .venv/bin)
+  rlightning-aio bench CONFIG   the best settings for your env on this machine (in .venv/bin)
   make docs                     all pages as a site
 """
 

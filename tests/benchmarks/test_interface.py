@@ -12,8 +12,8 @@ MOST = {
     "members": 350,
     "arguments": 408,
     "fields": 26,
-    "commands": 10,
-    "options": 33,
+    "commands": 8,
+    "options": 31,
     "extras": 15,
 }
 

@@ -1,16 +1,14 @@
-"""``bench`` and ``tune`` compare settings and print usable results."""
+"""``bench`` compares settings and writes the best one as a config."""
 
 from __future__ import annotations
 
-import csv
 import importlib.util
 import json
 import os
 import re
 import signal
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from cli import stub_policies
@@ -19,9 +17,8 @@ from patience import HANG
 from timelines import Seen
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli.bench import bench, measuring, settings, tune
+from rlightning_aio.cli.bench import bench, best, measuring, settings
 from rlightning_aio.config import moved
-from rlightning_aio.sharing import num_cores
 
 STUB = {"name": "stub", "backend": "stub", "task": "any", "num_workers": 4}
 QUICK = ["--seconds", 0.01, "--rounds", 2]
@@ -65,23 +62,6 @@ def test_a_measurement_has_a_step_on_any_machine(
     config = write_config(tmp_path, {**STUB, "num_workers": 1, "max_episode_steps": 1})
     document = invoke_json("bench", config, "--rounds", 3)
     assert all(min(c["rounds"]) > 0 for c in document["contenders"])
-
-
-def test_bench_publishes_a_page(tmp_path: Path) -> None:
-    """It has the machine, the figures of each contender, the command and the whole config."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 1})
-    page = tmp_path / "page.md"
-    override = "envs.0.max_episode_steps=9"
-    done = invoke("bench", config, override, *QUICK, "--publish", page)
-    text = page.read_text()
-    assert done.exit_code == 0
-    assert "2 rounds" in text
-    assert (
-        len([row for row in text.splitlines() if row.startswith(("| 1 worker", "| inline"))]) == 4
-    )
-    assert f"rlightning-aio bench {Path(config).name} {override}" in text
-    assert Path(config).read_text().strip() in text
-    assert str(tmp_path) not in text
 
 
 def test_bench_prints_a_table(tmp_path: Path) -> None:
@@ -170,74 +150,76 @@ def test_the_plot_of_a_rollout_is_an_image(tmp_path: Path) -> None:
     assert b"<svg" in path.read_bytes()
 
 
-def test_tunes_config_of_inline_envs_can_be_loaded(tmp_path: Path) -> None:
+def test_the_best_setting_is_a_config(tmp_path: Path) -> None:
+    """It differs from the given one only in the placement of envs, and is one of the fastest."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2, "max_episode_steps": 20})
+    path = tmp_path / "best.yaml"
+    document = invoke_json("bench", config, *QUICK, "--best", path)
+    (entry,), (asked_for,) = load_config(path), load_config(config)
+    chosen = {"placement", "envs_per_process"}
+    assert entry.model_dump(exclude=chosen) == asked_for.model_dump(exclude=chosen)
+    found = document["best"]
+    assert found in document["contenders"]
+    assert entry.placement == found["placement"]
+    fastest = max(c["steps_per_second"] for c in document["contenders"])
+    assert found["steps_per_second"] >= 0.97 * fastest
+    least = found["min_results"]
+    words = "step(batch)" if least is None else f"collect_async(min_results={least})"
+    assert f"steps/s with {words}.\n" in path.read_text()
+
+
+def test_the_best_config_of_inline_envs_can_be_loaded(tmp_path: Path) -> None:
     """It leaves out all fields that have no meaning there."""
     entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", step_timeout=3.0)
     setting = settings.Setting((moved(entry, "inline"),), "inline")
-    best = SimpleNamespace(setting=setting, steps_per_second=1.0, rule=measuring.Rule("step", None))
-    path = tmp_path / "tuned.yaml"
-    path.write_text(tune._as_yaml(path, cast("Any", best)))
+    path = tmp_path / "best.yaml"
+    fastest = measuring.Contender(setting, measuring.Rule("step", None))
+    best.write_best(path, path, fastest, interrupted=True)
     (loaded,) = load_config(path)
     assert (loaded.placement, loaded.step_timeout) == ("inline", None)
+    assert path.read_text().startswith("# Interrupted: ")
 
 
-def test_tunes_config_can_be_loaded(tmp_path: Path) -> None:
-    """The YAML on stdout differs from the config only in the placement of envs."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2, "max_episode_steps": 20})
-    done = invoke("tune", config, *QUICK)
-    assert done.exit_code == 0, done.stderr
-    tuned = tmp_path / "tuned.yaml"
-    tuned.write_text(done.stdout)
-    (entry,), (asked_for,) = load_config(tuned), load_config(config)
-    chosen = {"placement", "envs_per_process", "min_results"}
-    assert entry.model_dump(exclude=chosen) == asked_for.model_dump(exclude=chosen)
-    assert entry.placement == "inline" or isinstance(entry.envs_per_process, int)
-    assert entry.min_results is not None
-    assert f"collect_async(min_results={entry.min_results})" in done.stdout
-    assert "Where the envs live" in done.stderr
+def test_a_sweep_measures_all_combinations_and_nothing_else(tmp_path: Path) -> None:
+    """A field is that of all entries, or of the one that is named; the rules may be swept, too."""
+    config = write_config(tmp_path, STUB, {**CARTPOLE, "num_workers": 2})
+    sweeps = ["placement=process,inline", "envs.0.num_workers=1,3", "min_results=4,2"]
+    words = [word for sweep in sweeps for word in ("--sweep", sweep)]
+    contenders = invoke_json("bench", config, *QUICK, *words)["contenders"]
+    assert [(c["placement"], c["num_workers"], c["min_results"]) for c in contenders] == [
+        (placement, {"stub": count, "pole": 2}, least)
+        for placement in ("process", "inline")
+        for count in (1, 3)
+        for least in (2, 4)
+    ]
+    assert {c["workers"] for c in contenders if c["placement"] == "inline"} == {0}
+    assert "placement=inline, envs.0.num_workers=3" in {c["place"] for c in contenders}
 
 
-def test_tune_chooses_one_of_the_finalists(tmp_path: Path) -> None:
-    """The best is one of the two fastest places, with one of the rules tried there."""
-    document = invoke_json("tune", write_config(tmp_path, STUB), *QUICK)
-    tried, best = document["tried"], document["best"]
-    places, finals = tried[:4], tried[4:]
-    assert settings_of(places) == [("process", 1), ("process", 2), ("process", 4), ("inline", 0)]
-    assert [c["min_results"] for c in finals] == [1, 2, 3, 4] * 2
-    assert best in finals
-    fastest = max(c["steps_per_second"] for c in finals)
-    assert best["steps_per_second"] >= 0.97 * fastest
-    assert document["step_us"] > 0
+@pytest.mark.parametrize(
+    ("sweep", "words"),
+    [
+        ("num_workers", "should be FIELD=A,B"),
+        ("num_workers=", "should be FIELD=A,B"),
+        ("num_worker=1", "did you mean 'num_workers'"),
+        ("num_workers=0", "num_workers: should be greater"),
+        ("min_results=0", "should be a number from 1 on"),
+        ("placement=ray", "its envs live elsewhere"),
+    ],
+)
+def test_a_wrong_sweep_is_refused_before_anything_starts(
+    tmp_path: Path, sweep: str, words: str
+) -> None:
+    """With the reason."""
+    done = invoke("bench", write_config(tmp_path, STUB), "--sweep", sweep)
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert words in done.stderr
 
 
-def test_tune_prints_no_bound_for_envs_that_wait(tmp_path: Path) -> None:
-    """More of them than cores step at once, so a step's time gives no bound."""
-    config = write_config(tmp_path, {**STUB, "backend": "stub_waiting", "num_workers": 3})
-    waiting = ("--rounds", 1, "--seconds", 0.1)
-    document = invoke_json("tune", config, *waiting)
-    assert document["step_us"] >= 20_000
-    assert document["limit_steps_per_second"] is None
-    assert "most of it waiting" in invoke("tune", config, *waiting).stderr
-
-
-def test_tune_prints_no_bound_below_its_own_measurement() -> None:
-    """Several simulations in one env may take less time each than one alone."""
-    entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1")
-    setting = settings.Setting((moved(entry, "inline"),), "inline")
-    search = tune._Search([entry], 1, measuring.Limits(1, 1.0))
-    search.step_us = search.core_us = 1000.0
-    search.places = [measuring.Contender(setting, measuring.Rule("step", None))]
-    possible = num_cores() * 1000.0
-    for rate, bound in ((possible / 2, possible), (possible * 1.2, None)):
-        search.places[0].rounds = [measuring.Round(rate, (1.0, 1.0), 1.0)]
-        assert search.limit == bound
-
-
-@pytest.mark.parametrize("command", ["bench", "tune"])
-def test_tune_and_bench_refuse_an_env_server(tmp_path: Path, command: str) -> None:
+def test_bench_refuses_an_env_server(tmp_path: Path) -> None:
     """Its clients choose where envs live."""
     config = write_config(tmp_path, {"name": "robots", "backend": "env_server"})
-    done = invoke(command, config)
+    done = invoke("bench", config)
     assert done.exit_code == 2
     assert "'robots'" in done.stderr
 
@@ -290,31 +272,15 @@ def test_simulations_that_can_share_an_env_are_also_tried_that_way() -> None:
     assert ("inline", 0, [(1, 8), (3, 1)]) in found(entry(num_workers=8), other)
 
 
-def test_tunes_config_has_sub_environments_and_min_results(tmp_path: Path) -> None:
-    """Both are divided among the entries."""
-    entries = tuple(
-        EnvConfig(name=name, backend="gymnasium", task="CartPole-v1", num_workers=n, num_envs=2)
-        for name, n in (("a", 1), ("b", 2), ("c", 4))
-    )
-    setting = settings._in_workers(entries, 2)
-    rule = measuring.Rule("any", 5)
-    best = measuring.Contender(setting, rule, [measuring.Round(100.0, (1.0, 2.0), 1.0)])
-    path = tmp_path / "tuned.yaml"
-    path.write_text(tune._as_yaml(path, best))
-    loaded = load_config(path)
-    assert [(c.num_workers, c.num_envs) for c in loaded] == [(1, 2), (2, 2), (4, 2)]
-    assert sum(c.min_results or 0 for c in loaded) == 5
-
-
 def test_baselines_are_in_the_same_table(tmp_path: Path) -> None:
-    """They are a plain loop and Gymnasium's two vector envs; CSV has all figures."""
+    """They are a plain loop and Gymnasium's two vector envs."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "max_episode_steps": 5})
     # Gymnasium's shared memory stays open until this process ends.
-    done = run("bench", config, "--seconds", 0.005, "--rounds", 1, "--format", "csv")
+    done = run("bench", config, "--seconds", 0.005, "--rounds", 1, "--json")
     assert done.returncode == 0, done.stderr
-    rows = list(csv.DictReader(done.stdout.splitlines()))
+    rows = json.loads(done.stdout)["contenders"]
     assert [row["place"] for row in rows[-3:]] == ["bare loop", "SyncVectorEnv", "AsyncVectorEnv"]
-    assert all(float(row["steps_per_second"]) > 0 for row in rows)
+    assert all(row["steps_per_second"] > 0 for row in rows)
 
 
 def test_bench_uses_a_policy_and_a_seed(tmp_path: Path) -> None:
@@ -322,35 +288,9 @@ def test_bench_uses_a_policy_and_a_seed(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     stub_policies.furthest_seen.clear()
     words = ("--policy", "cli.stub_policies:furthest", "--seed", 3, "--rounds", 1)
-    done = invoke("bench", config, *words, "--seconds", 0.005, "--format", "markdown")
-    assert done.exit_code == 0, done.stderr
-    head, line, *rows = done.stdout.splitlines()
-    assert head.startswith("| envs in | results | steps/s |")
-    assert set(line) <= set("|-: ")
-    assert not [row for row in rows if "VectorEnv" in row]
+    document = invoke_json("bench", config, *words, "--seconds", 0.005)
+    assert {c["place"] for c in document["contenders"]} == {"1 worker process", "inline"}
     assert stub_policies.furthest_seen
-
-
-def test_bench_compares_with_saved_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The exit code is 3 only if all rounds are slower than all saved ones."""
-    monkeypatch.chdir(tmp_path)
-    config = write_config(tmp_path, {**STUB, "num_workers": 1})
-    words = ("bench", config, "--seconds", 0.005, "--rounds", 1)
-    missing = invoke(*words, "--compare", "before")
-    assert (missing.exit_code, missing.stdout) == (2, "")
-    assert invoke(*words, "--save", "before").exit_code == 0
-    saved = tmp_path / ".rlightning-aio" / "bench" / "before.json"
-    document = json.loads(saved.read_text())
-    for factor, code in ((1e-6, 0), (1e6, 3)):
-        changed = json.loads(json.dumps(document))
-        for contender in changed["contenders"]:
-            contender["rounds"] = [rate * factor for rate in contender["rounds"]]
-        saved.write_text(json.dumps(changed | {"cpu": "another"}))
-        done = invoke(*words, "--compare", "before", "--json")
-        assert done.exit_code == code, done.stderr
-        comparison = json.loads(done.stdout)["comparison"]
-        assert comparison["slower"] == (len(document["contenders"]) if code else 0)
-        assert comparison["differences"][0].startswith("cpu was another")
 
 
 def test_a_plot_that_cannot_be_written_is_refused_at_once(
@@ -400,15 +340,6 @@ def test_bench_reports_an_env_that_ends_its_process(tmp_path: Path, status: int)
     assert "Traceback" not in done.stderr
 
 
-def test_tune_reports_an_env_that_ends_its_process(tmp_path: Path) -> None:
-    """The best setting is one with workers."""
-    entry = {"name": "dying", "backend": "dying", "task": "any", "env_kwargs": {"status": 0}}
-    done = run("tune", write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
-    assert done.returncode == 0, done.stderr
-    assert "placement: process" in done.stdout
-    assert "inline: the process that stepped the envs exited with code 0" in done.stderr
-
-
 FAILING = {
     "dying": ({"status": 0, "steps": 0}, "the process that stepped the envs exited with code 0"),
     "raising": ({}, "ZeroDivisionError: the floor is missing"),
@@ -417,14 +348,11 @@ FAILING = {
 
 
 @pytest.mark.parametrize("backend", FAILING)
-@pytest.mark.parametrize("command", ["bench", "tune"])
-def test_without_any_measurement_the_exit_code_is_1(
-    tmp_path: Path, command: str, backend: str
-) -> None:
+def test_without_any_measurement_the_exit_code_is_1(tmp_path: Path, backend: str) -> None:
     """Also if the env ends its process as after a success."""
     kwargs, message = FAILING[backend]
     entry = {"name": "a", "backend": backend, "task": "any", "env_kwargs": kwargs}
-    done = run(command, write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
+    done = run("bench", write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
     assert (done.returncode, done.stdout) == (1, "")
     assert message in done.stderr.splitlines()[-1]
     assert done.stderr.splitlines()[-1].startswith("error: ")

@@ -46,10 +46,10 @@ def test_check_fails_if_an_env_fails(tmp_path: Path) -> None:
 
 def test_tasks_lists_the_tasks_of_a_backend() -> None:
     """A backend without a list, and an unknown one, raise an error."""
-    assert "CartPole-v1" in invoke("tasks", "gymnasium").stdout.splitlines()
-    assert "HalfCheetah-v5" in invoke_json("tasks", "mujoco")
-    assert "HalfCheetah-v5" not in invoke_json("tasks", "gymnasium")
+    assert "CartPole-v1" in invoke("backends", "gymnasium").stdout.splitlines()
+    assert "HalfCheetah-v5" in invoke_json("backends", "mujoco")
+    assert "HalfCheetah-v5" not in invoke_json("backends", "gymnasium")
     for name, said in (("callable", "has no list"), ("mujuco", "did you mean 'mujoco'")):
-        done = invoke("tasks", name)
+        done = invoke("backends", name)
         assert done.exit_code == 2
         assert said in done.stderr

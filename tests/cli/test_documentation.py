@@ -36,7 +36,6 @@ SHORT = {
     "rollout": ["--steps", "500", "envs.0.num_workers=8"],
     "bench": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=1"],
     "eval": ["envs.0.num_workers=2"],
-    "tune": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=1"],
 }
 
 

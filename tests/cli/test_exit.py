@@ -56,7 +56,7 @@ WRONG: dict[str, tuple[str, list[str], list[str]]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-@pytest.mark.parametrize("command", ["rollout", "bench", "tune"])
+@pytest.mark.parametrize("command", ["rollout", "bench"])
 def test_a_wrong_config_is_code_2_and_names_the_field(
     tmp_path: Path, command: str, wrong: tuple[str, list[str], list[str]]
 ) -> None:

@@ -16,7 +16,7 @@ STUB = {"name": "stub", "backend": "stub", "task": "-", "placement": "inline"}
 OPTIONS = [
     *(("rollout", "--trace"), ("rollout", "--plot"), ("rollout", "--video")),
     *(("eval", "--trace"), ("eval", "--plot"), ("eval", "--resume"), ("eval", "--video")),
-    *(("bench", "--trace"), ("bench", "--plot"), ("bench", "--save")),
+    *(("bench", "--trace"), ("bench", "--plot"), ("bench", "--best")),
 ]
 
 
@@ -32,10 +32,6 @@ def refused(*words: Any) -> str:
 def asked(command: str, option: str, folder: Path) -> tuple[Any, Path]:
     """The command's words, and the file that it would write; of --video the folder."""
     config = write_config(folder, STUB if option != "--video" else {**CARTPOLE})
-    if option == "--save":
-        saved = folder / ".rlightning-aio" / "bench" / "name.json"
-        saved.parent.mkdir(parents=True, exist_ok=True)
-        return (command, config, option, "name"), saved
     path = folder / "file.png"
     return (command, config, option, path), path
 

@@ -218,7 +218,7 @@ def test_python_m_runs_the_same_command() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [[], *([name] for name in ("rollout", "bench", "tune", "check", "backends", "tasks"))],
+    [[], *([name] for name in ("rollout", "bench", "check", "backends"))],
 )
 def test_help_has_examples(command: list[str]) -> None:
     """Each help text has command lines."""

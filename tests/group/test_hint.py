@@ -65,7 +65,7 @@ def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
         with group.auto_reset(max_episode_steps=100):
             for _ in range(2 * HINT_AFTER_BATCHES + 10):
                 batch, _ = group.step(batch.respond(np.zeros(1, np.int64)))
-    assert len([r for r in caplog.records if "rlightning-aio tune" in r.getMessage()]) == 1
+    assert len([r for r in caplog.records if "rlightning-aio bench" in r.getMessage()]) == 1
 
 
 MS = 1_000_000

@@ -11,13 +11,11 @@ import typer
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
 from rlightning_aio.cli.bench.bench import bench
-from rlightning_aio.cli.bench.tune import tune
 from rlightning_aio.cli.check import check
 from rlightning_aio.cli.playing.evaluating import evaluation
 from rlightning_aio.cli.playing.rollout import rollout
 from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.serving import serve
-from rlightning_aio.cli.tasks import tasks
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.protocol import kernel
 
@@ -71,7 +69,7 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, tune, check, backends, tasks, serve, client, keygen):
+for command in (rollout, bench, check, backends, serve, client, keygen):
     app.command()(guarded(command))
 # Named after what Python has a function of that name for.
 app.command("eval")(guarded(evaluation))

@@ -1,15 +1,24 @@
-"""``rlightning-aio backends``: lists the simulators, and how to install those that are missing."""
+"""``rlightning-aio backends``: lists the simulators and how to install them, or tasks of one."""
 
 from __future__ import annotations
 
 import importlib.metadata
 from dataclasses import asdict, dataclass
 from operator import attrgetter
+from typing import Annotated
 
+import typer
 from rich.text import Text
 
 from rlightning_aio.cli.options import AsJson
-from rlightning_aio.cli.terminal import named_columns, out, print_json, print_table
+from rlightning_aio.cli.tasks import names_of_tasks
+from rlightning_aio.cli.terminal import (
+    named_columns,
+    out,
+    print_json,
+    print_result,
+    print_table,
+)
 from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend
 
 __all__ = ["backends"]
@@ -25,9 +34,14 @@ class _Row:
 
 
 def backends(
+    backend: Annotated[
+        str | None, typer.Argument(help="List the tasks of this backend.", show_default=False)
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """List all backends: whether the package they need is installed here, and how to install it.
+
+    With the name of one, list the tasks of its simulator, as installed here, one per line.
 
     Backends of plug-ins (entry points of the group rlightning_aio.backends) are listed after
     the built-in ones. Simulators that exclude each other need separate virtual environments;
@@ -37,7 +51,12 @@ def backends(
 
         rlightning-aio backends
         rlightning-aio backends --json
+        rlightning-aio backends gymnasium | grep Cart
     """
+    if backend is not None:
+        names = names_of_tasks(backend)
+        print_json(names) if as_json else print_result("\n".join(names))
+        return
     rows = [_row(backend) for backend in (*BACKENDS.values(), *_plugged_in())]
     if as_json:
         print_json([asdict(row) for row in rows])

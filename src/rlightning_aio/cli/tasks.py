@@ -1,21 +1,19 @@
-"""``rlightning-aio tasks`` lists the tasks of a backend."""
+"""The tasks of the simulators that have a list of them."""
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
-import typer
 
-from rlightning_aio.cli.terminal import print_json, print_result
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import BACKENDS, ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-__all__ = ["tasks"]
+__all__ = ["names_of_tasks"]
 
 
 def _entry_point(spec: Any) -> str:
@@ -63,25 +61,11 @@ _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
 }
 
 
-def tasks(
-    backend: Annotated[
-        str,
-        typer.Argument(
-            help="A backend, as in an entry's `backend`.",
-            show_default=False,
-            autocompletion=lambda: list(_LISTS),
-        ),
-    ],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the names.")
-    ] = False,
-) -> None:
-    """List the tasks of a backend's simulator, as installed here, one per line.
+def names_of_tasks(backend: str) -> list[str]:
+    """Return the names of the tasks of a backend's simulator, as installed here.
 
-    For example:
-
-        rlightning-aio tasks mujoco
-        rlightning-aio tasks gymnasium | grep Cart
+    Raises:
+        ConfigError: there is no such backend, it has no list of tasks, or it is not installed.
     """
     if backend not in _LISTS:
         known = ", ".join(_LISTS)
@@ -94,8 +78,4 @@ def tasks(
     known_backend = BACKENDS[backend]
     if known_backend.installed_version() is None:
         raise ConfigError(f"backend {backend!r} is not installed: {known_backend.install_command}")
-    names = sorted(_LISTS[backend]())
-    if as_json:
-        print_json(names)
-    else:
-        print_result("\n".join(names))
+    return sorted(_LISTS[backend]())

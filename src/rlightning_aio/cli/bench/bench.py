@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Self, TypeAlias
 
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from rlightning_aio.cli.bench.apart import opened
 from rlightning_aio.cli.bench.baselines import Baseline, baselines_of
-from rlightning_aio.cli.bench.comparing import Comparison, check_name, check_save, compared, save
-from rlightning_aio.cli.bench.contender_table import as_csv, as_markdown, print_contenders
+from rlightning_aio.cli.bench.best import best_of, write_best
+from rlightning_aio.cli.bench.contender_table import print_contenders
 from rlightning_aio.cli.bench.measuring import Contender, Limits, Rule, take_turns
 from rlightning_aio.cli.bench.plots import check_plot, draw_contenders
-from rlightning_aio.cli.bench.publishing import publish
-from rlightning_aio.cli.bench.settings import Setting, possible_settings
+from rlightning_aio.cli.bench.settings import Setting, possible_settings, swept_settings
 from rlightning_aio.cli.bench.surroundings import surroundings
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
@@ -37,11 +35,10 @@ from rlightning_aio.cli.terminal import (
     err,
     out,
     print_json,
-    print_result,
     run_interruptible,
 )
 from rlightning_aio.config import load_config
-from rlightning_aio.errors import RLightningError
+from rlightning_aio.errors import ConfigError, RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,21 +48,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Watch", "bench"]
 
-REGRESSION = 3
-"""Exit code if a contender has become slower than in the saved figures."""
-
-
-class Format(StrEnum):
-    """The format of the table."""
-
-    TABLE = "table"
-    CSV = "csv"
-    MARKDOWN = "markdown"
-
 
 @dataclass
 class _Bench:
-    """The options of a measurement."""
+    """The options of a measurement; `waits` are values of `min_results`, None the usual rules."""
 
     settings: list[Setting]
     baselines: list[Baseline]
@@ -74,6 +60,7 @@ class _Bench:
     policy: str | None
     seed: int
     trace: Path | None
+    waits: list[int] | None
     contenders: list[Contender] = field(default_factory=list[Contender])
 
     def __post_init__(self) -> None:
@@ -82,7 +69,7 @@ class _Bench:
         self.contenders = [
             Contender(setting, rule)
             for setting in self.settings
-            for rule in _rules(setting.num_envs)
+            for rule in _rules(setting.num_envs, self.waits)
         ]
         self.contenders += [Contender(baseline, Rule("step", None)) for baseline in self.baselines]
 
@@ -92,60 +79,36 @@ class _Output:
     """The options for the figures. They are checked before anything is measured."""
 
     config: Path
-    overrides: Sequence[str]
-    table_format: Format
     as_json: bool
     plot: Path | None
-    save_as: str | None
-    compare: str | None
-    publish: Path | None
+    best: Path | None
 
     def __post_init__(self) -> None:
         check_plot(self.plot)
-        check_name(self.save_as, must_exist=False)
-        check_name(self.compare, must_exist=True)
-        check_save(self.save_as)
-        check_option_file("--publish", self.publish)
+        check_option_file("--best", self.best)
 
     def report(
         self, configs: Sequence[EnvConfig], contenders: Sequence[Contender], *, interrupted: bool
-    ) -> bool:
-        """Print, draw and save the figures. Return True if one is worse than it was saved."""
-        document = {
-            "config": str(self.config),
-            "interrupted": interrupted,
-            **surroundings(configs),
-            "contenders": [contender.as_json() for contender in contenders],
-        }
-        comparison = None if self.compare is None else compared(self.compare, document)
-        self._print(document, contenders, comparison)
+    ) -> None:
+        """Print and draw the figures, and write the best setting."""
+        best = best_of(contenders)
+        if self.as_json:
+            print_json(
+                {
+                    "config": str(self.config),
+                    "interrupted": interrupted,
+                    **surroundings(configs),
+                    "contenders": [contender.as_json() for contender in contenders],
+                    "best": None if best is None else best.as_json(),
+                }
+            )
+        else:
+            title = ("Interrupted: " if interrupted else "") + str(self.config)
+            print_contenders(out(), title, contenders)
         if self.plot is not None:
             draw_contenders(str(self.config), contenders, self.plot)
-        if self.publish is not None:
-            publish(self.publish, self.config, self.overrides, document, contenders)
-        if self.save_as is not None and not interrupted:
-            save(self.save_as, document)
-        return comparison is not None and bool(comparison.slower)
-
-    def _print(
-        self,
-        document: dict[str, Any],
-        contenders: Sequence[Contender],
-        comparison: Comparison | None,
-    ) -> None:
-        if self.as_json:
-            compared_figures = {} if comparison is None else {"comparison": comparison.as_json()}
-            print_json(document | compared_figures)
-            return
-        if self.table_format is Format.CSV:
-            print_result(as_csv(contenders))
-        elif self.table_format is Format.MARKDOWN:
-            print_result(as_markdown(contenders))
-        else:
-            title = ("Interrupted: " if document["interrupted"] else "") + document["config"]
-            print_contenders(out(), title, contenders)
-        if comparison is not None:
-            comparison.print(out() if self.table_format is Format.TABLE else err())
+        if self.best is not None and best is not None:
+            write_best(self.best, self.config, best, interrupted=interrupted)
 
 
 _Steps: TypeAlias = Annotated[
@@ -155,13 +118,17 @@ _Steps: TypeAlias = Annotated[
 _Seed: TypeAlias = Annotated[
     int, typer.Option(min=0, help="Seed of the first reset and random actions.")
 ]
-_Save: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--save", metavar="NAME", help="Save the figures to compare with later."),
+_Sweep: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FIELD=A,B,…",
+        help="Measure these values of a field in place of the usual settings, or of min_results in "
+        "place of the usual rules. With several of these options, all combinations.",
+        show_default=False,
+    ),
 ]
-_Compare: TypeAlias = Annotated[
-    str | None,
-    typer.Option(metavar="NAME", help="Compare with saved figures; exit code 3 if slower."),
+_Best: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Write the config with the best setting (YAML).")
 ]
 _Trace: TypeAlias = Annotated[
     Path | None,
@@ -171,29 +138,20 @@ _Trace: TypeAlias = Annotated[
         "https://ui.perfetto.dev.",
     ),
 ]
-_Publish: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE", help="Write a page (Markdown) with the figures, the machine and the config."
-    ),
-]
-_Format: TypeAlias = Annotated[Format, typer.Option("--format", help="Table format.")]
 
 
 def bench(
     config: Config,
     overrides: Overrides = None,
+    sweep: _Sweep = None,
     rounds: Rounds = 5,
     seconds: MeasuringSeconds = 0.5,
     steps: _Steps = None,
     policy: PolicyName = None,
     seed: _Seed = 0,
-    save_as: _Save = None,
-    compare: _Compare = None,
     plot: PlotFile = None,
-    table_format: _Format = Format.TABLE,
+    best: _Best = None,
     trace: _Trace = None,
-    publish: _Publish = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure how fast a config's envs run, and how to make them run faster.
@@ -203,32 +161,35 @@ def bench(
     are ready. Simulations that can share an env (num_envs) are also tried that way. A plain
     loop and Gymnasium's vector envs are measured as well, if these can make the envs. All take
     turns, and figures are medians over the rounds. Latency is the time from sending an action
-    to receiving its result. Actions are random, unless --policy names a policy.
+    to receiving its result. Actions are random, unless --policy names a policy. With --sweep,
+    only the values that it gives are compared.
 
     For example:
 
         rlightning-aio bench configs/halfcheetah.yaml
         rlightning-aio bench configs/cartpole.yaml envs.0.num_workers=256 --rounds 9
         rlightning-aio bench configs/hopper.yaml --plot hopper.png --json > hopper.json
-        rlightning-aio bench configs/hopper.yaml --save before --publish hopper.md
-        rlightning-aio bench configs/hopper.yaml --compare before
+        rlightning-aio bench configs/hopper.yaml --best fastest.yaml
+        rlightning-aio bench configs/hopper.yaml --sweep num_workers=8,16 --sweep min_results=1,4
     """
     check_seed(seed)
     configs = load_config(config, overrides or ())
-    files = (plot, save_as, compare, publish)
-    output = _Output(config, overrides or (), table_format, as_json, *files)
+    output = _Output(config, as_json, plot, best)
     check_option_file("--trace", trace)
+    sweeps = _values(sweep or ())
+    waits = sweeps.pop("min_results", None)
     order = _Bench(
-        possible_settings(configs),
+        swept_settings(config, overrides or (), sweeps) if sweeps else possible_settings(configs),
         # A policy takes a group's batches, which baselines don't have.
-        [] if policy else baselines_of(configs),
+        [] if policy or sweep else baselines_of(configs),
         rounds,
         Limits(steps or 2**62, seconds),
         policy,
         seed,
         trace,
+        None if waits is None else _numbers(waits),
     )
-    interrupted = slower = False
+    interrupted = False
     try:
         with Watch(len(order.settings), rounds * len(order.contenders)) as watch:
             run_interruptible(_measure(order, watch))
@@ -237,12 +198,31 @@ def bench(
         raise
     finally:
         if any(contender.rounds for contender in order.contenders):
-            slower = output.report(configs, order.contenders, interrupted=interrupted)
-    if slower:
-        raise typer.Exit(REGRESSION)
+            output.report(configs, order.contenders, interrupted=interrupted)
 
 
-def _rules(num_envs: int) -> list[Rule]:
+def _values(sweep: Sequence[str]) -> dict[str, list[str]]:
+    """Return the values of each field that is swept."""
+    found: dict[str, list[str]] = {}
+    for text in sweep:
+        name, equals, values = text.partition("=")
+        if not (name and equals and all(values.split(","))):
+            raise ConfigError(f"--sweep {text}: should be FIELD=A,B,…, such as num_workers=1,2,4")
+        found[name] = values.split(",")
+    return found
+
+
+def _numbers(values: Sequence[str]) -> list[int]:
+    """Return the values of `min_results`."""
+    for text in values:
+        if not text.isascii() or not text.isdigit() or not int(text):
+            raise ConfigError(f"--sweep min_results={text}: should be a number from 1 on")
+    return sorted(map(int, values))
+
+
+def _rules(num_envs: int, waits: Sequence[int] | None) -> list[Rule]:
+    if waits is not None:
+        return [Rule(f"min_results={least}", least) for least in waits]
     half = max(1, num_envs // 2)
     named = {1: "async, first ready", half: "async, half", num_envs: "async, all"}
     return [Rule("step", None), *(Rule(words, least) for least, words in sorted(named.items()))]

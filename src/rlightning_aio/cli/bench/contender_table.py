@@ -1,9 +1,7 @@
-"""Shows the figures of `bench` and `tune`: a table on a terminal, CSV, Markdown."""
+"""Shows the figures of `bench` in a table."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
@@ -17,16 +15,12 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.bench.measuring import Contender
 
-__all__ = ["as_csv", "as_markdown", "print_contenders"]
+__all__ = ["print_contenders"]
 
 _NAMES: Final = (
     "envs in", "results", "steps/s", "±", "latency p50", "p99", "start", "reset", "cores", "memory",
 )  # fmt: skip
 _EXPENDABLE: Final = ("reset", "start", "memory", "p99", "cores", "±", "latency p50")
-_FIGURES: Final = (
-    "place", "results", "steps_per_second", "spread", "latency_us_p50", "latency_us_p99",
-    "start_seconds", "reset_seconds", "cores", "memory_bytes",
-)  # fmt: skip
 
 
 def print_contenders(console: Console, title: str, contenders: Sequence[Contender]) -> None:
@@ -49,39 +43,6 @@ def print_contenders(console: Console, title: str, contenders: Sequence[Contende
         restarts[contender.setting.words] += contender.restarts
     for words, times in (+restarts).items():
         console.print(f"{words}: {counted(times, 'restart')} of a worker that died", markup=False)
-
-
-def as_csv(contenders: Sequence[Contender]) -> str:
-    """Return all figures in plain units: a line of names, then one for each contender."""
-    file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(_FIGURES)
-    for contender in contenders:
-        names = [contender.setting.words, contender.rule.words]
-        writer.writerow([*names, *_figures(contender)])
-    return file.getvalue().rstrip()
-
-
-def as_markdown(contenders: Sequence[Contender]) -> str:
-    """Return the table in Markdown."""
-    lines = [list(_NAMES), ["---", "---", *["---:"] * (len(_NAMES) - 2)]]
-    lines += [_row(contender) for contender in contenders]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
-def _figures(contender: Contender) -> list[float | None]:
-    if not contender.rounds or contender.costs is None:
-        return [None] * (len(_FIGURES) - 2)
-    costs = contender.costs
-    return [
-        contender.steps_per_second,
-        contender.spread,
-        *contender.latency_us,
-        costs.start_seconds,
-        costs.reset_seconds,
-        contender.cores,
-        costs.memory_bytes,
-    ]
 
 
 def _row(contender: Contender) -> list[str]:

@@ -1,26 +1,30 @@
-"""The settings that `bench` and `tune` try for a config.
+"""The settings that `bench` tries for a config.
 
-Rule: every setting steps the same number of simulations as the config, with one or several in each
-env, in this process, in workers, or in both.
+Rule: without `--sweep`, every setting steps the same number of simulations as the config, with one
+or several in each env, in this process, in workers, or in both. With it, the settings are all
+combinations of the values that the user gives.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio._core.group.setup.start_orders import nums_hosts
 from rlightning_aio.cli.terminal import counted
-from rlightning_aio.config import moved
+from rlightning_aio.config import load_config, moved
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import ENVS, PLACEMENTS
 from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Setting", "possible_settings"]
+__all__ = ["Setting", "possible_settings", "swept_settings"]
 
 _MANY_WORKERS: Final = 32
 """Largest number of workers to try; starting more takes too long."""
@@ -45,25 +49,24 @@ class Setting:
 
     @property
     def placement(self) -> str:
-        """Return the placement, which all entries share."""
-        return self.configs[0].placement
+        """Return the placement, or those of the entries if they differ."""
+        return " + ".join(dict.fromkeys(config.placement for config in self.configs))
 
     @property
     def steps_here(self) -> bool:
         """Return True if some of the envs are in the process of the group."""
-        return self.placement != "process"
+        return any(config.placement != "process" for config in self.configs)
 
     @property
     def has_workers(self) -> bool:
         """Return True if some of the envs are in worker processes."""
-        return PLACEMENTS[self.placement].spreads
+        return any(PLACEMENTS[config.placement].spreads for config in self.configs)
 
     @property
     def workers(self) -> int:
         """Return the total number of worker processes."""
-        if not self.has_workers:
-            return 0
-        return sum(map(_num_shares, self.configs))
+        counts = zip(self.configs, nums_hosts(self.configs, num_cores()), strict=True)
+        return sum(count for config, count in counts if PLACEMENTS[config.placement].spreads)
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that define it, for JSON."""
@@ -94,17 +97,55 @@ def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
     Raises:
         ConfigError: an entry's placement can't be chosen.
     """
+    _check_here(configs)
+    settings: dict[tuple[object, ...], Setting] = {}
+    for setting in _candidates(configs, num_cores()):
+        sizes = tuple(config.num_workers for config in setting.configs)
+        settings.setdefault((setting.placement, setting.workers, sizes), setting)
+    return list(settings.values())
+
+
+def swept_settings(
+    path: Path, overrides: Sequence[str], sweeps: Mapping[str, Sequence[str]]
+) -> list[Setting]:
+    """Return a setting for each combination of values.
+
+    Args:
+        path: the config's file.
+        overrides: of its fields.
+        sweeps: the values of each field. A field without a dot is that of all entries.
+
+    Raises:
+        ConfigError: a combination is no config, or an entry's envs live elsewhere.
+    """
+    num_entries = len(load_config(path, overrides))
+    settings: list[Setting] = []
+    for values in itertools.product(*sweeps.values()):
+        chosen = dict(zip(sweeps, values, strict=True))
+        configs = load_config(
+            path,
+            [
+                *overrides,
+                *(
+                    f"{name if '.' in name else f'envs.{k}.{name}'}={value}"
+                    for name, value in chosen.items()
+                    for k in range(num_entries)
+                ),
+            ],
+        )
+        _check_here(configs)
+        words = ", ".join(f"{name}={value}" for name, value in chosen.items())
+        settings.append(Setting(tuple(configs), words or "as configured"))
+    return settings
+
+
+def _check_here(configs: Sequence[EnvConfig]) -> None:
     for config in configs:
         if config.backend == "env_server" or config.placement == "ray":
             raise ConfigError(
                 f"entry {config.name!r}: its envs live elsewhere, so there is nothing to choose; "
                 "use rollout to measure it"
             )
-    settings: dict[tuple[object, ...], Setting] = {}
-    for setting in _candidates(configs, num_cores()):
-        sizes = tuple(config.num_workers for config in setting.configs)
-        settings.setdefault((setting.placement, setting.workers, sizes), setting)
-    return list(settings.values())
 
 
 def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
@@ -176,7 +217,4 @@ def _batched(config: EnvConfig, num_shares: int) -> EnvConfig:
         return config
     total = config.num_workers * config.num_envs
     count = num_batches(total, num_shares)
-    # A configured `min_results` was meant for another number of envs.
-    return config.model_copy(
-        update={"num_workers": count, "num_envs": total // count, "min_results": None}
-    )
+    return config.model_copy(update={"num_workers": count, "num_envs": total // count})

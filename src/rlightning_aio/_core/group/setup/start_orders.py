@@ -19,7 +19,7 @@ from rlightning_aio.sharing import envs_per_worker
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["start_orders"]
+__all__ = ["nums_hosts", "start_orders"]
 
 Share: TypeAlias = "list[tuple[int, PreprocessFn | None]]"
 """The envs of a host: their positions in the entry, and their preprocess functions."""
@@ -63,10 +63,10 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
         if not place_of(config).max_members
     ]
-    nums_hosts = _nums_hosts([config for config, _ in local], num_cores)
+    counts = nums_hosts([config for config, _ in local], num_cores)
     return [
         (config, share)
-        for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
+        for (config, fns), num_hosts in zip(local, counts, strict=True)
         for share in _shares(config, fns, num_hosts)
     ]
 
@@ -104,7 +104,7 @@ def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
     return config.model_copy(update={"task": tuple(makers[k] for k in indices)})
 
 
-def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
+def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     """The number of hosts of each entry.
 
     With ``envs_per_process: auto``, entries of CPU-bound simulators share the cores in proportion

@@ -1,6 +1,6 @@
 """Suggest a faster setting from measured times.
 
-Rule: a hint is a guess from a few numbers, and each is logged once; ``rlightning-aio tune``
+Rule: a hint is a guess from a few numbers, and each is logged once; ``rlightning-aio bench``
 measures. An ordinary step pays for hints with one comparison.
 """
 
@@ -177,7 +177,7 @@ class Hints:
         configs = [r.config for r in self._records if r.config.name not in warned]
         text = hint(configs, workers, num_cores, stats.summary()["latency_us"])
         if text is not None:
-            _log.info("%s; `rlightning-aio tune` measures what is best", text)
+            _log.info("%s; `rlightning-aio bench` measures what is best", text)
 
 
 def _now(records: Sequence[HostRecord]) -> _Since | None:
