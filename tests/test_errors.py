@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 KINDS = [kind for name in errors.__all__ if issubclass(kind := getattr(errors, name), Exception)]
-VALUES: dict[str, Any] = {"str": "some text", "int | None": -9}
+VALUES: dict[str, Any] = {"str": "some text", "int | None": -9, "Blame": "env"}
 """Arguments by annotation."""
 COPIES: list[Callable[[Any], Any]] = [
     *(lambda error, p=p: pickle.loads(pickle.dumps(error, p)) for p in range(6)),

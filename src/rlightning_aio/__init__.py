@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         ConfigError,
         EnvAway,
         EnvBusy,
+        EnvError,
         EnvFault,
         EnvHung,
         EnvRaised,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         UnknownEnv,
         WorkerDied,
     )
+    from rlightning_aio.outcomes import Outcome
     from rlightning_aio.registry import ENVS
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -46,6 +48,7 @@ _HOMES = {
         "ConfigError",
         "EnvAway",
         "EnvBusy",
+        "EnvError",
         "EnvFault",
         "EnvHung",
         "EnvRaised",
@@ -59,6 +62,7 @@ _HOMES = {
         "WorkerDied",
     ),
     "_core.group.api.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
+    "outcomes": ("Outcome",),
     "registry": ("ENVS",),
     "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
 }
@@ -74,6 +78,7 @@ __all__ = [
     "EnvAway",
     "EnvBusy",
     "EnvConfig",
+    "EnvError",
     "EnvFault",
     "EnvGroup",
     "EnvHandle",
@@ -85,6 +90,7 @@ __all__ = [
     "MultiAgentEnvRet",
     "NotInitialised",
     "NothingPending",
+    "Outcome",
     "PolicyResponse",
     "RLightningError",
     "SnapshotError",

@@ -11,7 +11,12 @@ from __future__ import annotations
 import builtins
 import functools
 import traceback
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
+
+from rlightning_aio.outcomes import Outcome
+
+if TYPE_CHECKING:
+    from rlightning_aio.outcomes import Blame, OutcomeKind
 
 __all__ = [
     "ActionRefused",
@@ -21,6 +26,7 @@ __all__ = [
     "EnvAborted",
     "EnvAway",
     "EnvBusy",
+    "EnvError",
     "EnvFault",
     "EnvHung",
     "EnvRaised",
@@ -138,12 +144,17 @@ class EnvFault(RLightningError):
         results: of `step` and `reset`: a `BatchedData` of the envs of the same call that succeeded;
             None if there are none.
         others: further faults of the same call.
+        outcome: of the episode that the fault has ended: what happened, and who can be to blame.
     """
+
+    _outcome: ClassVar[tuple[OutcomeKind, Blame]] = "env_died", "env"
+    """Kind and blame where nothing more is known."""
 
     def __init__(self, message: str, *, env_id: str) -> None:
         # Not `super()`: a builtin exception among the bases may need more than a message.
         BaseException.__init__(self, message)
         self.env_id = env_id
+        self.outcome = Outcome(*self._outcome, message.strip().partition("\n")[0], env_id)
         self.results: Any = None
         self.others: tuple[EnvFault, ...] = ()
 
@@ -161,6 +172,8 @@ class EnvRaised(EnvFault):
         exception_text: ``str()`` of the remote exception.
         traceback_text: the remote traceback as text.
     """
+
+    _outcome = "env_raised", "either"
 
     def __init__(
         self,
@@ -201,6 +214,8 @@ class ActionRefused(EnvRaised, BadAction):
 
     Unlike for other bad actions, the batch was sent, and the other envs have stepped.
     """
+
+    _outcome = "env_raised", "policy"
 
 
 _WITHOUT_KIND: Final = (BaseExceptionGroup, StopIteration, StopAsyncIteration)
@@ -261,9 +276,13 @@ class EnvHung(WorkerDied):
     ``stderr_tail`` ends with the stacks of the worker's threads.
     """
 
+    _outcome = "env_hung", "either"
+
 
 class EnvAway(EnvFault):
     """The client of a remote env is not connected; it may come back."""
+
+    _outcome = "env_away", "infrastructure"
 
 
 class EnvAborted(EnvFault):
@@ -271,6 +290,8 @@ class EnvAborted(EnvFault):
 
     The env is free; its episode is over.
     """
+
+    _outcome = "cancelled", "caller"
 
 
 class EpisodeLost(EnvFault):
@@ -286,6 +307,24 @@ class EpisodeLost(EnvFault):
 
 class StartFailed(EnvFault):
     """An env could not be built; ``init`` has stopped all workers."""
+
+    _outcome = "not_started", "env"
+
+
+class EnvError(RLightningError, RuntimeError):
+    """Raised by an env that knows who is to blame for what went wrong.
+
+    The `EnvRaised` in the trainer has the blame in its `outcome`. Any exception of an env may have
+    such an attribute ``blame``.
+
+    Args:
+        message: what went wrong.
+        blame: see `Outcome`.
+    """
+
+    def __init__(self, message: str, *, blame: Blame) -> None:
+        super().__init__(message)
+        self.blame = blame
 
 
 class ClientRefused(RLightningError, ConnectionError):

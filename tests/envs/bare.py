@@ -9,12 +9,12 @@ from rlightning_aio.envs.tensors import as_numpy
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Outcome
+    from rlightning_aio.envs.contract import Expected
 
 
 def gymnasium_outcomes(
     env: Any, seed: Any, actions: Sequence[Any], *, resets_itself: bool = False
-) -> Iterator[Outcome]:
+) -> Iterator[Expected]:
     """Of a `gymnasium.Env`, or of a vector environment that resets itself."""
     observation, _ = env.reset(seed=seed)
     yield as_numpy(observation), 0.0, False, False

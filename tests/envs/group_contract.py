@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
-from rlightning_aio.envs.contract import EnvContract, Outcome, outcome_of, same
+from rlightning_aio.envs.contract import EnvContract, Expected, same, values_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -40,7 +40,7 @@ class GroupContract(EnvContract):
         for k, outcomes in enumerate(alone):
             for index, (batch, outcome) in enumerate(zip(together, outcomes, strict=True)):
                 result = batch.values()[k]
-                assert same_outcome(outcome_of(result), outcome), (
+                assert same_outcome(values_of(result), outcome), (
                     f"env {k}, outcome {index}: {result} is not {outcome}"
                 )
             expected = list(episodes(meta, outcomes))
@@ -62,7 +62,7 @@ def batches(group: sync.EnvGroup, seed: int, actions: Sequence[Any]) -> Iterator
             yield group.step(BatchedData(group.env_ids, responses))[0]
 
 
-def same_outcome(one: Outcome, other: Outcome) -> bool:
+def same_outcome(one: Expected, other: Expected) -> bool:
     """Return True if two outcomes are equal; missing values equal any."""
     return same(one[0], other[0]) and all(map(_same_column, one[1:], other[1:]))
 
@@ -73,7 +73,7 @@ def _same_column(one: Any, other: Any) -> bool:
     return np.array_equal(*np.broadcast_arrays(one, other))
 
 
-def episodes(meta: EnvMeta, outcomes: Iterable[Outcome]) -> Iterator[tuple[float, int]]:
+def episodes(meta: EnvMeta, outcomes: Iterable[Expected]) -> Iterator[tuple[float, int]]:
     """Return length and return of each finished episode, by agent and sub-environment."""
     streams: dict[Any, list[tuple[float, bool]]] = {}
     for _, *columns in outcomes:

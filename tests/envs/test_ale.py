@@ -10,7 +10,7 @@ from envs.bare import gymnasium_outcomes
 from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import Outcome, outcome_of, same
+from rlightning_aio.envs.contract import Expected, same, values_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
@@ -39,7 +39,7 @@ def make(config: EnvConfig) -> ALEEnv:
 class TestRawFrames(GroupContract):
     config = entry()
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         return gymnasium_outcomes(gym.make("ALE/Pong-v5"), self.seed, actions)
 
 
@@ -52,7 +52,7 @@ class TestPreprocessedStack(GroupContract):
         },
     )
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         game = gym.make("ALE/Breakout-v5", frameskip=1)
         frames = AtariPreprocessing(game, terminal_on_life_loss=True, screen_size=(84, 96))
         return gymnasium_outcomes(FrameStackObservation(frames, 4), self.seed, actions)
@@ -61,7 +61,7 @@ class TestPreprocessedStack(GroupContract):
 class TestStepLimit(GroupContract):
     config = entry(max_episode_steps=30, env_kwargs={"preprocessing": True})
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         frames = AtariPreprocessing(gym.make("ALE/Pong-v5", frameskip=1))
         return gymnasium_outcomes(TimeLimit(frames, 30), self.seed, actions)
 
@@ -69,7 +69,7 @@ class TestStepLimit(GroupContract):
 class TestVectorOfRawFrames(GroupContract):
     config = entry("ALE/Breakout-v5", 3)
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         games = gym.make_vec(
             "ALE/Breakout-v5",
             num_envs=3,
@@ -94,7 +94,7 @@ class TestVectorOfPreprocessedStacks(GroupContract):
         "ALE/Breakout-v5", 3, env_kwargs={"preprocessing": {"noop_max": 12}, "frame_stack": 4}
     )
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         games = gym.make_vec(
             "ALE/Breakout-v5",
             num_envs=3,
@@ -138,9 +138,9 @@ def test_a_vector_plays_the_same_games_as_single_envs(preprocessing: Any) -> Non
         single.reset(seed=11 + k)
     steps = 0
     for action in actions:
-        together = outcome_of(vector.step(PolicyResponse("atari-0", action)))
+        together = values_of(vector.step(PolicyResponse("atari-0", action)))
         for k, single in enumerate(singles):
-            alone = outcome_of(single.step(PolicyResponse("atari-0", action[k])))
+            alone = values_of(single.step(PolicyResponse("atari-0", action[k])))
             assert same([column[k] for column in together[1:]], list(alone[1:]))
             # The last raw frames of a game may differ.
             assert same(together[0][k], alone[0]) or alone[2]

@@ -11,7 +11,7 @@ from envs.group_contract import GroupContract
 
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import Outcome, outcome_of, same
+from rlightning_aio.envs.contract import Expected, same, values_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
@@ -40,7 +40,7 @@ def make(*args: Any, **fields: Any) -> EnvPoolEnv:
 
 
 class PoolContract(GroupContract):
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         limit = self.config.max_episode_steps
         pool = envpool.make(
             self.config.task,
@@ -67,7 +67,7 @@ class TestAtari(PoolContract):
 class TestPoolOfOne(GroupContract):
     config = entry(num_envs=1)
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         pool = envpool.make("CartPole-v1", env_type="gymnasium", num_envs=1, seed=self.seed)
         batched = gymnasium_outcomes(
             pool, None, [np.array([a]) for a in actions], resets_itself=True
@@ -92,7 +92,7 @@ def test_results_equal_those_of_the_pools_methods(task: str) -> None:
         action = space.sample()
         pool.send(action, info["env_id"])
         if result.info["elapsed_step"].any():
-            outcome = outcome_of(result)
+            outcome = values_of(result)
             assert same(outcome, (observation, reward, terminated, truncated))
             assert outcome[1].dtype == reward.dtype
         result = env.step(PolicyResponse("pool-0", action))
@@ -241,9 +241,9 @@ def test_asynchronous_pools_can_be_reset_while_they_compute() -> None:
 def test_a_seed_or_a_list_of_seeds() -> None:
     """Sub-environment k gets seed + k, or element k of a list."""
     env = make()
-    start = outcome_of(env.reset(seed=7))
-    assert same(start, outcome_of(env.reset(seed=[7, 8, 9, 10])))
-    assert not same(start, outcome_of(env.reset(seed=[8, 7, 9, 10])))
+    start = values_of(env.reset(seed=7))
+    assert same(start, values_of(env.reset(seed=[7, 8, 9, 10])))
+    assert not same(start, values_of(env.reset(seed=[8, 7, 9, 10])))
     with pytest.raises(ValueError, match="'pool-0': 2 seeds for 4 sub-environments"):
         env.reset(seed=[1, 2])
     env.close()

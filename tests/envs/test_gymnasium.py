@@ -17,13 +17,13 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Outcome
+    from rlightning_aio.envs.contract import Expected
 
 
 class GymnasiumContract(GroupContract):
     num_steps = 300
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         env = gym.make(
             self.config.task,
             max_episode_steps=self.config.max_episode_steps,

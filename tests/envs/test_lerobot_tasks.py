@@ -17,7 +17,7 @@ from rlightning_aio.evaluation import EpisodeSpec, evaluate
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Outcome
+    from rlightning_aio.envs.contract import Expected
 
 pytest.importorskip("gym_pusht")
 pytest.importorskip("gym_aloha")
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.simulators
 class TestPushT(GroupContract):
     config = EnvConfig(name="block", backend="pusht", task="PushT-v0")
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         env = gym.make("gym_pusht/PushT-v0", disable_env_checker=True)
         return gymnasium_outcomes(env, self.seed, actions)
 

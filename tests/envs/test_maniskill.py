@@ -16,7 +16,7 @@ from envs.group_contract import GroupContract
 
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import Outcome, same
+from rlightning_aio.envs.contract import Expected, same
 from rlightning_aio.envs.simulators.vulkan import render_device_is_usable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
@@ -65,7 +65,7 @@ def step(env: ManiskillEnv, action: Any = None) -> EnvRet:
 class ManiskillContract(GroupContract):
     num_steps = 70  # Episodes have 50.
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         kwargs = {} if render_device_is_usable() else {"render_backend": "none"}
         env = gym.make(
             self.config.task,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     import rlightning_aio as rl
-    from rlightning_aio.envs.contract import Outcome
+    from rlightning_aio.envs.contract import Expected
 
 pytest.importorskip("metaworld")
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
@@ -53,7 +53,7 @@ class TestOneTask(GroupContract):
     num_steps = 40
     config = entry("drawer-close-v3", env_kwargs={"terminate_on_success": False})
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         env = simulator_of("drawer-close-v3")
         yield begun(env, self.seed), 0.0, False, False
         for action in actions:

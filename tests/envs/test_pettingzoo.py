@@ -19,7 +19,7 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Outcome
+    from rlightning_aio.envs.contract import Expected
     from rlightning_aio.envs.simulators.pettingzoo import PettingZooEnv
     from rlightning_aio.types import MultiAgentEnvRet
 
@@ -48,7 +48,7 @@ def make(task: str, **fields: Any) -> PettingZooEnv:
     return PettingZooEnv(entry(task, **fields))
 
 
-def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[Outcome]:
+def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[Expected]:
     """For a parallel environment whose agents stay together."""
     nothing = dict.fromkeys(env.possible_agents, 0.0)
     nobody = dict.fromkeys(env.possible_agents, False)
@@ -66,7 +66,7 @@ def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[O
 class TestSimpleSpread(GroupContract):
     config = entry("mpe2.simple_spread_v3", env_kwargs={"N": 4, "continuous_actions": True})
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         env = simple_spread_v3.parallel_env(N=4, continuous_actions=True)
         return parallel_outcomes(env, self.seed, actions)
 
@@ -74,7 +74,7 @@ class TestSimpleSpread(GroupContract):
 class TestAgentsWithDifferentSpaces(GroupContract):
     config = entry("mpe2.simple_tag_v3")
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         return parallel_outcomes(simple_tag_v3.parallel_env(), self.seed, actions)
 
     def test_spaces_are_dicts_by_agent(self) -> None:
@@ -90,7 +90,7 @@ class TestRegistered(GroupContract):
     config = entry("sisl/pursuit-v5", env_kwargs={"n_pursuers": 3, "max_cycles": 25})
     num_steps = 60
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         env = pettingzoo.make("parallel", "sisl/pursuit-v5", n_pursuers=3, max_cycles=25)
         return parallel_outcomes(env, self.seed, actions)
 

@@ -19,6 +19,7 @@ from rlightning_aio._core.group.episodes.continuity import (
 )
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
@@ -40,8 +41,10 @@ def part_of(slots: Any, is_reset: Any, over: Any) -> Any:
     return SimpleNamespace(slots=np.array(slots), flags=flags, positions=None)
 
 
+KILLED = Loss("was killed", "env_died", "env", "env-1")
+AGAIN = Loss("was killed again", "env_died", "env")
 EVENTS: dict[LossEvent, Callable[[Continuity], object]] = {
-    LossEvent.EPISODE_LOST: lambda c: c.lose([0], "was killed", from_checkpoint=True),
+    LossEvent.EPISODE_LOST: lambda c: c.lose([0], KILLED, from_checkpoint=True),
     LossEvent.REPORT_SENT: lambda c: c.report_losses(SLOT, ~STEP),
     LossEvent.RESUME_SENT: lambda c: c.report_losses(SLOT, STEP),
     LossEvent.RESET_SENT: lambda c: c.note_resets([0]),
@@ -108,11 +111,11 @@ def test_a_lost_episode_resumes_from_its_last_valid_checkpoint() -> None:
         continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
     continuity.save(0, b"sixth", 6, before=False, is_step=True)
     continuity.drop_unfinished([0], {6})
-    continuity.lose([0], "was killed", "env-1", from_checkpoint=True)
+    continuity.lose([0], KILLED, from_checkpoint=True)
     assert continuity.checkpoints([0]) == (b"third",)
     reports, seeds = continuity.report_losses(SLOT, STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [AS_RESTORED])
-    assert continuity.take_answers(SLOT) == [Report(0, "was killed", "env-1", 2)]
+    assert continuity.take_answers(SLOT) == [Report(0, KILLED, 2)]
     shown = part_of([0], [True], [False])
     continuity.returned(SLOT, [shown], continuity.judge(SLOT, [shown]))
     assert continuity.positions(SLOT) == [Position(3, is_cut=False)]
@@ -123,16 +126,16 @@ def test_an_env_that_is_being_reset_or_due_does_not_resume() -> None:
     continuity = in_phase(LossPhase.LOST)
     reports, seeds = continuity.report_losses(SLOT, ~STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [NO_SEED])
-    assert continuity.take_answers(SLOT) == [Report(0, "was killed", None, None)]
+    assert continuity.take_answers(SLOT) == [Report(0, KILLED, None)]
 
 
 def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
     """Although its request is a reset by then."""
     continuity = in_phase(LossPhase.RESUMING)
-    continuity.lose([0], "was killed again", from_checkpoint=True)
+    continuity.lose([0], AGAIN, from_checkpoint=True)
     _, seeds = continuity.report_losses(SLOT, ~STEP)
     assert seeds.tolist() == [AS_RESTORED]
-    assert continuity.take_answers(SLOT) == [Report(0, "was killed again", None, 0)]
+    assert continuity.take_answers(SLOT) == [Report(0, AGAIN, 0)]
 
 
 def test_the_steps_before_a_restore_are_not_lost_by_a_death_after_it() -> None:
@@ -143,10 +146,10 @@ def test_the_steps_before_a_restore_are_not_lost_by_a_death_after_it() -> None:
         continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
     continuity.save(0, b"restored", 4, before=False, is_step=False)
     continuity.note_shows([0], [Position(1, is_cut=False)])
-    continuity.lose([0], "was killed", from_checkpoint=True)
+    continuity.lose([0], KILLED, from_checkpoint=True)
     assert continuity.checkpoints([0]) == (b"restored",)
     continuity.report_losses(SLOT, ~STEP)
-    assert continuity.take_answers(SLOT) == [Report(0, "was killed", None, 0)]
+    assert continuity.take_answers(SLOT) == [Report(0, KILLED, 0)]
 
 
 def test_an_env_that_is_put_back_after_a_death_knows_how_many_steps_it_has_lost() -> None:
@@ -155,7 +158,7 @@ def test_an_env_that_is_put_back_after_a_death_knows_how_many_steps_it_has_lost(
     continuity.save(0, b"a reset", 1, before=True, is_step=False)
     for _ in range(3):
         continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
-    continuity.lose([0], "was killed", from_checkpoint=True)
+    continuity.lose([0], KILLED, from_checkpoint=True)
     continuity.save(0, b"put back", 2, before=True, is_step=False)
     assert continuity.positions(SLOT) == [Position(0, is_cut=False)]
 
@@ -175,6 +178,6 @@ def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: Los
 def test_an_env_that_was_not_built_anew_does_not_resume() -> None:
     """It has no state of its checkpoint that it could show."""
     continuity = in_phase(LossPhase.INTACT)
-    continuity.lose([0], "could not be put back")
+    continuity.lose([0], KILLED)
     _, seeds = continuity.report_losses(SLOT, STEP)
     assert seeds.tolist() == [NO_SEED]

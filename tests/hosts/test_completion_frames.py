@@ -22,6 +22,7 @@ from rlightning_aio._core.hosts.messages import (
     Value,
 )
 from rlightning_aio.errors import EnvHung
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.info import InfoSchema
 
@@ -65,8 +66,8 @@ def test_a_completion_arrives_as_it_was(completion: Completion) -> None:
     assert sent(completion._replace(host_id=0)) == completion
 
 
-@pytest.mark.parametrize("restarted", ["", "hung in a step"])
-def test_what_is_out_of_band_stays_pickled(restarted: str) -> None:
+@pytest.mark.parametrize("restarted", [None, Loss("hung in a step", "env_hung", "either", "one-0")])
+def test_what_is_out_of_band_stays_pickled(restarted: Loss | None) -> None:
     """Whoever collects the result reads it."""
     arrived = sent(Result(5, STEP, {"info": {"a": 1}}, restarted=restarted))
     assert isinstance(arrived, Result)

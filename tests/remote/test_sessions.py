@@ -14,7 +14,7 @@ from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
 from rlightning_aio.protocol.net import client_registry
 from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
-from rlightning_aio.protocol.net.payload import Outcome
+from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.protocol.net.wire import MAX_NESTING, ClientHello, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
@@ -573,7 +573,7 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
     assert client.todo is not None
     number, client.todo = client.todo.number, None
     info: dict[Any, Any] = {"fine": {1: 2}, 0: "cup"}
-    outcome = Outcome(client.observation(), 1.0, False, False)
+    outcome = ResultFields(client.observation(), 1.0, False, False)
     # Like a client that forwards the results of a bare step.
     client.session.answer(number, outcome, info, {}, 0, 0)
     client.flush()

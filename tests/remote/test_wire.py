@@ -17,7 +17,7 @@ from remote.random_spaces import any_info, any_space, same, sampled
 
 from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.net import wire
-from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.net.payload import Packed, ResultFields, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace, describe, space_from
 from rlightning_aio.protocol.net.wire import (
     ClientResult,
@@ -78,7 +78,7 @@ def test_rewards_and_flags_survive_for_agents_and_sub_environments(
         return dict.fromkeys(agents, value) if agents else value
 
     reward, ended = per_agent(np.full(shape, 0.5)), per_agent(np.ones(shape, bool))
-    outcome = Outcome(sampled(space, 3), reward, ended, ended)
+    outcome = ResultFields(sampled(space, 3), reward, ended, ended)
     layout = ResultLayout(space, num_envs, agents)
     packed = Packed([], [])
     header = layout.pack(outcome, packed)

@@ -67,6 +67,12 @@ def plainly(stepped: Any, mode: AutoresetMode) -> Any:
             assert [at_fault[k] for k in np.flatnonzero(mask)] == [
                 f"env-{k}" for k in np.flatnonzero(mask)
             ]
+        if "outcome" in found:
+            mask, outcomes = found.pop("_outcome"), found.pop("outcome")
+            assert [outcomes[k].env_id for k in np.flatnonzero(mask)] == [
+                f"env-{k}" for k in np.flatnonzero(mask)
+            ]
+            assert all(outcomes[k].blame in ("env", "either") for k in np.flatnonzero(mask))
     if "worker_restarted" in infos:
         assert all(infos["worker_restarted"][infos["_worker_restarted"]])
         if mode == AutoresetMode.SAME_STEP:  # There the info of the reset has it too.
@@ -526,7 +532,7 @@ def fields_of(on_worker_death: str) -> dict[str, Any]:
 def causes_of(on_worker_death: str) -> set[str]:
     """Keys of an info that tell of a death."""
     resumed = ["worker_resumed"] if on_worker_death == "resume" else []
-    return {"worker_restarted", "env_at_fault", *resumed}
+    return {"worker_restarted", "env_at_fault", "outcome", *resumed}
 
 
 def observed(envs: VectorEnv, actions: list[int], ends: Any) -> tuple[list[Any], Any]:

@@ -9,10 +9,11 @@ users.
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlightning_aio.batch.endings import all_agents
 from rlightning_aio.batch.infos import joined_infos, sub_env_infos_of_rows
 from rlightning_aio.batch.parts import (
     column_of_parts,
@@ -138,10 +139,3 @@ def names_of(batch: BatchedData) -> EnvNames | None:
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
     """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
     return batch._columns
-
-
-def all_agents(done: Any) -> NDArray[np.bool_]:
-    """Return True for episodes that are over for all of their agents."""
-    if isinstance(done, dict):
-        return np.logical_and.reduce(list(cast("dict[str, Any]", done).values()))
-    return done

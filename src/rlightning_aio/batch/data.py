@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from rlightning_aio.batch.endings import outcomes_of
 from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.batch.parts import (
@@ -247,6 +248,15 @@ class BatchedData:
         A learner that stores transitions must cut the env's chain there.
         """
         return _by_row(self, lambda part: part.by_sub_env(part.restarted))
+
+    @property
+    def outcome(self) -> NDArray[np.object_]:
+        """`Outcome` of the episode that ended with each row, or None; shaped like `is_reset`.
+
+        Where `restarted` is True, that is the episode before, which is lost. An env may say more
+        than its flags do by an `Outcome` in its info, as ``outcome``, where it ends an episode.
+        """
+        return outcomes_of(self, lambda rows: self.take(rows).info())
 
     @property
     def index(self) -> NDArray[np.int64]:

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BareResult, BareStep, BaseEnv
 
-__all__ = ["EnvContract", "Outcome", "outcome_of", "same"]
+__all__ = ["EnvContract", "Expected", "same", "values_of"]
 
-Outcome = tuple[Any, Any, Any, Any]
+Expected = tuple[Any, Any, Any, Any]
 """Observation, reward, terminated, truncated; NumPy arrays and Python scalars in them."""
 
 
@@ -53,7 +53,7 @@ class EnvContract:
     num_steps: ClassVar[int] = 200
     seed: ClassVar[int] = 3
 
-    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Expected]:
         """Yield the bare simulator's outcomes of a reset with `seed` and of each action.
 
         Override it to compare the env with the simulator that it wraps. After the end of an
@@ -85,20 +85,20 @@ class EnvContract:
 
     def outcomes(
         self, env: BaseEnv, actions: Sequence[Any], *, seed: int | None = None
-    ) -> Iterator[Outcome]:
+    ) -> Iterator[Expected]:
         """Yield the env's outcomes of a reset with `seed` (or the given one) and of each action.
 
         As in `simulate`, a reset takes the place of the step after the end of an episode, unless
         the env resets itself.
         """
 
-        def step(action: Any) -> Outcome:
-            return outcome_of(_step(env, action))
+        def step(action: Any) -> Expected:
+            return values_of(_step(env, action))
 
-        yield outcome_of(env.reset(seed=self.seed if seed is None else seed))
+        yield values_of(env.reset(seed=self.seed if seed is None else seed))
         ended = False
         for action in actions:
-            outcome = outcome_of(env.reset()) if ended else step(action)
+            outcome = values_of(env.reset()) if ended else step(action)
             ended = _awaits_reset(env, outcome)
             yield outcome
 
@@ -123,7 +123,7 @@ class EnvContract:
             ended = True
             for action in self.actions(env):
                 result = env.reset() if ended else _step(env, action)
-                outcome = outcome_of(result)
+                outcome = values_of(result)
                 _check_membership(self.config.task_name, outcome[0], env.get_observation_space())
                 if not ended:
                     _check_columns(outcome, meta.agents, shape)
@@ -157,12 +157,12 @@ class EnvContract:
         """A returned result stays unchanged during later steps."""
         with self.opened() as env:
             result = env.reset(seed=self.seed)
-            kept = _copied(outcome_of(result))
+            kept = _copied(values_of(result))
             for action in self.actions(env)[:20]:
                 result_before, kept_before = result, kept
                 result = _step(env, action)
-                kept = _copied(outcome_of(result))
-                assert same(outcome_of(result_before), kept_before)
+                kept = _copied(values_of(result))
+                assert same(values_of(result_before), kept_before)
                 if _awaits_reset(env, kept):
                     break
 
@@ -183,7 +183,7 @@ class EnvContract:
             env.reset(seed=self.seed)
             other.reset(seed=self.seed)
             for action in self.actions(env):
-                outcome = outcome_of(_step(env, action))
+                outcome = values_of(_step(env, action))
                 assert same(outcome, tuple(map(as_numpy, bare(action)[:4])))
                 if _awaits_reset(env, outcome):
                     break
@@ -201,8 +201,8 @@ class EnvContract:
             other.reset(seed=self.seed)
             for action in self.actions(env)[:3]:
                 assert same(
-                    outcome_of(_step(env, action)),
-                    outcome_of(_step(other, mapped(tensor, action))),
+                    values_of(_step(env, action)),
+                    values_of(_step(other, mapped(tensor, action))),
                 )
 
     def test_it_is_the_bare_simulator(self) -> None:
@@ -217,11 +217,11 @@ class EnvContract:
                 assert same(one, other), f"outcome {index}: {one} is not {other}"
 
 
-def outcome_of(result: Any) -> Outcome:
+def values_of(result: Any) -> Expected:
     """Return observation, reward and ends of a result, without torch tensors."""
     assert isinstance(result, EnvRet | MultiAgentEnvRet), f"not a result: {result}"
     return cast(
-        "Outcome",
+        "Expected",
         tuple(
             map(
                 as_numpy,
@@ -259,7 +259,7 @@ def _check_membership(task: str, observation: Any, space: gym.Space[Any]) -> Non
         assert space.contains(observation), f"observation not in {space}: {observation}"
 
 
-def _check_columns(outcome: Outcome, agents: tuple[str, ...], shape: tuple[int, ...]) -> None:
+def _check_columns(outcome: Expected, agents: tuple[str, ...], shape: tuple[int, ...]) -> None:
     """Check that rewards and flags have one entry for each agent and sub-environment."""
     for name, value in zip(("reward", "terminated", "truncated"), outcome[1:], strict=True):
         arrays = list(map(np.asarray, _entries(value, agents)))
@@ -295,7 +295,7 @@ def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
     return list(by_agent.values())
 
 
-def _awaits_reset(env: BaseEnv, outcome: Outcome) -> bool:
+def _awaits_reset(env: BaseEnv, outcome: Expected) -> bool:
     """Return True if all have ended, and the env does not reset itself."""
     if env.autoreset != "disabled":
         return False

@@ -22,7 +22,6 @@ from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_numbers
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
-    is_blamed,
     success_of,
     summed_rewards,
 )
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from rlightning_aio.evaluation.episode_video import EpisodeVideo
     from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
     from rlightning_aio.evaluation.results_file import ResultsFile
+    from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["evaluate"]
@@ -394,14 +394,14 @@ class _Play:
             env_id = env_ids[row]
             self._found.lost += int(self._open[self._places(env_id)].sum())
             self._lost.add(env_id)
-            if not is_blamed(env_id, info):
+            lost: Outcome = info["outcome"]
+            if lost.blame == "infrastructure":
                 continue  # Another env of its worker is at fault, and reports so.
             self._losses[env_id] += 1
             if self._losses[env_id] == _LOSSES_IN_A_ROW:
-                cause = info.get("worker_restarted", "its worker ended")
                 raise RLightningError(
                     f"env {env_id!r} has lost an episode with its worker {_LOSSES_IN_A_ROW} times "
-                    f"in a row, and finishes none: {cause}. Episodes start again with their seed, "
-                    "so a crash that depends on it repeats: a list of EpisodeSpec gives such an "
-                    "episode up, and plays the others"
+                    f"in a row, and finishes none: {lost.cause}. Episodes start again with their "
+                    "seed, so a crash that depends on it repeats: a list of EpisodeSpec gives such "
+                    "an episode up, and plays the others"
                 )

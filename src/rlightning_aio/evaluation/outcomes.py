@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["EndlessEpisodes", "is_blamed", "success_of", "summed_rewards"]
+__all__ = ["EndlessEpisodes", "success_of", "summed_rewards"]
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -46,14 +46,6 @@ def summed_rewards(reward: Any) -> NDArray[np.float64]:
     if isinstance(reward, dict):
         reward = np.sum(list(cast("dict[str, Any]", reward).values()), axis=0)
     return np.asarray(reward, np.float64)
-
-
-def is_blamed(env_id: str, info: dict[str, Any]) -> bool:
-    """Return True if an env may have ended its worker, by the info of its marked result.
-
-    Otherwise another env of the worker has, or may have.
-    """
-    return env_id in info.get("suspects", (info.get("env_at_fault", env_id),))
 
 
 def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:

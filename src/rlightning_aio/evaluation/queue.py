@@ -18,7 +18,6 @@ from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
-    is_blamed,
     success_of,
     summed_rewards,
 )
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting.procedure import Procedure
     from rlightning_aio.evaluation.results_file import ResultsFile
+    from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["QueuePlay", "QueueRules"]
@@ -272,8 +272,8 @@ class QueuePlay:
             for row, info in zip(rows, batch.take(rows).info(), strict=True):
                 env_id = env_ids[row]
                 if restarted[row]:
-                    cause = info.get("worker_restarted", "its worker ended")
-                    self._lose(env_id, cause, is_blamed=is_blamed(env_id, info))
+                    lost: Outcome = info["outcome"]
+                    self._lose(env_id, lost.cause, is_blamed=lost.blame != "infrastructure")
                 else:
                     self._end(env_id, info)
                 if env_id not in self._gone:

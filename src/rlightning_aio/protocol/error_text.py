@@ -6,16 +6,23 @@ import traceback
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rlightning_aio.outcomes import BLAMES
+
 __all__ = ["ErrorText"]
 
 
 @dataclass(frozen=True)
 class ErrorText:
-    """An exception as text, which any process can read, whatever its class."""
+    """An exception as text, which any process can read, whatever its class.
+
+    Attributes:
+        blame: of `Outcome`, as the exception itself says in an attribute of this name; or empty.
+    """
 
     type_name: str
     text: str
     traceback: str
+    blame: str = ""
 
     @property
     def summary(self) -> str:
@@ -34,7 +41,8 @@ class ErrorText:
         except BaseException:  # noqa: BLE001
             frames = traceback.format_tb(_TRACEBACK.__get__(error))
             lines = "".join(frames) + f"{name}: {text}\n"
-        return cls(name, text, lines)
+        blame: Any = getattr(error, "blame", "")
+        return cls(name, text, lines, blame if type(blame) is str and blame in BLAMES else "")
 
 
 def _described(error: BaseException) -> tuple[str, str]:

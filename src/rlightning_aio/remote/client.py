@@ -37,7 +37,7 @@ from rlightning_aio.protocol.net.client_session import (
     StepRequest,
 )
 from rlightning_aio.protocol.net.limited_log import LOG
-from rlightning_aio.protocol.net.payload import Outcome
+from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
 from rlightning_aio.protocol.net.wire import (
     MAX_FRAME_BYTES,
@@ -357,7 +357,7 @@ class RemoteEnvClient:
             busy_ns = time.perf_counter_ns() - began_ns
             self.num_steps += 1
             self._session.answer(
-                request.number, Outcome(*outcome), info, {}, busy_ns, time.time_ns()
+                request.number, ResultFields(*outcome), info, {}, busy_ns, time.time_ns()
             )
             self._flush()
             return

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Deaths", "Stepped", "cause_and_rest"]
 
-_CAUSE: Final = ("worker_restarted", "env_at_fault", "suspects", "worker_resumed")
+_CAUSE: Final = ("worker_restarted", "env_at_fault", "suspects", "worker_resumed", "outcome")
 """Keys of an info that say why its env was restarted, who was at fault, and how much was lost."""
 _OF_AN_END: Final = ("final_info", "final_obs")
 """Keys of an info that a step with same-step autoreset adds where it ends an episode."""

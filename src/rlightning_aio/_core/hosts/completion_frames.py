@@ -65,7 +65,7 @@ def completion_in(host_id: int, frame: Frame) -> Completion:
 
 def _encoded_result(result: Result) -> tuple[FrameKind, int, bytes]:
     payload = dumped(result.out_of_band, "the result")
-    if result.restarted:
+    if result.restarted is not None:
         return FrameKind.RESTARTED, result.entry, pickle.dumps((result.restarted, payload))
     return FrameKind.RESULT, result.entry, payload
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["RestartPolicy", "limits_of", "restart_pause"]
+__all__ = ["RestartPolicy", "hung", "limits_of", "restart_pause"]
 
 _FIRST_SECONDS: Final = 0.1
 _LONGEST_SECONDS: Final = 5.0
@@ -32,6 +33,15 @@ def restart_pause(losses: int) -> float:
     return min(_FIRST_SECONDS * 2.0 ** min(losses - 2, 10), _LONGEST_SECONDS)
 
 
+def hung(cause: str, op: int, at_fault: str | None) -> Loss:
+    """Return the loss of an env that has exceeded the time limit of an operation.
+
+    A step executes an action and a call has arguments, which may be why it takes so long.
+    """
+    blame = "either" if op in (Operation.STEP, Operation.CALL) else "env"
+    return Loss(cause, "env_hung", blame, at_fault)
+
+
 class RestartPolicy:
     """How many losses in a row an entry bears, of a worker or of an awaitable env.
 
@@ -52,7 +62,7 @@ class RestartPolicy:
         """Return True if a restart follows `losses` in a row."""
         return not self.raises and losses <= self._most
 
-    def outcome(self, losses: int) -> str:
+    def then(self, losses: int) -> str:
         """Say in a clause what follows `losses` in a row."""
         if self.raises:
             return f"on_worker_death is 'raise', so it is not {self._done}"

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.errors import EnvFault
+    from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import RowLayout, Slab
     from rlightning_aio.types import ClientTraits, EnvMeta
@@ -251,15 +252,15 @@ class Result(NamedTuple):
 
     Attributes:
         is_loss: the result is not from the env, but marks that it is gone.
-        restarted: the reason why the env was rebuilt, if it was: the result is the first of a new
-            episode, and the previous episode is lost.
+        restarted: why the env was rebuilt, if it was: the result is the first of a new episode,
+            and the previous episode is lost.
     """
 
     host_id: int
     entry: int
     out_of_band: bytes | OutOfBand
     is_loss: bool = False
-    restarted: str = ""
+    restarted: Loss | None = None
 
 
 class Value(NamedTuple):

@@ -27,6 +27,7 @@ from rlightning_aio.envs.openenv.session import (
 )
 from rlightning_aio.envs.options import read_options
 from rlightning_aio.errors import BadAction, ConfigError
+from rlightning_aio.outcomes import Outcome
 from rlightning_aio.spaces import Anything
 from rlightning_aio.types import EnvRet
 
@@ -168,7 +169,9 @@ class OpenEnv(BaseEnv):
         except ServerGone as gone:
             repeated = await self._repeated(message)
             if repeated is None:
-                return self._result({"session_lost": str(gone)}, last_truncated=True)
+                away = Outcome("env_away", "infrastructure", str(gone), self.env_id)
+                info = {"session_lost": str(gone), "outcome": away}
+                return self._result(info, last_truncated=True)
             data = repeated
         self._steps += 1
         if self._options.session == "keep" and self._is_counted is None:

@@ -62,6 +62,8 @@ class ServerGone(ConnectionError):
         is_unsent: the request was not sent, so that it has certainly not taken effect.
     """
 
+    blame = "infrastructure"
+
     def __init__(self, message: str, *, is_unsent: bool = False) -> None:
         super().__init__(message)
         self.is_unsent = is_unsent

@@ -13,7 +13,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
-from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.net.payload import Packed, ResultFields, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.texts import in_one_line
 from rlightning_aio.protocol.net.wire import (
@@ -342,7 +342,9 @@ class ClientSession:
 
     def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet, busy_ns: int = 0) -> None:
         """Answer request `number` with what `reset` or `step` of a `BaseEnv` returned."""
-        outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
+        outcome = ResultFields(
+            ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated
+        )
         # The contract gives this field its name.
         extra = ret._extra  # pyright: ignore[reportPrivateUsage]
         sent_ns = min(max(0, ret.ts_env_sent_ns), _LATEST_NS)
@@ -351,7 +353,7 @@ class ClientSession:
     def answer(
         self,
         number: int,
-        outcome: Outcome,
+        outcome: ResultFields,
         info: dict[str, Any],
         extra: dict[str, Any],
         busy_ns: int,

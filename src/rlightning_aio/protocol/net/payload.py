@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["MAX_HEAD", "Outcome", "Packed", "ResultLayout", "SpaceLayout"]
+__all__ = ["MAX_HEAD", "Packed", "ResultFields", "ResultLayout", "SpaceLayout"]
 
 MAX_HEAD = 1 << 20
 """Rewards of one result."""
@@ -201,7 +201,7 @@ def _node_of(space: gym.Space[Any], what: str) -> _Node:
     return _Number(space, what) if isinstance(space, spaces.Discrete) else _Array(space, what)
 
 
-class Outcome(NamedTuple):
+class ResultFields(NamedTuple):
     """One env's result as values: dicts by agent for multi-agent envs."""
 
     observation: Any
@@ -234,7 +234,7 @@ class ResultLayout:
         if prod(self.head) > MAX_HEAD:
             raise WireError(f"{prod(self.head)} rewards in one result; {MAX_HEAD} are allowed")
 
-    def pack(self, outcome: Outcome, packed: Packed) -> Outcome:
+    def pack(self, outcome: ResultFields, packed: Packed) -> ResultFields:
         """Append `outcome` to `packed`; return the part that belongs in the header.
 
         Raises:
@@ -243,11 +243,11 @@ class ResultLayout:
         self._observation.pack(outcome.observation, packed)
         if not self.head:
             _, reward, terminated, truncated = outcome
-            return Outcome(None, float(reward), bool(terminated), bool(truncated))
+            return ResultFields(None, float(reward), bool(terminated), bool(truncated))
         for name, dtype in (("reward", "float64"), ("terminated", "bool"), ("truncated", "bool")):
             column = self._column(getattr(outcome, name), name)
             packed.frames.append(column.astype(DTYPES[dtype]).tobytes())
-        return Outcome(None, None, None, None)
+        return ResultFields(None, None, None, None)
 
     def _column(self, value: Any, name: str) -> NDArray[Any]:
         try:
@@ -260,7 +260,7 @@ class ResultLayout:
 
     def unpack(
         self, frames: Sequence[Part], texts: Sequence[str], header: tuple[Any, Any, Any]
-    ) -> Outcome:
+    ) -> ResultFields:
         """Return the outcome at the start of `frames`; `header` is the part that `pack` returned.
 
         Raises:
@@ -270,19 +270,19 @@ class ResultLayout:
         if not self.head:
             if None in header:
                 raise WireError("a result lacks its reward or a flag")
-            return Outcome(observation, *header)
+            return ResultFields(observation, *header)
         rest = frames[self._observation.num_frames :]
         if len(rest) < 3:
             raise WireError("a result lacks the frames of its rewards and flags")
         columns = (form.read(part) for form, part in zip(self._columns, rest, strict=False))
-        return Outcome(observation, *map(self._by_agent, columns))
+        return ResultFields(observation, *map(self._by_agent, columns))
 
     def _by_agent(self, column: NDArray[Any]) -> Any:
         return dict(zip(self._agents, column, strict=True)) if self._agents else column
 
-    def cut_short(self, observation: Any) -> Outcome:
+    def cut_short(self, observation: Any) -> ResultFields:
         """Return an outcome that is truncated at `observation`."""
         if not self.head:
-            return Outcome(observation, 0.0, False, True)
+            return ResultFields(observation, 0.0, False, True)
         reward, flags = np.zeros(self.head), np.zeros(self.head, bool)
-        return Outcome(observation, *map(self._by_agent, (reward, flags, ~flags)))
+        return ResultFields(observation, *map(self._by_agent, (reward, flags, ~flags)))

@@ -13,6 +13,7 @@ import numpy as np
 
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio.errors import EnvAborted
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.registry import ENVS
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Aborts"]
 
-_CAUSE: Final = "was aborted"
+_WHY: Final = Loss("was aborted", "cancelled", "caller")
 
 
 class Aborts:
@@ -100,4 +101,4 @@ class Aborts:
         for slot in chosen:
             backend = self._envs.configs[slot].backend
             if slot < len(self._envs.all) and not ENVS.is_hardware(backend):
-                self._continuity.abandon([slot], _CAUSE)
+                self._continuity.abandon([slot], _WHY)

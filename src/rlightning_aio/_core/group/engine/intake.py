@@ -7,6 +7,7 @@ replacement.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.errors import EnvFault
+    from rlightning_aio.outcomes import Blame
 
 __all__ = ["Intake"]
 
@@ -107,11 +109,10 @@ class Intake:
         if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
         if completion.is_loss:
-            self._results.mark_lost(slot)
-        if completion.restarted:
-            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
-            env_id = self._envs.env_ids[slot]
-            self._results.mark_restarted(Report(slot, completion.restarted, env_id, None))
+            self._results.mark_away(slot)
+        if completion.restarted is not None:
+            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted.cause)
+            self._results.mark_restarted(Report(slot, completion.restarted, None))
         if self._conditions.unusual:
             self._note_answered(self._requests.alone(slot))
 
@@ -138,7 +139,7 @@ class Intake:
                 f"the call of {self._requests.tickets.method(self._requests.owner.item(slot))}()"
             )
             go_on = "the env is still usable"
-        return EnvRaised.of(
+        raised = EnvRaised.of(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "
             f"__cause__ is the remote traceback; {go_on}",
             env_id=self._envs.env_ids[slot],
@@ -146,6 +147,15 @@ class Intake:
             exception_text=error.text,
             traceback_text=error.traceback,
         )
+        begins = op in (Operation.RESET, Operation.RESTORE)
+        known = raised.outcome
+        raised.outcome = replace(
+            known,
+            kind="not_started" if begins else known.kind,
+            blame=cast("Blame", error.blame) or ("env" if begins else known.blame),
+            cause=error.summary,
+        )
+        return raised
 
     def _on_failed(self, completion: Failed) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
@@ -212,8 +222,7 @@ class Intake:
             return
         self._keep_ready(loss.slots)
         if loss.resets:
-            about = loss.death.cause, loss.at_fault, loss.suspects
-            continuity.lose(lost, *about, from_checkpoint=True)
+            continuity.lose(lost, loss.why, from_checkpoint=True)
         # A replacement answers steps and resets, but not calls.
         again = ~requests.numbering.awaits_value(owed) & loss.resets
         self._fail(owed[~again], loss.error)

@@ -10,6 +10,7 @@ import numpy as np
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import UNASKED, copied
+from rlightning_aio.outcomes import Outcome
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -125,18 +126,29 @@ class Results:
         self.detach_info(report.slot)
         found = self._out_of_band.get(report.slot)
         if isinstance(found, dict):
-            info = cast("dict[str, Any]", found["info"])
-            info["worker_restarted"] = report.cause
-            if report.at_fault is not None:
-                info["env_at_fault"] = report.at_fault
-            if report.suspects:
-                info["suspects"] = report.suspects
+            info, why = cast("dict[str, Any]", found["info"]), report.why
+            info["worker_restarted"] = why.cause
+            if why.at_fault is not None:
+                info["env_at_fault"] = why.at_fault
+            if why.suspects:
+                info["suspects"] = why.suspects
             if report.steps_lost is not None:
                 info["worker_resumed"] = report.steps_lost
-        self.mark_lost(report.slot)
+            info["outcome"] = why.outcome(self._envs.env_ids[report.slot])
+        self._mark(report.slot)
 
-    def mark_lost(self, slot: int) -> None:
-        """Mark a result as one whose episode before was lost; it will be truncated."""
+    def mark_away(self, slot: int) -> None:
+        """Mark a result as one of a client that is gone; it will be truncated."""
+        self.detach_info(slot)
+        found = self._out_of_band.get(slot)
+        if isinstance(found, dict):
+            info = cast("dict[str, Any]", found["info"])
+            env_id = self._envs.env_ids[slot]
+            cause = info.get("client_lost", "its client is gone")
+            info["outcome"] = Outcome("env_away", "infrastructure", cause, env_id)
+        self._mark(slot)
+
+    def _mark(self, slot: int) -> None:
         self._restarted[slot] = self._any_restarted = True
         self._conditions.note(BESIDE_ROWS, True)
 

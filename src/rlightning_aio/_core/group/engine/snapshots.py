@@ -7,7 +7,7 @@ be undone. `Continuity` records what the next results then report; `snapshot_for
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from rlightning_aio._core.group.episodes.snapshot_format import (
     unpack,
 )
 from rlightning_aio.errors import EnvFault, SnapshotError, WorkerDied
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.registry import ENVS
 
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
 
 __all__ = ["Snapshots"]
+
+_CANCELLED: Final = Loss("was being restored when that was cancelled", "cancelled", "caller")
+_NOT_PUT_BACK: Final = Loss("could not be put back", "not_started", "env")
 
 
 class Snapshots:
@@ -125,7 +129,7 @@ class Snapshots:
         except EnvFault:
             raise
         except BaseException:
-            self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
+            self._continuity.lose(slots.tolist(), _CANCELLED)
             raise
         positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
         return slots, positions, now
@@ -195,7 +199,7 @@ class Snapshots:
             # What a death means for its envs is settled.
             faults = [one for one in (fault, *fault.others) if not isinstance(one, WorkerDied)]
             lost = [fault.env_id for fault in faults]
-            self._continuity.lose(self._envs.find(lost).tolist(), "could not be put back")
+            self._continuity.lose(self._envs.find(lost).tolist(), _NOT_PUT_BACK)
             return lost
         return []
 

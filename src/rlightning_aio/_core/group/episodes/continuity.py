@@ -28,6 +28,7 @@ from rlightning_aio._core.group.state.conditions import (
     PAST_END,
     Conditions,
 )
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, op_of
 from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
 
@@ -102,6 +103,9 @@ LEGAL: Final[dict[tuple[LossPhase, LossEvent], LossPhase]] = {
 """The phase after each event. A pair that is missing is a bug, and raises."""
 
 
+_NOT_SHOWN: Final = Loss("could not show the state that was restored", "not_started", "env")
+
+
 class Position(NamedTuple):
     """An env's place in its episode: steps since the reset, and if the step limit cut it there."""
 
@@ -113,17 +117,13 @@ class Report(NamedTuple):
     """A loss that the result of a slot reports.
 
     Attributes:
-        cause: what ended the worker.
-        at_fault: the id of the env that the worker was executing; None if unknown.
+        why: it was lost.
         steps_lost: steps to repeat where the env resumes; None where it begins a new episode.
-        suspects: ids; see `WorkerDied`.
     """
 
     slot: int
-    cause: str
-    at_fault: str | None
+    why: Loss
     steps_lost: int | None
-    suspects: tuple[str, ...] = ()
 
 
 class Judged(msgspec.Struct):
@@ -155,9 +155,7 @@ class _Loss:
     """
 
     phase: LossPhase
-    cause: str = "could not show the state that was restored"
-    at_fault: str | None = None
-    suspects: tuple[str, ...] = ()
+    why: Loss = _NOT_SHOWN
     from_checkpoint: bool = False
     resumes: bool = False
     seed: int = NO_SEED
@@ -357,31 +355,21 @@ class Continuity:
 
     # -- replies ----------------------------------------------------------------------
 
-    def lose(
-        self,
-        slots: Iterable[int],
-        cause: str,
-        at_fault: str | None = None,
-        suspects: tuple[str, ...] = (),
-        *,
-        from_checkpoint: bool = False,
-    ) -> None:
+    def lose(self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False) -> None:
         """Record that the episodes of `slots` are lost; nothing is in flight there.
 
-        `cause`, `at_fault` and `suspects` are those of `Report`. `from_checkpoint`: the envs are
-        built anew, from their checkpoints where they have any.
+        `from_checkpoint`: the envs are built anew, from their checkpoints where they have any.
         """
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
-            loss.cause, loss.at_fault, loss.suspects = cause, at_fault, suspects
-            loss.from_checkpoint, loss.seed = from_checkpoint, NO_SEED
+            loss.why, loss.from_checkpoint, loss.seed = why, from_checkpoint, NO_SEED
 
-    def abandon(self, slots: Iterable[int], cause: str) -> None:
+    def abandon(self, slots: Iterable[int], why: Loss) -> None:
         """Record that the caller has ended the episodes of `slots`, whose requests end without a
         reply, or whose results were dropped. No checkpoint of them is used.
         """
         slots = list(slots)
-        self.lose(slots, cause)
+        self.lose(slots, why)
         for slot in slots:
             self._losses[slot].seed = AS_BEFORE
             for kept in (self._pending, self._checkpoints, self._restored):
@@ -395,8 +383,7 @@ class Continuity:
             if loss is None or loss.phase is LossPhase.LOST:
                 continue
             if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING):
-                about = loss.cause, loss.at_fault, loss.steps_lost, loss.suspects
-                reports.append(Report(slot, *about))
+                reports.append(Report(slot, loss.why, loss.steps_lost))
             if loss.position is not None:
                 self._restored[slot] = loss.position
             self._move(slot, LossEvent.ANSWERED)
@@ -409,7 +396,8 @@ class Continuity:
         loss = self._losses.get(slot)
         if loss is None or loss.phase is LossPhase.LOST:
             return None
-        cause = loss.cause if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING) else None
+        reports = loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING)
+        cause = loss.why.cause if reports else None
         self._move(slot, LossEvent.RAISED).from_checkpoint = False
         return cause
 

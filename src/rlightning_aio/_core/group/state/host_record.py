@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import AttachOrder, Death, EnvStarted, ErrorText
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.errors import WorkerDied
+    from rlightning_aio.outcomes import Loss
 
 __all__ = ["HostLoss", "HostRecord", "Stage", "last_lines"]
 
@@ -58,11 +59,10 @@ class HostLoss:
             sets in motion.
         kind: of its errors.
         what: the subject and the cause; last: the last request of the env at fault.
-        outcome: what happens to the worker now.
+        then: what happens to the worker now.
         env_ids: of all envs of the group, by slot.
         env_id: of the env at fault, or else of one that its errors name.
-        at_fault: the id of the env that the worker was executing; None if unknown.
-        suspects: ids; see `WorkerDied`.
+        why: its envs have lost their episodes.
     """
 
     host_id: int
@@ -74,11 +74,10 @@ class HostLoss:
     kind: type[WorkerDied]
     what: str
     last: str
-    outcome: str
+    then: str
     env_ids: Sequence[str]
     env_id: str
-    at_fault: str | None
-    suspects: tuple[str, ...]
+    why: Loss
 
     @property
     def message(self) -> str:
@@ -101,7 +100,7 @@ class HostLoss:
 
     def _message(self, owed: NDArray[np.intp]) -> str:
         names = ", ".join(self._ids(owed)) or "none"
-        return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.outcome}"
+        return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.then}"
 
     def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
         tail = self.death.stderr_tail
@@ -112,7 +111,8 @@ class HostLoss:
             stderr_tail=tail,
         )
         error.env_ids = tuple(self._ids(slots))
-        error.suspects = self.suspects
+        error.suspects = self.why.suspects
+        error.outcome = self.why.outcome(self.env_id)
         return error
 
     def _ids(self, slots: NDArray[np.intp]) -> list[str]:

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
 from rlightning_aio._core.hosts.base import Killable
+from rlightning_aio._core.hosts.limits import hung
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, slot_of
 
 if TYPE_CHECKING:
@@ -144,11 +146,11 @@ def host_loss(
     record: HostRecord,
     death: Death,
     owed: NDArray[np.intp],
-    outcome: str,
+    then: str,
     *,
     replaced: bool,
 ) -> HostLoss:
-    """Describe a death; `outcome` says what happens to the worker now."""
+    """Describe a death; `then` says what happens to the worker now."""
     slot = record.blamed[0]
     slot = record.slots.start if slot is None else slot
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
@@ -170,12 +172,25 @@ def host_loss(
         kind=EnvHung if record.is_hung else WorkerDied,
         what=what,
         last=last,
-        outcome=outcome,
+        then=then,
         env_ids=envs.env_ids,
         env_id=envs.env_ids[slot],
-        at_fault=None if record.culprit is None else envs.env_ids[record.culprit],
-        suspects=tuple(envs.env_ids[slot] for slot in record.suspects),
+        why=_why(envs, requests, record, death.cause),
     )
+
+
+def _why(envs: EnvTable, requests: Requests, record: HostRecord, cause: str) -> Loss:
+    at_fault = None if record.culprit is None else envs.env_ids[record.culprit]
+    suspects = tuple(envs.env_ids[slot] for slot in record.suspects)
+    if record.aborted_slot is not None:
+        return Loss(cause, "cancelled", "caller", at_fault, suspects)
+    if record.is_hung:
+        op = 0 if record.culprit is None else requests.numbering.op(record.culprit)
+        return hung(cause, op, at_fault)._replace(suspects=suspects)
+    if record.refused_since is not None:
+        return Loss(cause, "not_started", "infrastructure", at_fault, suspects)
+    kind = "not_started" if record.late or record.rebuild_error is not None else "env_died"
+    return Loss(cause, kind, "env", at_fault, suspects)
 
 
 @dataclass

@@ -435,17 +435,17 @@ class Supervisor:
         self._note_deaths(True)
         policy = record.restart_policy
         replaced = not is_fault or policy.bears(deaths)
-        outcome = policy.outcome(deaths) if is_fault else "it is replaced"
+        then = policy.then(deaths) if is_fault else "it is replaced"
         if is_fault and replaced and record.is_hardware:
-            outcome += "; it moves nothing until you reset it"
+            then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
-        loss = host_loss(self._envs, requests, record, death, owed, outcome, replaced=replaced)
+        loss = host_loss(self._envs, requests, record, death, owed, then, replaced=replaced)
         self._note_fate("died" if replaced else "given up", loss.host_id, death.cause)
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:
             self.crash_log.note(
-                record.config.name, loss.message, death.cause, loss.at_fault, self._clock()
+                record.config.name, loss.message, death.cause, loss.why.at_fault, self._clock()
             )
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return loss

@@ -13,6 +13,7 @@ import asyncio
 from collections import deque
 from contextvars import Context, copy_context
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,12 +30,13 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     time_collector,
     watched,
 )
-from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of, restart_pause
+from rlightning_aio._core.hosts.limits import RestartPolicy, hung, limits_of, restart_pause
 from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvHung, WorkerDied
+from rlightning_aio.outcomes import Loss, Outcome
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
@@ -49,6 +51,8 @@ __all__ = ["CLOSE_SECONDS", "AwaitedEnvs"]
 
 CLOSE_SECONDS: Final = 0.6
 """How long envs may take to close, where their entry doesn't say."""
+_ABORTED: Final = Loss("was aborted", "cancelled", "caller")
+_CANCELLED: Final = Loss("ended while it was idle: something cancelled its task", "env_died", "env")
 _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
@@ -78,7 +82,7 @@ class _EnvRecord:
         self.entry = 0
         self.arguments: Any = None
         self.losses = 0
-        self.lost = ""
+        self.lost = _CANCELLED
         self.leaving: asyncio.Task[None] | None = None
         self.restoring: asyncio.Task[None] | None = None
         self.fault: WorkerDied | None = None
@@ -329,7 +333,7 @@ class AwaitedEnvs:
             if record.restoring is not None:
                 record.restoring.cancel()
             if record.env is not None:
-                self._put_away(record, record.env, "was aborted")
+                self._put_away(record, record.env, _ABORTED)
             self._finish(record, aborted)
             return
         queued = [one for one in self._queue if one[1] != entry]
@@ -344,14 +348,15 @@ class AwaitedEnvs:
         env = record.env
         if self._ending or env is None:
             return
-        doing = Operation(op_of(record.entry)).name.lower()
+        op = op_of(record.entry)
+        doing = Operation(op).name.lower()
         waits_in = awaited_calls(env.answering)
         message = (
             f"env {record.name!r} took longer than {seconds} s for a {doing} and was cancelled"
         )
         if waits_in:
             message += f" while it waited in {waits_in}"
-        self._put_away(record, env, f"hung in a {doing} and was cancelled")
+        self._put_away(record, env, hung(f"hung in a {doing} and was cancelled", op, record.name))
         self._restore(record, message)
 
     def _on_broken(self, env: AwaitedEnv) -> None:
@@ -359,7 +364,7 @@ class AwaitedEnvs:
         record = self._records[env.index]
         if self._ending or record.env is not env:
             return
-        record.env, record.lost = None, "ended while it was idle: something cancelled its task"
+        record.env, record.lost = None, _CANCELLED
         record.leaving = env.task
 
         late = self._loop.call_later(self._close_seconds, env.cut_short, self._close_seconds)
@@ -367,7 +372,8 @@ class AwaitedEnvs:
         def closed(_: object) -> None:
             late.cancel()
             if env.close_error is not None:
-                record.lost = f"ended while it was idle: {env.close_error.summary}"
+                cause = f"ended while it was idle: {env.close_error.summary}"
+                record.lost = Loss(cause, "env_died", "env", record.name)
             self._note_closed(env)
 
         # No task of ours waits for that: perhaps the event loop ends.
@@ -375,10 +381,10 @@ class AwaitedEnvs:
         if record.entry:  # It has come at the same time.
             self._restore(record)
 
-    def _put_away(self, record: _EnvRecord, env: AwaitedEnv, cause: str) -> None:
+    def _put_away(self, record: _EnvRecord, env: AwaitedEnv, why: Loss) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
         env.leave()
-        record.env, record.lost = None, cause
+        record.env, record.lost = None, why
         record.leaving = self._spawn(self._close(env))
 
     async def _close(self, env: AwaitedEnv) -> None:
@@ -447,16 +453,16 @@ class AwaitedEnvs:
 
     async def _reset(self, record: _EnvRecord, env: AwaitedEnv) -> Result | Raised | None:
         """Begin an episode like the one that was lost; None if that takes too long."""
-        entry, cause = record.entry, record.lost
+        entry, why = record.entry, record.lost
         ended: asyncio.Future[Result | Raised] = self._loop.create_future()
 
         def then(_: Any, entry: int, outcome: Any, error: BaseException | None) -> None:
             if error is None:
-                ended.set_result(Result(self._host_id, entry, outcome or {}, restarted=cause))
+                ended.set_result(Result(self._host_id, entry, outcome or {}, restarted=why))
                 return
             text = ErrorText.of(error)
-            message = f"{text.text} (in the reset after its env {cause})"
-            error_text = ErrorText(text.type_name, message, text.traceback)
+            message = f"{text.text} (in the reset after its env {why.cause})"
+            error_text = replace(text, text=message)
             ended.set_result(Raised(self._host_id, entry, error_text))
 
         env.give(Operation.RESET, entry, env.runner.reset_with, then)
@@ -464,20 +470,24 @@ class AwaitedEnvs:
         await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
         if ended.done():
             return ended.result()
-        self._put_away(record, env, cause)
+        self._put_away(record, env, why)
         return None
 
     def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Failed | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         record.losses += 1
-        outcome = self._restarts.outcome(record.losses)
+        then = self._restarts.then(record.losses)
         if self._restarts.bears(record.losses):
-            log.warning("%s; %s", message, outcome)
+            log.warning("%s; %s", message, then)
             return None
         for_good = self._restarts.raises
         if not for_good:
-            outcome += ", so this request ends here; the next one tries again"
-        fault = kind(f"{message}; {outcome}", env_id=record.name, exit_code=None, stderr_tail="")
+            then += ", so this request ends here; the next one tries again"
+        fault = kind(f"{message}; {then}", env_id=record.name, exit_code=None, stderr_tail="")
+        if kind is EnvHung:
+            fault.outcome = record.lost.outcome(record.name)
+        else:
+            fault.outcome = Outcome("not_started", "env", message, record.name)
         fault.env_ids = (record.name,)
         if for_good:
             record.fault = fault

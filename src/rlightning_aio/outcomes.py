@@ -1,0 +1,126 @@
+"""`Outcome`: how an episode, an attempt or a request ended, and who can have caused that.
+
+Rule: an outcome is made where the cause is known, and carried from there. It says what happened;
+what to retry, replace, mask or score is the caller's choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, get_args
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["BLAMES", "Blame", "Loss", "Outcome", "OutcomeKind", "TimeSpent"]
+
+OutcomeKind: TypeAlias = Literal[
+    "terminated",
+    "truncated",
+    "timed_out",
+    "env_raised",
+    "env_died",
+    "env_hung",
+    "env_away",
+    "not_started",
+    "agent_raised",
+    "cancelled",
+]
+"""See `Outcome`."""
+Blame: TypeAlias = Literal["policy", "either", "env", "infrastructure", "caller"]
+"""See `Outcome`."""
+BLAMES: Final[frozenset[str]] = frozenset(get_args(Blame))
+
+
+class TimeSpent(NamedTuple):
+    """Where the time of an attempt went, in seconds.
+
+    Attributes:
+        env: in resets, steps and calls of its env.
+        agent: in the agent's code between them, which includes its model.
+        waiting: until an env was free.
+    """
+
+    env: float = 0.0
+    agent: float = 0.0
+    waiting: float = 0.0
+
+
+_NONE: Final = TimeSpent()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How an episode or an attempt ended.
+
+    Attributes:
+        kind: ``terminated`` or ``truncated`` by the env or a step limit; any other is a failure:
+            ``timed_out`` (the attempt's time was over), ``env_raised``, ``env_died``, ``env_hung``
+            (it exceeded its time limit), ``env_away`` (a client or a server was lost),
+            ``not_started`` (a reset or a start failed), ``agent_raised``, ``cancelled``.
+        blame: who can have caused it: ``policy``; ``env``; ``either`` of the two, where the request
+            executed an action; ``infrastructure`` (machine, network, another env of the worker);
+            ``caller``.
+        cause: one line for people.
+        env_id: of the env; empty without one.
+        attempt: its number, from 0, among the attempts at the same episode.
+        seconds: where its time went; zeros for a single request.
+    """
+
+    kind: OutcomeKind
+    blame: Blame
+    cause: str
+    env_id: str = ""
+    attempt: int = 0
+    seconds: TimeSpent = _NONE
+
+    @property
+    def is_failure(self) -> bool:
+        """The episode has no end of its own, so it has no return."""
+        return self.kind not in ("terminated", "truncated")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the outcome as JSON values."""
+        return {**asdict(self), "seconds": self.seconds._asdict()}
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Outcome:
+        """Make an outcome from `to_json`.
+
+        Raises:
+            TypeError, ValueError, KeyError: it is no outcome.
+        """
+        fields = {**value}
+        found = cls(seconds=TimeSpent(**fields.pop("seconds")), **fields)
+        if found.kind not in get_args(OutcomeKind) or found.blame not in BLAMES:
+            raise ValueError(f"{value!r} is no outcome")
+        return found
+
+
+class Loss(NamedTuple):
+    """Why envs have lost their episodes.
+
+    Attributes:
+        cause: a clause whose subject is the worker or the env, such as "was killed by SIGKILL".
+        kind: of the outcome of the env at fault.
+        blame: likewise.
+        at_fault: the id of the env that was executing; None if unknown.
+        suspects: without one, ids of those that may be the cause.
+    """
+
+    cause: str
+    kind: OutcomeKind
+    blame: Blame
+    at_fault: str | None = None
+    suspects: tuple[str, ...] = ()
+
+    def concerns(self, env_id: str) -> bool:
+        """Return True if an env itself may be at fault, and not another one of its worker."""
+        return env_id in self.suspects if self.suspects else self.at_fault in (None, env_id)
+
+    def outcome(self, env_id: str) -> Outcome:
+        """The outcome of the episode that an env has lost."""
+        if self.concerns(env_id):
+            return Outcome(self.kind, self.blame, self.cause, env_id)
+        cause = f"{self.cause} (while it executed {self.at_fault})"
+        return Outcome("env_died", "infrastructure", cause, env_id)

@@ -1,0 +1,214 @@
+"""Each failure is a typed outcome: what happened, and who can have caused it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import pickle
+import time
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rlightning_aio as rl
+from rlightning_aio.outcomes import TimeSpent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from faults.driven import Driven
+
+    Start: TypeAlias = Callable[..., Driven]
+
+GO, END, CUT, RAISE, BLAME, DIE, HANG = range(7)
+
+
+class Deeds:
+    """Its action, or the option ``deed`` of its reset, says what it does."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(7)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        del seed
+        self._do((options or {}).get("deed", GO))
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> Any:
+        self._do(action)
+        return np.ones(1), 1.0, bool(action == END), bool(action == CUT), {}
+
+    def _do(self, deed: int) -> None:
+        if deed == RAISE:
+            raise ValueError("as asked")
+        if deed == BLAME:
+            raise rl.EnvError("the action is nonsense", blame="policy")
+        if deed == DIE:
+            os._exit(3)
+        if deed == HANG:
+            time.sleep(3600)
+
+
+class Fails(Deeds, gym.Env[Any, Any]):
+    """The same as an env of Gymnasium."""
+
+
+class Awaited(Deeds):
+    """The same with coroutines."""
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        if (options or {}).get("deed") == HANG:
+            await asyncio.sleep(3600)
+        return super().reset(seed=seed, options=options)
+
+    async def step(self, action: Any) -> Any:
+        if action == HANG:
+            await asyncio.sleep(3600)
+        return super().step(action)
+
+
+def entry(**fields: Any) -> dict[str, Any]:
+    limits = {"step_timeout": 0.4, "reset_timeout": 0.4}
+    place = {} if fields.get("placement") == "loop" else {"envs_per_process": 2}
+    return {"name": "f", "task": Fails, "num_workers": 2, **place, **limits, **fields}
+
+
+def step(group: Driven, *actions: int) -> rl.BatchedData:
+    ids = group.group.env_ids
+    values = [rl.PolicyResponse(i, action) for i, action in zip(ids, actions, strict=False)]
+    return group.step(rl.BatchedData(ids[: len(values)], values))[0]
+
+
+def said(outcome: Any) -> tuple[str, str, str]:
+    return outcome.kind, outcome.blame, outcome.env_id
+
+
+def test_ends_of_their_own_are_the_policys(start: Start) -> None:
+    """A step limit as well; a row in the middle of an episode has no outcome."""
+    group = start(entry())
+    with group.group.auto_reset(2):
+        assert step(group, GO, END).outcome.tolist()[0] is None
+        found = step(group, GO, END).outcome
+        assert said(found[0]) == ("truncated", "policy", "f-0")
+        assert "limit" in found[0].cause
+        assert found[1] is None  # Its reset.
+        found = step(group, GO, CUT)
+        assert said(found.outcome[1]) == ("truncated", "policy", "f-1")
+        assert not found.outcome[1].is_failure
+
+
+@pytest.mark.parametrize(
+    ("deed", "kind", "blame"), [(RAISE, "env_raised", "either"), (BLAME, "env_raised", "policy")]
+)
+def test_an_env_that_raises_in_a_step(start: Start, deed: int, kind: str, blame: str) -> None:
+    group = start(entry(num_workers=1))
+    with pytest.raises(rl.EnvRaised) as caught:
+        step(group, deed)
+    assert said(caught.value.outcome) == (kind, blame, "f-0")
+    assert "\n" not in caught.value.outcome.cause
+
+
+@pytest.mark.parametrize(("deed", "blame"), [(RAISE, "env"), (BLAME, "policy")])
+def test_an_env_that_raises_in_its_reset_has_not_started(
+    start: Start, deed: int, blame: str
+) -> None:
+    group = start(entry(num_workers=1))
+    with pytest.raises(rl.EnvRaised) as caught:
+        group.reset(options={"deed": deed})
+    assert said(caught.value.outcome) == ("not_started", blame, "f-0")
+
+
+@pytest.mark.parametrize(
+    ("deed", "kind", "blame"), [(DIE, "env_died", "env"), (HANG, "env_hung", "either")]
+)
+def test_a_lost_episode_says_so_and_blames_no_neighbour(
+    start: Start, deed: int, kind: str, blame: str
+) -> None:
+    """The result of the next reset carries it, in a column and in its info."""
+    group = start(entry())
+    group.step_async(group_actions(group, deed, GO))
+    found: dict[str, Any] = {}
+    while len(found) < 2:
+        batch = group.collect_async()[0]
+        found.update(zip(batch.env_ids(), batch.outcome, strict=True))
+        infos = zip(batch.outcome, batch.info(), strict=True)
+        assert all(outcome == info.get("outcome") for outcome, info in infos)
+    assert said(found["f-0"]) == (kind, blame, "f-0")
+    if found["f-1"] is None:  # It had replied before.
+        found["f-1"] = step(group, GO, GO).outcome[1]
+    assert said(found["f-1"]) == ("env_died", "infrastructure", "f-1")
+    assert "f-0" in found["f-1"].cause
+
+
+def group_actions(group: Driven, *actions: int) -> rl.BatchedData:
+    ids = group.group.env_ids
+    return rl.BatchedData(ids, [rl.PolicyResponse(i, a) for i, a in zip(ids, actions, strict=True)])
+
+
+@pytest.mark.parametrize(
+    ("deed", "kind", "blame"), [(DIE, "env_died", "env"), (HANG, "env_hung", "either")]
+)
+def test_a_worker_that_is_not_replaced_says_the_same(
+    start: Start, deed: int, kind: str, blame: str
+) -> None:
+    group = start(entry(num_workers=1, on_worker_death="raise"))
+    with pytest.raises(rl.WorkerDied) as caught:
+        step(group, deed)
+    assert said(caught.value.outcome) == (kind, blame, "f-0")
+
+
+def test_a_reset_that_hangs_is_not_the_policys(start: Start) -> None:
+    group = start(entry(num_workers=1, on_worker_death="raise"))
+    with pytest.raises(rl.EnvHung) as caught:
+        group.reset(options={"deed": HANG})
+    assert said(caught.value.outcome) == ("env_hung", "env", "f-0")
+
+
+@pytest.mark.parametrize("driver", ["uvloop"], indirect=True)
+@pytest.mark.parametrize("placement", ["loop", "process"])
+def test_awaitable_envs_say_the_same(start: Start, placement: str) -> None:
+    group = start(entry(task=Awaited, num_workers=1, placement=placement))
+    assert said(step(group, HANG).outcome[0]) == ("env_hung", "either", "f-0")
+    with pytest.raises(rl.EnvRaised) as caught:
+        step(group, BLAME)
+    assert said(caught.value.outcome) == ("env_raised", "policy", "f-0")
+    with pytest.raises(rl.EnvRaised) as caught:
+        group.reset(options={"deed": RAISE})
+    assert said(caught.value.outcome) == ("not_started", "env", "f-0")
+
+
+def test_an_aborted_request_is_the_callers(start: Start) -> None:
+    group = start(entry(num_workers=1, step_timeout=None))
+    group.step_async(group_actions(group, HANG))
+    group.abort(["f-0"])
+    outcome = step(group, GO).outcome[0]
+    assert said(outcome) == ("cancelled", "caller", "f-0")
+
+
+def test_sub_environments_have_outcomes_of_their_own(start: Start) -> None:
+    group = start({"name": "c", "task": "CartPole-v1", "num_workers": 1, "num_envs": 3})
+    actions = np.ones((1, 3), np.int64)
+    batch = group.reset(seed=0)[0]
+    for _ in range(200):
+        batch = group.step(batch.respond(action=actions))[0]
+        assert batch.outcome.shape == (1, 3)
+        done = batch.done[0]
+        assert [outcome is not None for outcome in batch.outcome[0]] == done.tolist()
+        if done.any():
+            break
+    ended = batch.outcome[0, int(done.argmax())]
+    assert said(ended) == ("terminated", "policy", "c-0")
+
+
+def test_it_survives_json_and_pickle() -> None:
+    outcome = rl.Outcome("timed_out", "either", "90 s were over", "f-0", 2, TimeSpent(1.5, 2.0, 0))
+    assert rl.Outcome.from_json(json.loads(json.dumps(outcome.to_json()))) == outcome
+    assert pickle.loads(pickle.dumps(outcome)) == outcome
+    assert outcome.is_failure
+    for wrong in ({"kind": "lost"}, {"blame": "you"}, {"more": math.pi}):
+        with pytest.raises((ValueError, TypeError)):
+            rl.Outcome.from_json({**outcome.to_json(), **wrong})
