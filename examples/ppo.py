@@ -156,8 +156,11 @@ def learn(
 
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
+    # MuJoCo's threads step its simulations in this process; this field adds a group, which records
+    # the timeline and saves the state.
+    entry: dict[str, Any] = {"placement": "inline"} if args.backend == "mujoco" else {}
     run = Run(args.total_steps, args.folder, args.resume)
-    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep")
+    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **entry)
     with closing(envs):
         group = envs.group
         observations, actions = envs.single_observation_space, envs.single_action_space

@@ -348,14 +348,15 @@ def test_a_snapshot_has_the_randomized_fields() -> None:
 )
 def test_a_snapshot_of_other_simulations_is_refused(saved: Any, here: Any, message: str) -> None:
     """Those of `make_vec` have no config to compare; nothing is changed."""
+    entry = {"placement": "inline"}
     actions = np.ones((2, 3), np.float32)
-    one, other = make_vec("Hopper-v5", 2, **saved), make_vec("Hopper-v5", 2, **here)
+    one, other = (make_vec("Hopper-v5", 2, None, entry, **given) for given in (saved, here))
     one.reset(seed=0)
     other.reset(seed=0)
     with pytest.raises(EnvRaised, match=message):
         other.group.restore(one.group.snapshot())
     one.close()
-    alike = make_vec("Hopper-v5", 2, **here)
+    alike = make_vec("Hopper-v5", 2, None, entry, **here)
     alike.reset(seed=0)
     assert_alike(other.step(actions), alike.step(actions))
     alike.close()
@@ -389,7 +390,7 @@ def test_randomization_needs_simulations_that_are_stepped_together() -> None:
     with pytest.raises(ConfigError, match="stepped together: num_envs above 1"):
         MujocoEnv(config)
     with pytest.raises(ConfigError, match="several in each batch"):
-        make_vec("Hopper-v5", 1, randomize=RANGES)
+        make_vec("Hopper-v5", 1, None, {"max_concurrency": 1}, randomize=RANGES)
     for options in ({"randomize": RANGES}, {"num_threads": 2}):
         with pytest.raises(ConfigError, match=f"{next(iter(options))} needs envs that are stepped"):
             make_vec("Hopper-v5", 2, "async", **options)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from faults.striking import struck
 
-from rlightning_aio.vector import VectorEnv
+from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,6 +24,7 @@ MAKERS = [lambda: gym.make("CartPole-v1")] * 3
 KINDS: dict[str, Callable[[], Any]] = {
     "NEXT_STEP": lambda: VectorEnv(MAKERS),
     "SAME_STEP": lambda: VectorEnv(MAKERS, autoreset_mode=gym.vector.AutoresetMode.SAME_STEP),
+    "stepped together": lambda: make_vec("Hopper-v5", 3),
     "sb3": lambda: of_sb3(MAKERS),
 }
 
@@ -37,7 +38,7 @@ def of_sb3(makers: Any) -> Any:
 
 def first(envs: Any) -> Any:
     """Reset to the same states as before, and return the observations."""
-    if isinstance(envs, VectorEnv):
+    if isinstance(envs, gym.vector.VectorEnv):
         return envs.reset(seed=3)[0]
     envs.seed(3)
     return envs.reset()
@@ -57,7 +58,8 @@ def test_a_reset_goes_on_wherever_a_call_was_interrupted(kind: str, call: str) -
     """The observations after it, and the steps after that, are those without an interrupt."""
     envs = KINDS[kind]()
     try:
-        actions = np.zeros(3, np.int64)
+        space = getattr(envs, "single_action_space", envs.action_space)
+        actions = np.zeros((3, *space.shape), space.dtype)
         expected = first(envs)
         following = envs.step(actions)[0]
         uses = {

@@ -1,4 +1,4 @@
-"""A lazy list of infos is made once, by whatever reads it first, and is a list to everybody."""
+"""Lazy infos are made once, by whatever reads them first, and are plain ones to everybody."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from rlightning_aio.vector.lazy_infos import LazyInfos
+from rlightning_aio.vector.lazy_infos import LazyColumns, LazyInfos
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,3 +66,57 @@ def test_changes_stay() -> None:
     infos[1]["episode"] = {"r": 1.0}
     infos.append({})
     assert infos == [INFOS[0], {**INFOS[1], "episode": {"r": 1.0}}, {}]
+
+
+COLUMNS = {"x": [1, 2], "_x": [True, False]}
+READERS_OF_COLUMNS: dict[str, Callable[[Any], Any]] = {
+    "dict": dict,
+    "unpacked": lambda infos: {**infos},
+    "update": lambda infos: (made := {}, made.update(infos))[0],
+    "or": lambda infos: infos | {},
+    "or of a dict": lambda infos: {} | infos,
+    "in place": lambda infos: (made := {}, made.__ior__(infos))[0],
+    "items": lambda infos: dict(infos.items()),
+    "keys": lambda infos: {key: infos[key] for key in infos.keys()},  # noqa: SIM118
+    "iter": lambda infos: {key: infos.get(key) for key in infos},
+    "in": lambda infos: COLUMNS if "x" in infos else None,
+    "values": lambda infos: dict(zip(COLUMNS, infos.values(), strict=True)),
+    "len": lambda infos: COLUMNS if len(infos) == 2 else None,
+    "bool": lambda infos: COLUMNS if infos else None,
+    "equal": lambda infos: COLUMNS if infos == COLUMNS else None,
+    "equal to": lambda infos: COLUMNS if COLUMNS == infos else None,  # noqa: SIM300
+    "keywords": lambda infos: dict(**infos),
+    "copy": lambda infos: infos.copy(),
+    "copy.copy": copy.copy,
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda infos: pickle.loads(pickle.dumps(infos)),
+    "repr": lambda infos: eval(repr(infos)),
+    "pop": lambda infos: {key: infos.pop(key) for key in ("x", "_x")},
+    "setdefault": lambda infos: {key: infos.setdefault(key, 7) for key in ("x", "_x")},
+    "match": lambda infos: COLUMNS if _matched(infos) else None,
+}
+
+
+def _matched(infos: Any) -> bool:
+    match infos:
+        case {"x": [1, 2]}:
+            return True
+        case _:
+            return False
+
+
+@pytest.mark.parametrize("name", READERS_OF_COLUMNS)
+def test_whoever_reads_finds_all_columns(name: str) -> None:
+    """Also through functions in C; and they are made only once."""
+    calls: list[None] = []
+
+    def make() -> dict[str, Any]:
+        calls.append(None)
+        return copy.deepcopy(COLUMNS)
+
+    infos = LazyColumns(make)
+    assert isinstance(infos, dict)
+    assert not calls
+    assert READERS_OF_COLUMNS[name](infos) == COLUMNS
+    list(infos)
+    assert len(calls) == 1

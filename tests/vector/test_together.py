@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import multiprocessing
+import pickle
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
+from gymnasium.error import (
+    AlreadyPendingCallError,
+    ClosedEnvironmentError,
+    NoAsyncCallError,
+    ResetNeeded,
+)
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector.toys import Toy, assert_alike
 
@@ -19,6 +26,7 @@ from rlightning_aio.envs.mujoco import tasks as mujoco_tasks
 from rlightning_aio.errors import EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
 from rlightning_aio.vector.making import steps_together
+from rlightning_aio.vector.mujoco import MujocoVectorEnv
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -70,8 +78,19 @@ def test_numbers_in_arguments_count_envs(arguments: dict[str, Any], num_results:
 
 
 def test_envs_that_are_stepped_together_need_no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They are in this process, unless an argument needs workers or MuJoCo has no batches."""
-    for arguments, pids in (({}, [None]), ({"step_timeout": 60.0, "max_concurrency": 1}, [int])):
+    """They are one batch in this process, unless a field asks for a group or MuJoCo has no
+    batches.
+    """
+    alone = make_vec(
+        PENDULUM, 4, None, {"shared_memory": True}, num_threads=2, autoreset_mode="SameStep"
+    )
+    assert isinstance(alone, MujocoVectorEnv)
+    assert alone.metadata["autoreset_mode"] == alone.autoreset_mode == AutoresetMode.SAME_STEP
+    with pytest.raises(AttributeError, match=r"without a group. Pass placement="):
+        _ = alone.group
+    alone.close()
+    workers = {"step_timeout": 60.0, "max_concurrency": 1}
+    for arguments, pids in ((INLINE, [None]), (workers, [int])):
         env = make_vec(PENDULUM, 4, vector_kwargs=arguments, num_threads=2)
         found = [worker["pid"] for worker in env.group.get_workers()]
         assert [pid if pid is None else type(pid) for pid in found] == pids
@@ -79,6 +98,58 @@ def test_envs_that_are_stepped_together_need_no_worker(monkeypatch: pytest.Monke
     assert steps_together(gym.spec(PENDULUM), {})
     monkeypatch.setattr(mujoco_tasks, "version", lambda _: "3.12.0")
     assert not steps_together(gym.spec(PENDULUM), {})
+
+
+def test_a_batch_is_called_in_two_halves_as_gymnasiums() -> None:
+    """The second half computes; errors are Gymnasium's, also those of a closed one."""
+    env: Any = make_vec(PENDULUM, 3)
+    with pytest.raises(NoAsyncCallError, match="without any prior call to `step_async`"):
+        env.step_wait()
+    env.reset_async(seed=4, options={})
+    with pytest.raises(AlreadyPendingCallError, match="pending call to `reset`"):
+        env.call("dt")
+    first, _ = env.reset_wait(timeout=1.0)
+    actions = env.action_space.sample()
+    env.step_async(actions)
+    expected = actions.copy()
+    actions[:] = 0.0  # The call has a copy.
+    found = env.step_wait()
+    env.call_async("state_vector")
+    assert len(env.call_wait()) == 3
+    again, _ = env.reset(seed=4)
+    np.testing.assert_array_equal(again, first)
+    assert_alike(env.step(expected), found)
+    with pytest.raises(ResetNeeded):
+        make_vec(PENDULUM, 2).step(np.zeros((2, 1), np.float32))
+    env.close()
+    for use in (lambda: env.step(actions), env.save_state, lambda: env.render_one(0)):
+        with pytest.raises(ClosedEnvironmentError, match="this MujocoVectorEnv is closed"):
+            use()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+@pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5"])
+def test_a_state_of_a_batch_can_be_restored_again(task: str, mode: AutoresetMode) -> None:
+    """Also after more steps, and in another one; what was returned doesn't change."""
+    one, other = (make_vec(task, 3, autoreset_mode=mode, max_episode_steps=6) for _ in range(2))
+    one.reset(seed=1)
+    one.action_space.seed(0)
+    actions = [one.action_space.sample() for _ in range(9)]
+    one.step(actions[0])
+    kept = pickle.loads(pickle.dumps(one.save_state()))
+
+    def steps(env: Any) -> list[Any]:
+        found = [env.step(each) for each in actions[1:5]]
+        return [*found, env.reset(options={"reset_mask": np.array([True, False, True])})]
+
+    found = steps(one)
+    copies = copy.deepcopy(found)
+    for env in (one, one, other):
+        env.load_state(kept)
+        assert_alike(steps(env), copies)
+    assert_alike(found, copies)
+    one.close()
+    other.close()
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)

@@ -143,12 +143,13 @@ def test_in_workers(mode: AutoresetMode) -> None:
 
 
 def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limit: int) -> None:
-    """Four simulations in two workers, each stepping two together."""
+    """Four simulations that are one batch, and in two workers, each stepping two together."""
     kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
-    ours = make_vec(task, 4, vector_kwargs={**arguments, "max_concurrency": 2}, **kwargs)
-    assert len(ours.group.env_ids) == 2
-    theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
-    compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
+    for entry in ({}, {"max_concurrency": 2}):
+        ours: Any = make_vec(task, 4, vector_kwargs={**arguments, **entry}, **kwargs)
+        assert not entry or len(ours.group.env_ids) == 2
+        theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
+        compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -12,6 +12,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rlightning_aio.vector.lazy_infos import LazyColumns
+
 
 class Toy(gym.Env[Any, Any]):
     """Ends at random, by its own generator; reports many infos."""
@@ -93,6 +95,9 @@ def toy() -> gym.Env[Any, Any]:
 
 def assert_alike(found: Any, expected: Any, where: str = "") -> None:
     """Equal in structure, type, dtype, shape and value; the order of keys doesn't matter."""
+    found, expected = (
+        dict(each) if isinstance(each, LazyColumns) else each for each in (found, expected)
+    )
     assert type(found) is type(expected), where
     if isinstance(expected, dict):
         assert found.keys() == expected.keys(), where

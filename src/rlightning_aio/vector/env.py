@@ -7,16 +7,11 @@ import math
 import multiprocessing
 import warnings
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import (
-    AlreadyPendingCallError,
-    ClosedEnvironmentError,
-    NoAsyncCallError,
-    ResetNeeded,
-)
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio._core.group.api.sync import driver_of
@@ -30,6 +25,8 @@ from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
+from rlightning_aio.vector.pending import check_free, check_running, check_sent
+from rlightning_aio.vector.proxies import EnvProxy, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, checked_mode, seeds_of_envs
 from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
@@ -45,8 +42,6 @@ if TYPE_CHECKING:
 __all__ = ["VectorEnv", "per_worker"]
 
 T = TypeVar("T")
-
-_NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
 
 
 class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
@@ -328,13 +323,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _begin(self, what: str) -> None:
         """Check that requests may be sent, and drop those that an earlier call has left."""
-        self._check_running()
-        if self._pending is not None:
-            raise AlreadyPendingCallError(
-                f"Calling `{what}` while waiting for a pending call to `{self._pending}` to "
-                f"complete; call `{self._pending}_wait` first.",
-                self._pending,
-            )
+        check_free(self, self._pending, what)
         if self._has_leftovers:
             drop_outstanding(self.group)
             self._has_leftovers = False
@@ -346,21 +335,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "interrupted; call reset() without a mask to begin new episodes"
             )
 
-    def _check_running(self) -> None:
-        if self.closed:
-            raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
-
-    def _check_sent(self, what: str) -> None:
-        self._check_running()
-        if self._pending != what:
-            raise NoAsyncCallError(
-                f"Calling `{what}_wait` without any prior call to `{what}_async`.", what
-            )
-        self._pending = None
-
     def _finish(self, what: str, timeout: float | None, collect: Callable[..., Any]) -> Any:
         """Collect the pending requests by `collect`, within `timeout` seconds."""
-        self._check_sent(what)
+        check_sent(self, self._pending, what)
+        self._pending = None
         self._has_leftovers = True  # Until all are collected.
         try:
             found = collect(deadline=_seconds(timeout))
@@ -396,7 +374,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send calls without waiting; `call_wait` returns their values."""
         self._begin("call_async")
-        _check_name(name)
+        check_name(name)
         self._has_leftovers = True  # Until all are sent.
         self._rows.call(name, args, kwargs)
         self._pending = "call"
@@ -418,12 +396,12 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def envs(self) -> list[Any]:
         """A proxy of each env; it fetches attributes when they are read."""
         return [
-            _SubEnvProxy(partial(self._look_up, place), partial(self._call_one, place))
+            EnvProxy(partial(self._look_up, place), partial(self._call_one, place))
             for place in range(self.num_envs)
         ]
 
     def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        _check_name(name)
+        check_name(name)
         send = partial(self._rows.call, name, args, kwargs, [place])
         return self._rows.values(self._answered("call_async", send), [place])[0]
 
@@ -445,7 +423,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of each env: a list or tuple has one value for each env."""
-        self._check_running()
+        check_running(self)
         single = not isinstance(values, list | tuple)
         each = [values] * self.num_envs if single else list(cast("list[Any]", values))
         if len(each) != self.num_envs:
@@ -488,36 +466,6 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.group.close()
 
 
-class _SubEnvProxy:
-    """Fetches an attribute of the env when it is read, and calls its methods.
-
-    Values are copies: changing one does not change the env.
-
-    Args:
-        look_up: returns True and None for a method's name, or False and the attribute's value.
-        call: calls a method of the env by name.
-    """
-
-    def __init__(
-        self, look_up: Callable[[str], tuple[bool, Any]], call: Callable[..., Any]
-    ) -> None:
-        vars(self).update(_look_up=look_up, _call=call)
-
-    @property
-    def unwrapped(self) -> _SubEnvProxy:
-        """The proxy itself: attributes are found through wrappers."""
-        return self
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "_look_up" not in vars(self):  # `copy` looks these up.
-            raise AttributeError(name)
-        is_method, value = self._look_up(name)
-        return partial(self._call, name) if is_method else value
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        self._call("set_wrapper_attr", name, value)
-
-
 def _in_one_call(group: EnvGroup, send: Callable[[], None], wait: Callable[[], T]) -> T:
     """Send and wait; Ctrl-C comes in the wait, and leaves nothing pending."""
 
@@ -526,11 +474,6 @@ def _in_one_call(group: EnvGroup, send: Callable[[], None], wait: Callable[[], T
         return wait()
 
     return driver_of(group).call(ask)
-
-
-def _check_name(name: str) -> None:
-    if name in _NOT_TO_BE_CALLED:
-        raise ValueError(f"call {name}() of the vector env itself, not of its envs")
 
 
 def per_worker(max_concurrency: Any, num_envs: int) -> int:

@@ -1,8 +1,9 @@
-"""`LazyInfos`: a list of infos that is made when somebody reads it.
+"""`LazyInfos` and `LazyColumns`: infos that are made when somebody reads them.
 
-Most programs read an info only at the end of an episode, and decoding those of all envs costs more
-than anything else in a step. The first call of any method makes the list; before that, the object
-holds only what makes it. Left out: laziness by env, which would need dicts that are no plain dicts.
+Most programs read an info only at the end of an episode, and making those of all envs costs more
+than anything else in a step. The first call of any method makes them; before that, the object
+holds only what makes them. Left out: laziness by env, which would need dicts that are no plain
+dicts.
 """
 
 from __future__ import annotations
@@ -13,13 +14,20 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["LazyInfos"]
+__all__ = ["LazyColumns", "LazyInfos"]
 
-_READING_OR_CHANGING: Final = (
-    "__add__", "__contains__", "__delitem__", "__eq__", "__ge__", "__getitem__", "__gt__",
-    "__iadd__", "__imul__", "__iter__", "__le__", "__len__", "__lt__", "__mul__", "__ne__",
-    "__repr__", "__reversed__", "__rmul__", "__setitem__", "append", "clear", "copy", "count",
-    "extend", "index", "insert", "pop", "remove", "reverse", "sort",
+_OF_BOTH: Final = (
+    "__contains__", "__delitem__", "__eq__", "__ge__", "__getitem__", "__gt__", "__iter__",
+    "__le__", "__len__", "__lt__", "__ne__", "__repr__", "__reversed__", "__setitem__", "clear",
+    "copy", "pop",
+)  # fmt: skip
+_OF_LISTS: Final = (
+    "__add__", "__iadd__", "__imul__", "__mul__", "__rmul__", "append", "count", "extend", "index",
+    "insert", "remove", "reverse", "sort",
+)  # fmt: skip
+_OF_DICTS: Final = (
+    "__ior__", "__or__", "__ror__", "get", "items", "keys", "popitem", "setdefault", "update",
+    "values",
 )  # fmt: skip
 
 
@@ -54,16 +62,47 @@ class LazyInfos(list[dict[str, Any]]):
         return list, (list(self),)
 
 
-def _filling(name: str) -> Callable[..., Any]:
-    method = getattr(list, name)
+class LazyColumns(dict[str, Any]):
+    """A dict that is made by the first call of any of its methods.
+
+    Left out: `json.dumps`, which looks into a dict past its methods, and can't write arrays anyway.
+
+    Args:
+        make: returns the entries; called at most once.
+    """
+
+    __slots__ = ("_make",)
+
+    # Mutable, as any dict.
+    __hash__ = None  # pyright: ignore[reportAssignmentType]
+
+    def __init__(self, make: Callable[[], dict[str, Any]]) -> None:
+        super().__init__()
+        self._make: Callable[[], dict[str, Any]] | None = make
+
+    def fill(self) -> None:
+        """Make the entries, unless that has been done."""
+        make, self._make = self._make, None
+        if make is not None:
+            super().update(make())
+
+    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
+        """Pickle and copy as a plain dict."""
+        return dict, (dict(self),)
+
+
+def _filling(kind: type[Any], name: str) -> Callable[..., Any]:
+    method = getattr(kind, name)
 
     @functools.wraps(method)
-    def call(infos: LazyInfos, *args: Any, **kwargs: Any) -> Any:
+    def call(infos: Any, *args: Any, **kwargs: Any) -> Any:
         infos.fill()
         return method(infos, *args, **kwargs)
 
     return call
 
 
-for _name in _READING_OR_CHANGING:
-    setattr(LazyInfos, _name, _filling(_name))
+for _name in (*_OF_BOTH, *_OF_LISTS):
+    setattr(LazyInfos, _name, _filling(list, _name))
+for _name in (*_OF_BOTH, *_OF_DICTS):
+    setattr(LazyColumns, _name, _filling(dict, _name))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.mujoco.of_spec import BatchOf, OneOf, VectorOf
 from rlightning_aio.envs.mujoco.tasks import is_batched
-from rlightning_aio.envs.simulators.gymnasium import spec_of
+from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted, spec_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import PLACEMENTS, is_mujocos
 from rlightning_aio.sharing import check_threads, num_batches, num_cores
@@ -24,11 +24,16 @@ if TYPE_CHECKING:
     from gymnasium import VectorizeMode
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["imports_of", "make_vec", "steps_together", "together", "vector_entry_point"]
+    from rlightning_aio.vector.mujoco import MujocoVectorEnv
 
+__all__ = ["alone", "imports_of", "make_vec", "steps_together", "together", "vector_entry_point"]
+
+Made = TypeVar("Made", bound="gym.vector.VectorEnv[Any, Any, Any]")
 Mode = Literal["async", "vector_entry_point"]
 BATCH_OPTIONS: Final = ("num_threads", "randomize")
 """Options of envs that are stepped together, in addition to those of the task."""
+_OF_EVERY_VECTOR_ENV: Final = {"autoreset_mode", "shared_memory", "copy", "context", "daemon"}
+"""Arguments of `VectorEnv` without a meaning for a group."""
 _WHICH_ENVS: Final = {
     "name", "backend", "task", "num_workers", "num_envs", "max_episode_steps",
     "env_kwargs",
@@ -44,15 +49,15 @@ def make_vec(
     vector_kwargs: Mapping[str, Any] | None = None,
     wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     **kwargs: Any,
-) -> VectorEnv:
-    """Make a `VectorEnv` of `num_envs` envs of one task; see `gymnasium.make_vec`.
+) -> VectorEnv | MujocoVectorEnv:
+    """Make a vector env of `num_envs` envs of one task; see `gymnasium.make_vec`.
 
     Args:
         id: a registered name, ``module:name``, or a spec.
         num_envs: the number of envs.
-        vectorization_mode: None steps the envs of a task that `mujoco_batch` supports together,
-            with the same results, in threads of this process, and makes workers only if an
-            argument needs them; envs of any other task are separate. ``async``: always separate
+        vectorization_mode: None steps the envs of a task that `envs.mujoco` supports together,
+            with the same results, in threads of this process, and makes a group only if a field of
+            a config entry is given; envs of any other task are separate. ``async``: always separate
             envs. ``vector_entry_point``: each worker has the task's own vector environment, whose
             seeds and infos may differ from those of separate envs.
         vector_kwargs: further arguments of `VectorEnv`. Fields of a config entry that say how envs
@@ -72,7 +77,8 @@ def make_vec(
     mode = getattr(vectorization_mode, "value", vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
     own = {name: kwargs.pop(name) for name in RUNTIME_FIELDS & kwargs.keys()}
-    given = {**imports_of(spec), **(vector_kwargs or {}), **own}
+    asked = {**(vector_kwargs or {}), **own}
+    given = {**imports_of(spec), **asked}
     of_one = {"disable_env_checker": True, **kwargs}
     makers: list[Callable[[], Any]] = [OneOf(spec, of_one, tuple(wrappers))] * num_envs
     if mode == "vector_entry_point":
@@ -88,24 +94,42 @@ def make_vec(
         )
     elif steps_together(spec, kwargs, separate=mode == "async" or bool(wrappers)):
         autoreset = checked_mode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        if asked.keys() <= _OF_EVERY_VECTOR_ENV:
+            return _with_spec(alone(spec, of_one, num_envs, autoreset), spec, kwargs)
         makers, given = together(spec, of_one, num_envs, autoreset, given)
-    env = VectorEnv(makers, **given)
+    return _with_spec(VectorEnv(makers, **given), spec, kwargs)
+
+
+def _with_spec(env: Made, spec: EnvSpec, kwargs: Mapping[str, Any]) -> Made:
     env.spec = copy.deepcopy(spec)
     env.spec.kwargs.update(kwargs)
     return env
 
 
+def alone(
+    spec: EnvSpec, kwargs: Mapping[str, Any], num_envs: int, mode: AutoresetMode
+) -> MujocoVectorEnv:
+    """Make envs that are stepped together in this process; arguments as of `together`."""
+    # It imports MuJoCo.
+    from rlightning_aio.vector.mujoco import MujocoVectorEnv  # noqa: PLC0415
+
+    options = {name: kwargs[name] for name in BATCH_OPTIONS if name in kwargs}
+    one = OneOf(spec, {name: kwargs[name] for name in kwargs if name not in options})
+    with outdated_assets_accepted():
+        return MujocoVectorEnv(one(), num_envs, mode, **options)
+
+
 def vector_entry_point(
     id: str | EnvSpec,  # noqa: A002
     **vector_kwargs: Any,
-) -> Callable[..., VectorEnv]:
-    """Make a ``vector_entry_point`` for `gymnasium.register`: it makes a `VectorEnv` of task `id`.
+) -> Callable[..., VectorEnv | MujocoVectorEnv]:
+    """Make a ``vector_entry_point`` for `gymnasium.register`: it makes a vector env of task `id`.
 
-    `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")` then returns a `VectorEnv`
-    with `vector_kwargs`, also to libraries that call it, such as RLlib.
+    `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")` then returns what `make_vec`
+    does with `vector_kwargs`, also to libraries that call it, such as RLlib.
     """
 
-    def make(num_envs: int, **kwargs: Any) -> VectorEnv:
+    def make(num_envs: int, **kwargs: Any) -> VectorEnv | MujocoVectorEnv:
         return make_vec(id, num_envs, vector_kwargs=vector_kwargs, **kwargs)
 
     return make

@@ -1,24 +1,29 @@
 """Many simulations of one of Gymnasium's MuJoCo tasks, stepped with one call.
 
 Rule: results are bit-identical to those of separate envs of `gymnasium.make`. One Gymnasium env
-reads the options, resets, renders and answers calls, for one simulation at a time. MuJoCo steps
-all simulations (`mujoco_threads`), and rewards and observations are computed as arrays
-(`mujoco_tasks`). Unlike in Gymnasium, a simulation that fails ends its episode.
+reads the options, renders and answers calls, for one simulation at a time. MuJoCo steps and resets
+all simulations (`threads`), and rewards, observations and noise are computed as arrays (`tasks`,
+`resets`). A task whose reset does more than draw noise is reset by the Gymnasium env, one after
+the other. Unlike in Gymnasium, a simulation that fails ends its episode.
 """
 
 from __future__ import annotations
 
 import time
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from rlightning_aio.envs.mujoco.infos import Begun, Finished, of_resets, of_step
 from rlightning_aio.envs.mujoco.randomize import Randomizer
+from rlightning_aio.envs.mujoco.resets import Some, can_draw, drawn
 from rlightning_aio.envs.mujoco.tasks import task_of
 from rlightning_aio.envs.mujoco.threads import Simulations, state_of
 from rlightning_aio.envs.state import load_state, save_state
@@ -26,7 +31,7 @@ from rlightning_aio.envs.wrappers import ClassName, has_wrapper, wrappers_of
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -44,7 +49,7 @@ _FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
 _NEXT_STEP: Final = AutoresetMode.NEXT_STEP
 _SAME_STEP: Final = AutoresetMode.SAME_STEP
 _BRIEF_NS: Final = 500_000
-_STATE: Final = ("_num_steps", "_before", "_substeps", "_observations", "_ended")
+_STATE: Final = ("_num_steps", "_before", "_substeps", "_last", "_ended")
 """Attributes that are part of the state, in addition to the simulations."""
 
 
@@ -126,14 +131,16 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._take_back(k)
         self._mode = autoreset_mode
         self._read_step_limit()
+        self._read_first_row()
         self._num_steps = np.zeros(num_envs, np.int64)
         # All data of a simulation follow from this state and a number of MuJoCo's steps; 0 means a
         # reset.
-        self._before = self._simulations.rows.copy()
+        self._before = self._simulations.moving.copy()
         self._substeps = np.zeros(num_envs, np.int64)
-        self._observations = np.zeros((num_envs, *self.env.observation_space.shape))
+        # The observations that were returned last; never written to.
+        self._last = np.zeros((num_envs, *self.env.observation_space.shape))
         self._ended: NDArray[np.bool_] | None = None
-        self._everywhere = np.ones(num_envs, np.bool_)
+        self._is_whole = True  # No step or reset was interrupted.
 
     def _read_step_limit(self) -> None:
         self._limiter: Any = None
@@ -142,6 +149,12 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             if isinstance(wrapper, gym.wrappers.TimeLimit):
                 self._limiter = wrapper
                 self._limit = self._limiter._max_episode_steps  # noqa: SLF001
+
+    def _read_first_row(self) -> None:
+        """Note the state of a simulation at the beginning of a reset."""
+        self._first_row = np.empty_like(self._simulations.rows[0])
+        mujoco.mj_resetData(self.env.model, self._data)
+        state_of(self.env.model, self._data, self._first_row)
 
     # -- resets -------------------------------------------------------------------------
 
@@ -163,30 +176,110 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             seeds = list(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for num_envs={self.num_envs}")
-        mask = self._everywhere
+        mask = np.ones(self.num_envs, np.bool_)
         if options is not None and "reset_mask" in options:
             options = dict(options)
             mask = options.pop("reset_mask")
-        infos: dict[str, Any] = {}
-        for k in np.flatnonzero(mask).tolist():
-            infos = self._add_info(infos, self._reset(k, seeds[k], options), k)
+            if not (self._is_whole or mask.all()):
+                raise ResetNeeded("a step or reset was interrupted: call reset() without a mask")
+        self._is_whole = False
+        ids, observations = np.flatnonzero(mask), self._last.copy()
+        begun = self._begin(ids, observations, [seeds[k] for k in ids.tolist()], options)
         ended = np.zeros(self.num_envs, np.bool_) if self._ended is None else self._ended
-        self._ended = ended & ~mask
-        return self._observations.copy(), infos
+        self._ended, self._is_whole = ended & ~mask, True
+        self._keep(observations)
+        return observations, self._infos(partial(of_resets, begun, self.num_envs, self._add_info))
+
+    def _infos(self, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return infos."""
+        return make()
+
+    def _keep(self, observations: NDArray[Any]) -> None:
+        """Keep what is returned; where masks are usual, a copy that the caller can't change."""
+        is_masked = self._mode == AutoresetMode.DISABLED
+        self._last = observations.copy() if is_masked else observations
+
+    @property
+    def _resets_together(self) -> bool:
+        """True if the reset of the task only draws noise, and MuJoCo needs nothing else."""
+        task, env = self._task, self.env
+        return (
+            task.noise != "more"
+            and env.render_mode != "human"
+            and not (task.needs_forces and env.model.nsensor)
+            and can_draw(env._reset_noise_scale)  # noqa: SLF001
+        )
+
+    def _begin(
+        self,
+        ids: NDArray[np.intp],
+        observations: NDArray[Any],
+        seeds: Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> Begun:
+        """Reset the simulations `ids`, and write their observations into those of all.
+
+        Args:
+            ids: the simulations.
+            observations: of all simulations.
+            seeds: of the simulations `ids`.
+            options: passed to the task.
+        """
+        given = [None] * len(ids) if seeds is None else seeds
+        self._num_steps[ids] = 0
+        if not self._resets_together:
+            each = [
+                self._reset(k, observations, seed, options)
+                for k, seed in zip(ids.tolist(), given, strict=True)
+            ]
+            return Begun(ids, None, each)
+        columns, each = self._draw(ids, given)
+        self._task.moved(ids, Some(self._simulations, ids))
+        observations[ids] = self._task.observation(ids)
+        return Begun(ids, columns, each)
+
+    def _draw(self, ids: NDArray[np.intp], seeds: Sequence[int | None]) -> tuple[Any, Any]:
+        """Draw first states of the simulations `ids`, and have MuJoCo compute what follows."""
+        env, task, simulations, each = self.env, self._task, self._simulations, []
+        generators = [self._generator(k, seed) for k, seed in zip(ids.tolist(), seeds, strict=True)]
+        places = ids.astype(np.int32)
+        if self._randomizer is not None:
+            each = [
+                {"randomized": self._randomizer.draw(k, seed)}
+                for k, seed in zip(ids.tolist(), seeds, strict=True)
+            ]
+            simulations.set_const(places)
+        model, scale = env.model, env._reset_noise_scale  # noqa: SLF001
+        positions, velocities = drawn(generators, task.noise, scale, model.nq, model.nv)
+        simulations.rows[ids] = self._first_row
+        simulations.qpos[ids] = env.init_qpos + positions
+        simulations.qvel[ids] = env.init_qvel + velocities
+        simulations.forward(places)
+        self._before[ids], self._substeps[ids] = simulations.moving[ids], 0
+        return task.begun(Some(simulations, ids)), each
+
+    def _generator(self, k: int, seed: int | None) -> np.random.Generator:
+        """The generator of simulation `k`, seeded like that of a Gymnasium env."""
+        own = self._own[k]
+        if seed is not None or own.get("_np_random") is None:
+            own["_np_random"], own["_np_random_seed"] = seeding.np_random(seed)
+        return own["_np_random"]
 
     def _reset(
-        self, k: int, seed: int | None = None, options: dict[str, Any] | None = None
+        self, k: int, observations: NDArray[Any], seed: int | None, options: dict[str, Any] | None
     ) -> dict[str, Any]:
-        """Reset simulation k by the Gymnasium env, and store its observation. Return the info."""
-        factors = None if self._randomizer is None else self._randomizer.draw(k, seed)
+        """Reset simulation k by the Gymnasium env. Return the info."""
+        factors = None
+        if self._randomizer is not None:
+            factors = self._randomizer.draw(k, seed)
+            self._simulations.set_const(np.array([k], np.int32))
         self._simulations.show_model(k)
         self._lend(k)
-        self._observations[k], info = self.env.reset(seed=seed, options=options)
+        observations[k], info = self.env.reset(seed=seed, options=options)
         _ = self.env.np_random  # Without a seed, this makes a randomly seeded generator.
         self._take_back(k)
         self._put(k, self._data)
-        self._before[k] = self._simulations.rows[k]
-        self._num_steps[k] = 0
+        self._before[k] = self._simulations.moving[k]
         return info if factors is None else {**info, "randomized": factors}
 
     def _lend(self, k: int) -> None:
@@ -227,85 +320,52 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             ValueError: the actions have the wrong shape.
         """
         ended, actions = self._ended, np.asarray(actions)
-        if ended is None:
-            raise ResetNeeded("Cannot call env.step() before calling env.reset()")
+        if ended is None or not self._is_whole:
+            what = "before calling env.reset()" if ended is None else "after an interrupted call"
+            raise ResetNeeded(f"Cannot call env.step() {what}")
         if actions.shape != self.action_space.shape:
             raise ValueError(
                 f"actions must have shape {self.action_space.shape}, not {actions.shape}"
             )
+        self._is_whole, count = False, self.num_envs
         # `any` of an array takes four times as long as `count_nonzero`.
-        due = ended if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
-        failures = self._simulate(actions, due)
+        due = (
+            np.flatnonzero(ended) if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
+        )
+        failures = self._simulate(actions, None if due is None else ~ended)
         observations, (rewards, terminated, columns) = self._task.stepped(actions)
         self._num_steps += 1
-        truncated = self._num_steps >= self._limit
-        # Infos of simulations that have failed or were reset instead.
-        apart = {k: {FAILED: cause} for k, cause in failures.items()}
+        begun, finished = None, None
         if due is not None:
-            apart |= {k: self._reset(k) for k in np.flatnonzero(due).tolist()}
-        if apart:
-            chosen = list(apart)
-            observations[chosen] = self._observations[chosen]
-            rewards[chosen] = 0.0
-            terminated[chosen] = truncated[chosen] = False
-            truncated[list(failures)] = True
-        infos = self._infos(columns, apart)
-        self._observations[:] = observations
+            begun = self._begin(due, observations)
+            rewards[due], terminated[due] = 0.0, False
+        truncated = self._num_steps >= self._limit
+        if failures:
+            failed = list(failures)
+            observations[failed], rewards[failed] = self._last[failed], 0.0
+            terminated[failed], truncated[failed] = False, True
         self._ended = ended = terminated | truncated
         if self._mode == _SAME_STEP and np.count_nonzero(ended):
-            observations, infos = self._reset_ended(ended, observations, infos)
-        return observations, rewards, terminated, truncated, infos
+            ids = np.flatnonzero(ended)
+            finished = Finished(ended, observations[ids])
+            begun = self._begin(ids, observations)
+        self._keep(observations)
+        causes = {k: {FAILED: cause} for k, cause in failures.items()}
+        infos = partial(of_step, columns, count, causes, begun, finished, self._add_info)
+        self._is_whole = True
+        return observations, rewards, terminated, truncated, self._infos(infos)
 
-    def _simulate(self, actions: NDArray[Any], due: NDArray[np.bool_] | None) -> dict[int, str]:
-        """Step all simulations except those due for a reset. Return failures with their reasons."""
+    def _simulate(self, actions: NDArray[Any], stepped: NDArray[np.bool_] | None) -> dict[int, str]:
+        """Step the simulations `stepped`, or all. Return failures with their reasons."""
         simulations = self._simulations
-        self._before[:] = simulations.rows
+        self._before[:] = simulations.moving
         self._substeps[:] = self.env.frame_skip
         simulations.ctrl[:] = actions
-        ids = None if due is None else np.flatnonzero(~due).astype(np.int32)
+        ids = None if stepped is None else np.flatnonzero(stepped).astype(np.int32)
         failures = simulations.step(self.env.frame_skip, ids)
         for k in failures:
-            self._before[k], self._substeps[k] = simulations.rows[k], 0
+            self._before[k], self._substeps[k] = simulations.moving[k], 0
         return failures
-
-    def _infos(
-        self, columns: dict[str, NDArray[Any]], apart: dict[int, dict[str, Any]]
-    ) -> dict[str, Any]:
-        """Return the infos of a step with masks, as in Gymnasium.
-
-        Args:
-            columns: of all simulations, ``[num_envs, ...]``.
-            apart: the infos of simulations that have failed or were reset instead.
-        """
-        infos, stepped = dict[str, Any](), self._everywhere.copy()
-        if not apart:
-            for name, column in columns.items():
-                infos[name], infos["_" + name] = column, stepped
-            return infos
-        chosen = list(apart)
-        stepped[chosen] = False
-        if len(chosen) < self.num_envs:
-            for name, column in columns.items():
-                infos[name], infos["_" + name] = column.copy(), stepped.copy()
-                infos[name][chosen] = 0
-        for k, info in apart.items():
-            infos = self._add_info(infos, info, k)
-        return infos
-
-    def _reset_ended(
-        self, ended: NDArray[np.bool_], last: NDArray[Any], infos: dict[str, Any]
-    ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Reset simulations that have ended. Return observations, and infos with the last ones."""
-        final = np.full(self.num_envs, None, object)
-        for k in np.flatnonzero(ended).tolist():
-            final[k] = last[k].copy()
-        final_info = _only(infos, ended)
-        infos = _only(infos, ~ended)
-        for k in np.flatnonzero(ended).tolist():
-            infos = self._add_info(infos, self._reset(k), k)
-        infos.update(final_obs=final, _final_obs=ended.copy())
-        infos.update(final_info=final_info, _final_info=ended.copy())
-        return self._observations.copy(), infos
 
     # -- calls --------------------------------------------------------------------------
 
@@ -339,11 +399,11 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         finally:
             self._take_back(k)
             self.env.data = self._data
-            state = np.empty_like(self._before[k])
+            state = np.empty_like(self._simulations.rows[k])
             state_of(self.env.model, data, state)
             if not np.array_equal(state, self._simulations.rows[k], equal_nan=True):
                 self._put(k, data)
-                self._before[k] = state
+                self._before[k] = self._simulations.moving[k]
             if self._limiter is not None and self._limiter._elapsed_steps is not None:  # noqa: SLF001
                 self._num_steps[k] = self._limiter._elapsed_steps  # noqa: SLF001
 
@@ -372,6 +432,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def _note_options(self, positions: Any) -> None:
         """Read the options of the env, which may have changed; the positions are the last ones."""
         self._read_step_limit()
+        self._read_first_row()
         self._task = type(self._task)(self.env, self._simulations)
         self._task.positions = positions
 
@@ -413,6 +474,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         for name in _STATE:
             setattr(self, name, state[name])
         self._note_options(state["positions"])
+        self._is_whole = True
 
     def render(self) -> tuple[Any, ...]:
         """Render a frame of each simulation."""
@@ -433,20 +495,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         del kwargs
         self._simulations.close()
         cast("gym.Env[Any, Any]", self.env).close()
-
-
-def _only(infos: dict[str, Any], chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Copy what the columns have for the simulations `chosen`, with masks as in Gymnasium."""
-    found: dict[str, Any] = {}
-    for name, column in infos.items():
-        if name.startswith("_"):
-            continue
-        mask = infos["_" + name] & chosen
-        if mask.any():
-            found[name] = column.copy()
-            found[name][~mask] = None if column.dtype == object else 0
-            found["_" + name] = mask
-    return found
 
 
 def _attribute(name: str, value: Any, *, force: bool = True) -> tuple[str, Any]:

@@ -69,6 +69,8 @@ class StepsWithForces:
             ctypes.cast(each, c_void_p) for each in (library.mj_step, library.mj_rnePostConstraint)
         )
         self._plan = _Plan(step, finish)
+        self._finish = finish
+        self._forward = ctypes.cast(library.mj_forward, c_void_p)
 
     def output(self, name: str) -> NDArray[Any]:
         """Copy field `name` after each step, to the array ``[count, ...]`` that this returns."""
@@ -81,10 +83,18 @@ class StepsWithForces:
             plan.num_outputs += 1
         return values
 
+    def forward(self, batch: c_void_p, chosen: Any, count: int) -> int:
+        """Compute what follows from the states; return the number of failed simulations."""
+        plan = self._plan
+        plan.num_steps, plan.finish = 0, self._forward
+        return self._library.mjb_apply(
+            batch, chosen, count, self._function, ctypes.byref(plan), True
+        )
+
     def step(self, batch: c_void_p, chosen: Any, count: int, num_steps: int) -> int:
         """Do as `mjb_step`; return the number of failed simulations."""
         plan = self._plan
-        plan.num_steps = num_steps
+        plan.num_steps, plan.finish = num_steps, self._finish
         return self._library.mjb_apply(
             batch, chosen, count, self._function, ctypes.byref(plan), True
         )

@@ -70,7 +70,7 @@ class Randomizer:
             )
 
     def draw(self, k: int, seed: int | None) -> dict[str, float]:
-        """Draw new fields for simulation `k`.
+        """Draw new fields for simulation `k`. Call `Simulations.set_const` afterwards.
 
         Args:
             k: position of the simulation.
@@ -85,7 +85,6 @@ class Randomizer:
         for name, (low, high) in self._ranges.items():
             factors[name] = factor = self._generators[k].uniform(low, high)
             self._values[name][k] = self._nominal[name] * factor
-        self._simulations.set_const(np.array([k], np.int32))
         return factors
 
     def save_state(self) -> Any:

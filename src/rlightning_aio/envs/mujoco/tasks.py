@@ -9,23 +9,25 @@ from n simulations are ``[n, ...]`` float64.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
 
+from rlightning_aio.envs.mujoco.views import flat, joined
 from rlightning_aio.envs.wrappers import wrappers_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from gymnasium.envs.registration import EnvSpec
     from numpy.typing import NDArray
 
 __all__ = ["Task", "is_batched", "task_of"]
 
-Judgement = tuple[Any, Any, dict[str, Any]]
+Columns = Callable[[], dict[str, Any]]
+"""Makes infos of several simulations, from values that don't change later."""
+Judgement = tuple[Any, Any, Columns]
 """Rewards, terminations, infos."""
 
 
@@ -38,12 +40,15 @@ class Task:
 
     Attributes:
         needs_forces: True if the task reads contact forces.
+        noise: how a reset draws velocities around the first ones, after positions that it draws
+            uniformly; or more than that.
         positions: ``[n, ...]``, last position of the body, for its velocity.
         actions: of the step.
         observations: after the step.
     """
 
     needs_forces: ClassVar[bool] = False
+    noise: ClassVar[Literal["uniform", "normal", "more"]] = "uniform"
 
     def __init__(self, env: Any, fields: Any) -> None:
         self.env = env
@@ -55,13 +60,18 @@ class Task:
         self.actions: Any = None
         self.observations: Any = None
 
-    def gathered(self, *parts: Callable[[Any], Any]) -> Callable[[], NDArray[np.float64]]:
-        """Make a function that reads parts of all simulations, flattened and concatenated."""
-        views: list[NDArray[Any]] = [part(self.fields) for part in parts]
-        num = self._num
-        if all(view.ndim == 2 for view in views):
-            return lambda: np.concatenate(views, axis=1)
-        return lambda: np.concatenate([view.reshape(num, -1) for view in views], axis=1)
+    def gathered(self, *parts: Callable[[Any], Any]) -> Callable[..., NDArray[np.float64]]:
+        """Make a function that copies parts of all simulations, flattened and concatenated.
+
+        With ids, it copies those of the simulations `ids`.
+        """
+        views = joined([flat(part(self.fields)) for part in parts])
+
+        def gather(ids: Any = None) -> NDArray[np.float64]:
+            chosen = views if ids is None else [view[ids] for view in views]
+            return chosen[0].copy() if len(chosen) == 1 else np.concatenate(chosen, axis=1)
+
+        return gather
 
     # -- the differences between tasks ----------------------------------------------------
 
@@ -79,6 +89,11 @@ class Task:
         """Compute rewards, terminations and infos of a step."""
         raise NotImplementedError
 
+    def begun(self, fields: Any) -> Columns:
+        """Infos of a reset, from `fields` of the simulations that were reset."""
+        del fields
+        return dict
+
     # -- use --------------------------------------------------------------------------------
 
     def stepped(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], Judgement]:
@@ -88,11 +103,17 @@ class Task:
         self.finish(self.observations)
         return self.observations, self.judge()
 
-    def moved(self, k: int, data: Any) -> None:
-        """Record the position of simulation k, which was moved to `data` without a step."""
+    def observation(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
+        """Observations of the simulations `ids`, from their fields."""
+        found = self._observed(ids)
+        self.finish(found)
+        return found
+
+    def moved(self, which: Any, fields: Any) -> None:
+        """Record the positions of simulations that were moved to `fields` without a step."""
         if self.positions is not None:
             self.positions = self.positions.copy()  # The last infos have views of it.
-            self.positions[k] = self.position(data)
+            self.positions[which] = self.position(fields)
 
     def velocity(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return current positions, and velocities since the last step."""
@@ -119,12 +140,26 @@ def _squares(rows: NDArray[Any]) -> Any:
     return np.add.reduce(np.square(rows), axis=1)
 
 
+_TENDONS = ("tendon_length", "tendon_velocity")
+
+
+def _begun_at(xy: NDArray[np.float64]) -> Columns:
+    """Infos of the reset of a body at these positions."""
+    return lambda: {
+        "x_position": xy[:, 0],
+        "y_position": xy[:, 1],
+        "distance_from_origin": _lengths(xy),
+    }
+
+
 def _lengths(vectors: NDArray[np.float64]) -> Any:
     # Like `np.linalg.norm`, which uses a dot product.
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
 class HalfCheetah(Task):
+    noise = "normal"
+
     def observed(self) -> list[Callable[[Any], Any]]:
         return _skipping(self.env, 1)
 
@@ -136,13 +171,20 @@ class HalfCheetah(Task):
         x, velocity = positions[:, 0], velocities[:, 0]
         forward = self.env._forward_reward_weight * velocity
         control = self.env._ctrl_cost_weight * _squares(self.actions)
-        infos = {
-            "x_position": x,
-            "x_velocity": velocity,
-            "reward_forward": forward,
-            "reward_ctrl": -control,
-        }
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": x,
+                "x_velocity": velocity,
+                "reward_forward": forward,
+                "reward_ctrl": -control,
+            }
+
         return forward - control, self.never(), infos
+
+    def begun(self, fields: Any) -> Columns:
+        x = fields.qpos[:, 0]
+        return lambda: {"x_position": x}
 
 
 class Swimmer(Task):
@@ -156,22 +198,28 @@ class Swimmer(Task):
         xy, velocity = self.velocity()
         forward = self.env._forward_reward_weight * velocity[:, 0]
         control = self.env._ctrl_cost_weight * _squares(self.actions)
-        infos = {
-            "x_position": xy[:, 0],
-            "y_position": xy[:, 1],
-            "distance_from_origin": _lengths(xy),
-            "x_velocity": velocity[:, 0],
-            "y_velocity": velocity[:, 1],
-            "reward_forward": forward,
-            "reward_ctrl": -control,
-        }
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": xy[:, 0],
+                "y_position": xy[:, 1],
+                "distance_from_origin": _lengths(xy),
+                "x_velocity": velocity[:, 0],
+                "y_velocity": velocity[:, 1],
+                "reward_forward": forward,
+                "reward_ctrl": -control,
+            }
+
         return forward - control, self.never(), infos
+
+    def begun(self, fields: Any) -> Columns:
+        return _begun_at(fields.qpos[:, :2])
 
 
 class Hopper(Task):
     def __init__(self, env: Any, fields: Any) -> None:
         super().__init__(env, fields)
-        self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
+        (self.state,) = joined([fields.qpos, fields.qvel])
         self.velocities = env.observation_space.shape[0] - env.model.nv
 
     def observed(self) -> list[Callable[[Any], Any]]:
@@ -195,22 +243,30 @@ class Hopper(Task):
         return (low < z) & (z < high) & (least < angle) & (angle < most)
 
     def judge(self) -> Judgement:
-        env, state = self.env, self.state()
+        env, state = self.env, self.state
         positions, velocities = self.velocity()
         x, velocity = positions[:, 0], velocities[:, 0]
         healthy = self.healthy(state)
+        height = state[:, 1] - env.init_qpos[1]
         forward = env._forward_reward_weight * velocity
         survive = healthy * env._healthy_reward
         control = env._ctrl_cost_weight * _squares(self.actions)
-        infos = {
-            "x_position": x,
-            "z_distance_from_origin": state[:, 1] - env.init_qpos[1],
-            "x_velocity": velocity,
-            "reward_forward": forward,
-            "reward_ctrl": -control,
-            "reward_survive": survive,
-        }
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": x,
+                "z_distance_from_origin": height,
+                "x_velocity": velocity,
+                "reward_forward": forward,
+                "reward_ctrl": -control,
+                "reward_survive": survive,
+            }
+
         return forward + survive - control, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+    def begun(self, fields: Any) -> Columns:
+        x, z = fields.qpos[:, 0], fields.qpos[:, 1] - self.env.init_qpos[1]
+        return lambda: {"x_position": x, "z_distance_from_origin": z}
 
 
 class Walker2d(Hopper):
@@ -220,12 +276,13 @@ class Walker2d(Hopper):
 
 class Ant(Task):
     needs_forces = True
+    noise = "normal"
 
     def __init__(self, env: Any, fields: Any) -> None:
         self.body = env.model.body(env._main_body).id
         super().__init__(env, fields)
-        self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
-        self.forces = self.gathered(lambda s: s.cfrc_ext)
+        (self.state,) = joined([fields.qpos, fields.qvel])
+        self.forces = flat(fields.cfrc_ext)
         self.first_force = env.observation_structure["qpos"] + env.observation_structure["qvel"]
 
     def position(self, fields: Any) -> Any:
@@ -242,28 +299,35 @@ class Ant(Task):
         np.clip(forces, *self.env._contact_force_range, out=forces)
 
     def judge(self) -> Judgement:
-        env, state = self.env, self.state()
+        env, state = self.env, self.state
         _, velocity = self.velocity()
+        xy = state[:, :2].copy()
         low, high = env._healthy_z_range
         healthy = np.isfinite(state).all(axis=1) & (low <= state[:, 2]) & (state[:, 2] <= high)
         forward = velocity[:, 0] * env._forward_reward_weight
         survive = healthy * env._healthy_reward
         control = env._ctrl_cost_weight * _squares(self.actions)
-        forces = np.clip(self.forces(), *env._contact_force_range)
+        forces = np.clip(self.forces, *env._contact_force_range)
         contact = env._contact_cost_weight * _squares(forces)
-        infos = {
-            "x_position": state[:, 0],
-            "y_position": state[:, 1],
-            "distance_from_origin": _lengths(state[:, :2]),
-            "x_velocity": velocity[:, 0],
-            "y_velocity": velocity[:, 1],
-            "reward_forward": forward,
-            "reward_ctrl": -control,
-            "reward_contact": -contact,
-            "reward_survive": survive,
-        }
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": xy[:, 0],
+                "y_position": xy[:, 1],
+                "distance_from_origin": _lengths(xy),
+                "x_velocity": velocity[:, 0],
+                "y_velocity": velocity[:, 1],
+                "reward_forward": forward,
+                "reward_ctrl": -control,
+                "reward_contact": -contact,
+                "reward_survive": survive,
+            }
+
         rewards = forward + survive - (control + contact)
         return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+    def begun(self, fields: Any) -> Columns:
+        return _begun_at(fields.qpos[:, :2])
 
 
 class _Humanoid(Task):
@@ -274,8 +338,7 @@ class _Humanoid(Task):
     def __init__(self, env: Any, fields: Any) -> None:
         super().__init__(env, fields)
         self.start = self.gathered(lambda s: s.qpos[:, :3])
-        self.controls = self.gathered(lambda s: s.ctrl)
-        self.forces = self.gathered(lambda s: s.cfrc_ext)
+        self.forces = flat(fields.cfrc_ext)
         self.lengths = self.gathered(lambda s: s.ten_length)
         self.speeds = self.gathered(lambda s: s.ten_velocity)
 
@@ -293,15 +356,15 @@ class _Humanoid(Task):
 
     def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
         """Cost of external forces."""
-        return np.clip(weight * _squares(self.forces()), *limits)
+        return np.clip(weight * _squares(self.forces), *limits)
 
 
 class Humanoid(_Humanoid):
     def position(self, fields: Any) -> Any:
-        single = fields is not self.fields
+        single = not hasattr(fields, "model_field")
         masses = self.env.model.body_mass if single else fields.model_field("body_mass")
-        weighted = masses[..., np.newaxis] * fields.xipos
-        return (weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True))[..., :2]
+        weighted = masses[..., np.newaxis] * fields.xipos[..., :2]
+        return weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True)
 
     def judge(self) -> Judgement:
         env, start = self.env, self.start()
@@ -310,42 +373,64 @@ class Humanoid(_Humanoid):
         healthy = (low < start[:, 2]) & (start[:, 2] < high)
         forward = env._forward_reward_weight * velocity[:, 0]
         survive = healthy * env._healthy_reward
-        control = env._ctrl_cost_weight * _squares(self.controls())
+        control = env._ctrl_cost_weight * _squares(self.fields.ctrl)
         contact = self.clipped(env._contact_cost_weight, env._contact_cost_range)
-        infos = {
-            "x_position": start[:, 0],
-            "y_position": start[:, 1],
-            "tendon_length": self.lengths(),
-            "tendon_velocity": self.speeds(),
-            "distance_from_origin": _lengths(start[:, :2]),
-            "x_velocity": velocity[:, 0],
-            "y_velocity": velocity[:, 1],
-            "reward_survive": survive,
-            "reward_forward": forward,
-            "reward_ctrl": -control,
-            "reward_contact": -contact,
-        }
+        lengths, speeds = self.lengths(), self.speeds()
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": start[:, 0],
+                "y_position": start[:, 1],
+                "tendon_length": lengths,
+                "tendon_velocity": speeds,
+                "distance_from_origin": _lengths(start[:, :2]),
+                "x_velocity": velocity[:, 0],
+                "y_velocity": velocity[:, 1],
+                "reward_survive": survive,
+                "reward_forward": forward,
+                "reward_ctrl": -control,
+                "reward_contact": -contact,
+            }
+
         rewards = forward + survive - (control + contact)
         return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+    def begun(self, fields: Any) -> Columns:
+        xy, tendons = fields.qpos[:, :2], (fields.ten_length, fields.ten_velocity)
+        return lambda: {**_begun_at(xy)(), **dict(zip(_TENDONS, tendons, strict=True))}
 
 
 class HumanoidStandup(_Humanoid):
     def judge(self) -> Judgement:
         env, start = self.env, self.start()
         up = (start[:, 2] - 0) / env.model.opt.timestep
-        control = env._ctrl_cost_weight * _squares(self.controls())
+        control = env._ctrl_cost_weight * _squares(self.fields.ctrl)
         impact = self.clipped(env._impact_cost_weight, env._impact_cost_range)
-        infos = {
+        lengths, speeds, height = self.lengths(), self.speeds(), start[:, 2] - env.init_qpos[2]
+
+        def infos() -> dict[str, Any]:
+            return {
+                "x_position": start[:, 0],
+                "y_position": start[:, 1],
+                "z_distance_from_origin": height,
+                "tendon_length": lengths,
+                "tendon_velocity": speeds,
+                "reward_linup": up,
+                "reward_quadctrl": -control,
+                "reward_impact": -impact,
+            }
+
+        return up - control - impact + 1, self.never(), infos
+
+    def begun(self, fields: Any) -> Columns:
+        start, tendons = fields.qpos[:, :3], (fields.ten_length, fields.ten_velocity)
+        height = start[:, 2] - self.env.init_qpos[2]
+        return lambda: {
             "x_position": start[:, 0],
             "y_position": start[:, 1],
-            "z_distance_from_origin": start[:, 2] - env.init_qpos[2],
-            "tendon_length": self.lengths(),
-            "tendon_velocity": self.speeds(),
-            "reward_linup": up,
-            "reward_quadctrl": -control,
-            "reward_impact": -impact,
+            "z_distance_from_origin": height,
+            **dict(zip(_TENDONS, tendons, strict=True)),
         }
-        return up - control - impact + 1, self.never(), infos
 
 
 class InvertedPendulum(Task):
@@ -356,10 +441,12 @@ class InvertedPendulum(Task):
         finite = np.isfinite(self.observations).all(axis=1)
         terminated = ~finite | (np.abs(self.observations[:, 1]) > 0.2)
         survive = (~terminated).astype(np.int64)
-        return survive.astype(np.float64), terminated, {"reward_survive": survive}
+        return survive.astype(np.float64), terminated, lambda: {"reward_survive": survive}
 
 
 class InvertedDoublePendulum(Task):
+    noise = "normal"
+
     def __init__(self, env: Any, fields: Any) -> None:
         super().__init__(env, fields)
         self.tip = self.gathered(lambda s: s.site_xpos[:, 0])
@@ -390,15 +477,20 @@ class InvertedDoublePendulum(Task):
         velocities = np.array([1e-3 * v1**2 + 5e-3 * v2**2 for v1, v2 in speeds])
         terminated = np.array([y <= 1 for _, _, y in tips])
         alive = self.env._healthy_reward * ~terminated
-        infos = {
-            "reward_survive": alive,
-            "distance_penalty": -distances,
-            "velocity_penalty": -velocities,
-        }
+
+        def infos() -> dict[str, Any]:
+            return {
+                "reward_survive": alive,
+                "distance_penalty": -distances,
+                "velocity_penalty": -velocities,
+            }
+
         return alive - distances - velocities, terminated, infos
 
 
 class Pusher(Task):
+    noise = "more"  # It draws places until one is far enough away.
+
     def observed(self) -> list[Callable[[Any], Any]]:
         arm, thing, goal = (self.env.model.body(name).id for name in ("tips_arm", "object", "goal"))
         return [
@@ -415,11 +507,20 @@ class Pusher(Task):
         near = -_lengths(thing - arm) * env._reward_near_weight
         distance = -_lengths(thing - goal) * env._reward_dist_weight
         control = -_squares(self.actions) * env._reward_control_weight
-        infos = {"reward_dist": distance, "reward_ctrl": control, "reward_near": near}
+
+        def infos() -> dict[str, Any]:
+            return {
+                "reward_dist": distance,
+                "reward_ctrl": control,
+                "reward_near": near,
+            }
+
         return distance + control + near, self.never(), infos
 
 
 class Reacher(Task):
+    noise = "more"  # As above.
+
     def __init__(self, env: Any, fields: Any) -> None:
         super().__init__(env, fields)
         tip, target = (env.model.body(name).id for name in ("fingertip", "target"))
@@ -447,7 +548,13 @@ class Reacher(Task):
         env = self.env
         distance = -_lengths(self.tip() - self.target()) * env._reward_dist_weight
         control = -_squares(self.actions) * env._reward_control_weight
-        infos = {"reward_dist": distance, "reward_ctrl": control}
+
+        def infos() -> dict[str, Any]:
+            return {
+                "reward_dist": distance,
+                "reward_ctrl": control,
+            }
+
         return distance + control, self.never(), infos
 
 

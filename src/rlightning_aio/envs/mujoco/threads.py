@@ -32,6 +32,7 @@ __all__ = ["Simulations", "state_of"]
 mujoco: Any = import_module("mujoco")
 
 _INTEGRATION: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_ALL_STAGES: Final = int(mujoco.mjtStage.mjSTAGE_ACC)
 _STATE_FIELDS: Final = ("qpos", "qvel", "ctrl", "qacc_warmstart")
 _UNSTABLE: Final = {
     int(warning): name
@@ -100,6 +101,7 @@ class Simulations:
 
     Attributes:
         rows: states of the simulations, ``[count, ...]`` float64.
+        moving: the part of `rows` that a step reads and changes; controls are only read.
         busy_ns: duration of the last call of `step`; 0 before the first.
 
     Raises:
@@ -123,7 +125,7 @@ class Simulations:
         if function is not None:
             self._with_forces = StepsWithForces(library, function, count, self._template)
         # Without the compiled function, MuJoCo must keep what forces are computed from.
-        self._keeps_data = forces and function is None
+        self._keeps_data, self._has_forces = forces and function is None, forces
         config = _Config(min(num_threads, count), self._keeps_data)
         error = ctypes.create_string_buffer(1000)
         address = library.mjb_makeBatch(
@@ -143,10 +145,11 @@ class Simulations:
             library.mjb_setModels(self._batch, models)
         size = library.mjb_nstate(self._batch)
         self.rows = _array(library.mjb_state(self._batch), np.float64, (count, size))
+        self.moving = self.rows[:, : _num_moving(model, size)]
         num_warnings = int(mujoco.mjtWarning.mjNWARNING)
-        self._warnings = _array(
-            library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2)
-        )[..., 1]
+        # Pairs of the last details and a number.
+        warnings = _array(library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2))
+        self._warned, self._warnings = warnings.view(np.int64).reshape(-1), warnings[..., 1]
         self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
         self._expanded: dict[str, NDArray[Any]] = {}
         self.busy_ns = 0
@@ -200,10 +203,10 @@ class Simulations:
         self._expanded[name] = found
         return found
 
-    def model_field(self, name: str) -> NDArray[Any]:
-        """A field of the model: ``[count, ...]`` if simulations differ in it, else the model's."""
+    def model_field(self, name: str, ids: Any = ...) -> NDArray[Any]:
+        """A field of the model: that of each simulation in `ids` if they differ in it."""
         found = self._expanded.get(name)
-        return getattr(self._model, name) if found is None else found
+        return getattr(self._model, name) if found is None else found[ids]
 
     def set_const(self, ids: NDArray[np.int32] | None = None) -> None:
         """Compute the fields that depend on others, in the models of all simulations or of `ids`.
@@ -236,7 +239,7 @@ class Simulations:
             num_failed = self._with_forces.step(self._batch, chosen, count, num_steps)
         else:
             num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
-        failures = self._failures() if num_failed or np.count_nonzero(self._warnings) else {}
+        failures = self._failures() if num_failed or np.count_nonzero(self._warned) else {}
         if self._keeps_data:
             forces = library.mj_rnePostConstraint  # It ignores the further arguments.
             library.mjb_apply(self._batch, chosen, count, forces, None, False)
@@ -245,12 +248,31 @@ class Simulations:
         self.busy_ns = time.monotonic_ns() - began
         return failures
 
+    def forward(self, ids: NDArray[np.int32]) -> None:
+        """Compute what follows from the states of the simulations `ids`, as a reset does.
+
+        Contact forces are 0 then.
+
+        Raises:
+            RuntimeError: MuJoCo can't compute it.
+        """
+        library = self._library
+        chosen, count = _chosen(ids)
+        if self._with_forces is not None:
+            num_failed = self._with_forces.forward(self._batch, chosen, count)
+        else:
+            num_failed = library.mjb_forward(self._batch, chosen, count, _ALL_STAGES)
+        if num_failed:
+            raise RuntimeError(f"MuJoCo can't reset: {'; '.join(self._failures().values())}")
+        if self._has_forces:
+            self.cfrc_ext[ids] = 0.0
+
     def _failures(self) -> dict[int, str]:
         failures: dict[int, str] = {}
         for warning, name in _UNSTABLE.items():
             for k in np.flatnonzero(self._warnings[:, warning]).tolist():
                 failures[k] = f"NaN, infinite or huge {name}: the simulation is unstable"
-        self._warnings[:] = 0
+        self._warned[:] = 0
         for k in np.flatnonzero(self._status).tolist():
             failures[k] = " ".join(self._library.mjb_error(self._batch, k).decode().split())
         return failures
@@ -260,19 +282,20 @@ class Simulations:
 
         Args:
             k: position of the simulation.
-            before: its state before the step.
+            before: the moving part of its state before the step.
             num_steps: number of MuJoCo's steps in it; 0 after a reset.
         """
         self.show_model(k)
         data = mujoco.MjData(self._model)
-        mujoco.mj_setState(self._model, data, before, _INTEGRATION)
+        state = self.rows[k].copy()
+        state[: len(before)] = before
+        mujoco.mj_setState(self._model, data, state, _INTEGRATION)
         if not num_steps:
             warmstart = data.qacc_warmstart.copy()
             data.qacc_warmstart[:] = 0  # As in the reset.
             mujoco.mj_forward(self._model, data)
             data.qacc_warmstart[:] = warmstart  # The state itself stays as it is.
             return data
-        data.ctrl[:] = self.ctrl[k]
         mujoco.mj_step(self._model, data, num_steps)
         mujoco.mj_rnePostConstraint(self._model, data)
         return data
@@ -283,6 +306,16 @@ def _chosen(ids: NDArray[np.int32] | None) -> tuple[Any, int]:
     if ids is None:
         return None, 0
     return ids.ctypes.data_as(POINTER(c_int)), len(ids)
+
+
+def _num_moving(model: Any, size: int) -> int:
+    """Number of leading values of a state that steps change; all `size`, if others change, too."""
+    states = mujoco.mjtState
+    leading = int(states.mjSTATE_CTRL) - 1  # Up to the warm start.
+    changing = int(states.mjSTATE_FULLPHYSICS) | int(states.mjSTATE_USERDATA)
+    if mujoco.mj_stateSize(model, changing & ~leading):
+        return size
+    return mujoco.mj_stateSize(model, leading)
 
 
 def _array(address: int, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:

@@ -1,0 +1,196 @@
+"""Simulations of a MuJoCo task that are stepped together, as a vector env of their own.
+
+No group is around them, so there is nothing to lose, to restart or to copy.
+"""
+
+from __future__ import annotations
+
+import copy
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio.envs.mujoco.batch import MujocoBatch
+from rlightning_aio.vector.lazy_infos import LazyColumns
+from rlightning_aio.vector.pending import check_free, check_running, check_sent
+from rlightning_aio.vector.proxies import EnvProxy, check_name
+from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from gymnasium.vector import AutoresetMode
+    from numpy.typing import NDArray
+
+__all__ = ["MujocoVectorEnv"]
+
+
+class MujocoVectorEnv(MujocoBatch):
+    """Simulations of one of Gymnasium's MuJoCo tasks behind Gymnasium's vector interface.
+
+    MuJoCo steps and resets them in threads of this process. Returned arrays are fresh: no later
+    call changes them. Infos are made when they are first read.
+
+    Args:
+        env, num_envs, autoreset_mode, num_threads, randomize: see `MujocoBatch`.
+    """
+
+    _pending: str | None = None
+    _do: Callable[[], Any]
+
+    @property
+    def autoreset_mode(self) -> AutoresetMode:
+        return self.metadata["autoreset_mode"]
+
+    @property
+    def group(self) -> Any:
+        """There is none; the error says how to get one."""
+        raise AttributeError(
+            "group: the envs of this task are stepped together in this process, without a group. "
+            "Pass placement='process' or another field of a config entry to make_vec, or make an "
+            "EnvGroup with EnvConfig(num_envs=...)"
+        )
+
+    def _infos(self, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        return LazyColumns(make)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Reset all envs, or those of a mask.
+
+        Args:
+            seed: env k gets ``seed + k``; or a sequence with one seed or None for each env.
+            options: passed to the task, without ``reset_mask``: a bool array ``[num_envs]`` that
+                selects the envs to reset. The others return their last observation again.
+
+        Raises:
+            ClosedEnvironmentError: the vector env is closed.
+        """
+        check_free(self, self._pending, "reset_async")
+        return self._reset_now(seed, options)
+
+    def _reset_now(self, seed: Any, options: dict[str, Any] | None) -> Any:
+        if options is not None and "reset_mask" in options:
+            checked_mask(options["reset_mask"], self.num_envs)
+        return super().reset(seed=seeds_of_envs(seed, self.num_envs), options=options)
+
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[
+        NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
+    ]:  # fmt: skip
+        """Step all envs, or reset those that are over; see `MujocoBatch.step`."""
+        check_free(self, self._pending, "step_async")
+        return super().step(actions)
+
+    # -- in two halves, of which the second computes -----------------------------------------
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Note a reset; `reset_wait` resets."""
+        self._note("reset", partial(self._reset_now, seed, options))
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Reset as `reset_async` was told; `timeout` is ignored."""
+        return self._noted("reset", timeout)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Note actions; `step_wait` steps."""
+        self._note("step", partial(super().step, np.array(actions)))
+
+    def step_wait(self, timeout: float | None = None) -> Any:
+        """Step as `step_async` was told; `timeout` is ignored."""
+        return self._noted("step", timeout)
+
+    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
+        """Note a call; `call_wait` calls."""
+        check_name(name)
+        self._note("call", partial(super().call, name, *args, **kwargs))
+
+    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
+        """Call as `call_async` was told; `timeout` is ignored."""
+        return self._noted("call", timeout)
+
+    def _note(self, what: str, do: Callable[[], Any]) -> None:
+        check_free(self, self._pending, f"{what}_async")
+        self._pending, self._do = what, do
+
+    def _noted(self, what: str, timeout: float | None) -> Any:
+        del timeout
+        check_sent(self, self._pending, what)
+        self._pending = None
+        return self._do()
+
+    # -- methods and attributes -----------------------------------------------------------
+
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call method `name` of each env, or get an attribute."""
+        check_free(self, self._pending, "call_async")
+        check_name(name)
+        return super().call(name, *args, **kwargs)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Attribute `name` of each env, found through its wrappers."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set attribute `name` of all envs to one value, or to equal values in a list or tuple."""
+        check_running(self)
+        super().set_attr(name, values)
+
+    @property
+    def envs(self) -> list[Any]:
+        """A proxy of each env; it fetches attributes when they are read."""
+        return [
+            EnvProxy(partial(self._look_up, k), partial(self._call_one, k))
+            for k in range(self.num_envs)
+        ]
+
+    def _look_up(self, k: int, name: str) -> tuple[bool, Any]:
+        is_method = callable(getattr(self.env, name, None))
+        return is_method, None if is_method else self._call_one(k, name)
+
+    def _call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        check_free(self, self._pending, "call_async")
+        check_name(name)
+        return self.call_one(k, name, *args, **kwargs)
+
+    @property
+    def np_random(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # As theirs.
+        """Random generators of the envs: a tuple."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Seeds of the envs' random generators: a tuple."""
+        return self.get_attr("np_random_seed")
+
+    # -- state and rendering ---------------------------------------------------------------
+
+    def save_state(self) -> dict[str, Any]:
+        """Return the state of all envs, as a copy that can be pickled."""
+        check_running(self)
+        return copy.deepcopy(super().save_state())
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore the state of all envs, of this vector env or of another one of the same task.
+
+        Raises:
+            ValueError: it is that of another model, or of envs with another `randomize`; nothing
+                was changed.
+        """
+        check_running(self)
+        super().load_state(copy.deepcopy(state))
+
+    def render_one(self, k: int) -> Any:
+        """Render a frame of env k in the render mode of the task."""
+        check_running(self)
+        return super().render_one(k)
