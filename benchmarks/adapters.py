@@ -35,14 +35,14 @@ COMPUTES = Work(no_work.WORKS_1_MS, num_envs=32, modules=("no_work",))
 
 @dataclass
 class OursVector(GymnasiumVector):
-    """`rlightning_aio.vector.VectorEnv`, with its workers pinned to cores like the bare group's."""
+    """`rlightning_aio.vector.VectorEnv`, with a worker for each core like the bare group."""
 
     package = "rlightning_aio"
 
     def make(self) -> Any:
         from rlightning_aio.vector import VectorEnv
 
-        return VectorEnv(self.work.makers(), max_concurrency=num_cores(), cpu_affinity=True)
+        return VectorEnv(self.work.makers(), max_concurrency=num_cores())
 
 
 @dataclass
@@ -71,7 +71,7 @@ class OursSb3(Sb3Vector):
         from rlightning_aio.sb3 import VecEnv
 
         share = -(-self.work.num_envs // num_cores())
-        return VecEnv(self.work.makers(), envs_per_process=share, cpu_affinity=True)
+        return VecEnv(self.work.makers(), envs_per_process=share)
 
 
 @dataclass
@@ -83,7 +83,7 @@ class OursMadeVector(GymnasiumVector):
     def make(self) -> Any:
         from rlightning_aio.vector import make_vec
 
-        return make_vec(self.work.task, self.work.num_envs, vector_kwargs={"cpu_affinity": True})
+        return make_vec(self.work.task, self.work.num_envs)
 
 
 @dataclass
@@ -97,7 +97,7 @@ class OursMadeSb3(Sb3Vector):
     def make(self) -> Any:
         from rlightning_aio.sb3 import make_vec_env
 
-        arguments = {"env_kwargs": {"render_mode": None}, "vec_env_kwargs": {"cpu_affinity": True}}
+        arguments = {"env_kwargs": {"render_mode": None}}
         return make_vec_env(self.work.task, self.work.num_envs, **arguments).venv
 
 

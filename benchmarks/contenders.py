@@ -125,11 +125,7 @@ def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
     workers: dict[str, Any] = {}
     if work.placement != "inline":
         by_core = -(-work.num_requests // num_cores())  # `auto` gives own tasks a worker each.
-        # With one worker on each core, pinning is best.
-        workers = {
-            "envs_per_process": by_core if envs_per_process == "auto" else envs_per_process,
-            "cpu_affinity": envs_per_process == "auto",
-        }
+        workers = {"envs_per_process": by_core if envs_per_process == "auto" else envs_per_process}
     return {
         "name": "bench",
         "backend": work.backend,

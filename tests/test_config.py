@@ -239,7 +239,6 @@ words = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="?"
             "on_worker_death": st.sampled_from(["restart", "raise"]),
             "max_restarts": st.integers(0, 99),
             "env_vars": st.dictionaries(st.from_regex(r"\A[A-Z_]+\Z"), st.text("ab= ")),
-            "cpu_affinity": st.booleans(),
             "env_kwargs": st.dictionaries(
                 st.text("abc", min_size=1),
                 st.recursive(
@@ -398,14 +397,6 @@ def test_num_envs_of_a_backend_with_single_envs_is_refused() -> None:
     assert said in problems_of(arm)
 
 
-def test_min_results_above_the_number_of_envs_is_refused() -> None:
-    """An env_server has no such bound, because any number of clients may connect."""
-    said = problems_of({**CARTPOLE, "num_workers": 4, "min_results": 5})
-    assert "envs.0 ('cartpole'), min_results: is 5, more than num_workers: 4" in said
-    parse_configs({**CARTPOLE, "num_workers": 4, "min_results": 4})
-    parse_configs({"name": "robots", "backend": "env_server", "min_results": 9})
-
-
 def test_a_missing_task_is_named() -> None:
     """It is the only field without a default."""
     assert "envs.0 ('mujoco'), task: is required" in problems_of([{"backend": "mujoco"}])
@@ -437,7 +428,6 @@ VALUES: dict[str, Any] = {
     "max_restarts": 0,
     "interpreter": sys.executable,
     "env_vars": {"A": "1"},
-    "cpu_affinity": True,
     "max_concurrency": 3,
     "ray_options": {"max_restarts": 0},
     "video": {"folder": "films"},
@@ -474,7 +464,6 @@ def test_other_fields_are_accepted_for_the_placement() -> None:
         "step_timeout": None,
         "interpreter": None,
         "env_vars": {},
-        "cpu_affinity": False,
     }
     parse_configs(INLINE | asks_nothing | {"num_workers": 3, "num_gpus": 0.5})
     if BACKENDS["env_server"].installed_version() is not None:

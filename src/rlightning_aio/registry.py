@@ -243,7 +243,6 @@ PLACEMENTS: dict[str, Placement] = {
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
-            "cpu_affinity": _THIS_PROCESS,
             "ray_options": _NOT_RAYS,
         },
         awaits="only",
@@ -262,7 +261,6 @@ PLACEMENTS: dict[str, Placement] = {
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
-            "cpu_affinity": _THIS_PROCESS,
             "ray_options": _NOT_RAYS,
             "max_concurrency": _NOT_ON_LOOP,
         },
@@ -273,7 +271,6 @@ PLACEMENTS: dict[str, Placement] = {
         refuses={
             "interpreter": "Ray starts the actors; ray_options.runtime_env may name another "
             "Python or other packages",
-            "cpu_affinity": "Ray assigns the cores of its nodes",
             "max_concurrency": _NOT_ON_LOOP,
         },
         local=False,
@@ -296,7 +293,6 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "envs_per_process": _CLIENTS_OWN,
             "interpreter": _CLIENTS_OWN,
             "env_vars": _CLIENTS_OWN,
-            "cpu_affinity": _CLIENTS_OWN,
             "ray_options": _CLIENTS_OWN,
             "max_concurrency": _CLIENTS_OWN,
             "start_timeout": "clients connect at any time; env_kwargs.connect_timeout limits how "

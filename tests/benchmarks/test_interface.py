@@ -11,7 +11,7 @@ MOST = {
     "names": 80,
     "members": 360,
     "arguments": 417,
-    "fields": 26,
+    "fields": 24,
     "commands": 8,
     "options": 31,
     "extras": 15,

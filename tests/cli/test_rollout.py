@@ -71,12 +71,6 @@ def test_a_rollout_without_results_prints_a_document(tmp_path: Path) -> None:
     assert " steps in " in invoke("rollout", config, "--seconds", 0.001).stdout
 
 
-def test_rollout_uses_the_configs_min_results(tmp_path: Path) -> None:
-    """`tune` writes this field."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 6, "min_results": 5})
-    assert invoke_json("rollout", config, "--steps", 100)["batch_size"]["max"] >= 5
-
-
 def test_overrides_change_the_config(tmp_path: Path) -> None:
     """They follow the file on the command line."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})

@@ -67,12 +67,11 @@ def sizes_of_batches(group: Any, **options: Any) -> set[int]:
     return set(sizes[1:])
 
 
-def test_the_configs_number_of_results_is_the_default() -> None:
+def test_half_of_the_envs_is_the_default() -> None:
     """Inline envs are executed only while too few results are ready."""
     assert sizes_of_batches(poles(4)) == {2}, "half of the envs"
     assert sizes_of_batches(poles(1)) == {1}
-    assert sizes_of_batches(poles(4, min_results=3)) == {3}
-    assert sizes_of_batches(poles(4, min_results=3), min_results=2) == {2}
+    assert sizes_of_batches(poles(4), min_results=3) == {3}
 
 
 def test_each_kind_of_env_has_its_own_policy_and_rollout() -> None:

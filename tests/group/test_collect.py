@@ -6,7 +6,6 @@ Rules that need an exact order of events and a clock are in `test_core`.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -120,28 +119,6 @@ def test_a_collect_respects_its_minimum_and_maximum(sync_group: Any, gates: list
         assert len(batch) == len(flags) == size
         came += batch.ids()
     assert came == ["gated-1", "gated-3", "gated-0"]
-
-
-def test_the_default_minimum_comes_from_the_config(tmp_path: Path) -> None:
-    """It is the sum over the entries; a smaller maximum lowers it."""
-    envs = {"backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
-    entries = [
-        {**envs, "name": "a", "num_workers": 3, "min_results": 2},
-        {**envs, "name": "b", "num_workers": 3, "min_results": 3},
-        {**envs, "name": "c"},
-    ]
-    with rlightning_aio.sync.build_env_group(entries) as group:
-        batch, _ = group.reset(seed=0)
-        steps = batch.respond(action=[0] * 7)
-        for options, count in (
-            ({}, 5),
-            ({"max_results": 1}, 1),
-            ({"min_results": 4}, 4),
-        ):
-            group.step_async(steps)
-            assert len(group.collect_async(**options)[0]) == count, options
-            with contextlib.suppress(NothingPending):
-                group.collect_async(wait_all=True)
 
 
 def test_workers_are_described_with_what_they_are_doing(sync_group: Any, gates: list[Gate]) -> None:

@@ -25,9 +25,6 @@ def maker_of_witnesses() -> Any:
         def variable(self, name: str) -> str | None:
             return os.environ.get(name)
 
-        def cores(self) -> set[int]:
-            return os.sched_getaffinity(0)
-
         def seen_by(self, module: str) -> str | None:
             """Return what a module saw when it was imported."""
             return sys.modules[module].FOUND
@@ -52,7 +49,6 @@ def test_each_entry_has_its_own_surroundings(
             "task": witness,
             "num_workers": 2,
             "envs_per_process": 1,
-            "cpu_affinity": True,
         },
         {
             "name": "other",
@@ -62,20 +58,16 @@ def test_each_entry_has_its_own_surroundings(
             "imports": ["flavoured"],
         },
     ]
-    cores = sorted(os.sched_getaffinity(0))
     with build_env_group(entries) as group:
-        one, two, other = (group[env_id] for env_id in group.env_ids)
+        one, _, other = (group[env_id] for env_id in group.env_ids)
         for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             assert one.call("variable", name) == "1"
         assert one.call("variable", "FLAVOUR") == "salt"
         assert one.call("variable", "STARTED_BY") is None
-        pinned = [env.call("cores") for env in (one, two)]
-        assert pinned == [{cores[k % len(cores)]} for k in range(2)]
         assert other.call("variable", "STARTED_BY") == str(program)
         assert other.call("seen_by", "flavoured") == "sugar"
         assert other.call("variable", "OMP_NUM_THREADS") == "1"
         assert other.call("variable", "MKL_NUM_THREADS") == "3", (
             "the configured values are in effect"
         )
-        assert other.call("cores") == set(cores)
     assert "flavoured" not in sys.modules

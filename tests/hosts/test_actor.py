@@ -32,7 +32,7 @@ def order(num_envs: int = 2, **fields: Any) -> bytes:
         **{"name": "one", "backend": "probe", "task": "-", "num_workers": num_envs, **fields}
     )
     indices, fns = tuple(range(num_envs)), (None,) * num_envs
-    return dumped_with_code(StartOrder(config, None, indices, fns, spins=False, core=None))
+    return dumped_with_code(StartOrder(config, None, indices, fns, spins=False))
 
 
 def actor(limits: dict[int, float] | None = None, **fields: Any) -> EnvActor:

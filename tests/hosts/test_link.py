@@ -106,7 +106,7 @@ class Scene:
             is_idle=lambda slot: True,
             resources={(ForkServerHandle, *_surroundings(CONFIG)): self.fork_server},
         )
-        order = StartOrder(CONFIG, None, (0, 1), (None, None), spins=False, core=None)
+        order = StartOrder(CONFIG, None, (0, 1), (None, None), spins=False)
         self.host = ProcessHost(0, 0, order, wiring)
         self.rung = 0
 

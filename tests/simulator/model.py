@@ -66,7 +66,6 @@ class Entry:
     on_death: str
     every: int | None
     max_restarts: int
-    min_results: int | None
 
     @property
     def own_limit(self) -> float:

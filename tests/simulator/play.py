@@ -477,15 +477,11 @@ class Play(Session):
         """As many results as the rules say."""
         there = len(self.collectable())
         most = min(rules.get("max_results") or there, there)
-        usual = 1 if rules.get("wait_all") else self.usual_min_results()
-        need = most if rules.get("wait_all") else min(rules.get("min_results") or usual, most)
+        need = most if rules.get("wait_all") else min(rules.get("min_results", 1), most)
         require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
         order = list(self.model.envs)
         places = [order.index(env_id) for env_id in batch.env_ids()]
         require(places == sorted(places), "not in the group's order", places)
-
-    def usual_min_results(self) -> int:
-        return sum(plan.min_results or 0 for plan in self.program.plans) or 1
 
     async def op_reset(self, rng: Random) -> None:
         envs = self.some(rng, self.model.idle())

@@ -75,7 +75,6 @@ class Plan:
     every: int | None = None
     max_restarts: int = 3
     timeout: float | None = None
-    min_results: int | None = None
     start: str = ""
 
     def config(self, number: int) -> dict[str, Any]:
@@ -84,7 +83,6 @@ class Plan:
             "name": self.name, "num_workers": self.num_workers, "placement": self.placement,
             "max_restarts": self.max_restarts, "step_timeout": self.timeout,
             "reset_timeout": self.timeout, "on_worker_death": self.on_death,
-            "min_results": self.min_results,
         }  # fmt: skip
         if self.placement in ("inline", "loop"):
             if self.placement == "inline":
@@ -124,7 +122,7 @@ class Plan:
         """What the model must know."""
         return Entry(
             self.name, self.form, self.layout, self.controls, self.num_envs, self.mode,
-            self.limit, self.on_death, self.every, self.max_restarts, self.min_results,
+            self.limit, self.on_death, self.every, self.max_restarts,
         )  # fmt: skip
 
 
@@ -255,7 +253,7 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
     features -= {"async", "base", "awaitable", "several entries"}
     if kind == "sb3":
         features -= {"out of band"}
-    plan = replace(_plan(rng, features, "env"), min_results=None)
+    plan = _plan(rng, features, "env")
     if plan.form == "stacked" and plan.mode == "next_step" and plan.on_death == "resume":
         plan = replace(plan, on_death="restart", every=None)
     if plan.form == "stacked" and kind == "sb3":
@@ -277,8 +275,6 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
     if form == "stacked":
         modes = ["disabled", "disabled", "next_step", "same_step"]
         plan = replace(plan, num_envs=rng.randint(2, 3), mode=rng.choice(modes))
-    if "extras" in features and rng.random() < 0.3:
-        plan = replace(plan, min_results=rng.randint(1, plan.num_workers))
     places = ["inline"] if form != "awaitable" else ["loop"] if "async" in features else []
     if "processes" in features or not places:
         places += ["process"] if form == "awaitable" else ["process"] * 5

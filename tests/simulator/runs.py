@@ -179,7 +179,6 @@ def _simpler(program: Program) -> Iterator[Callable[[Program], Program]]:
         for fields in (
             {"num_workers": 1},
             {"limit": None},
-            {"min_results": None},
             {"layout": "vector"},
         ):
             yield lambda p, k=number, f=fields: replace(

@@ -60,7 +60,7 @@ class Vectors(Session):
             else:
                 makers.append(partial(Scripted, codes[0], *tail))
         fields = plan.config(0)
-        for name in ("name", "num_workers", "task", "min_results"):
+        for name in ("name", "num_workers", "task"):
             fields.pop(name, None)
         try:
             self.rows = self.make(makers, fields)

@@ -114,7 +114,7 @@ def _offers(config: EnvConfig) -> dict[str, Any]:
 
 async def _try(config: EnvConfig, found: _Finding) -> None:
     """Build one env of the entry and step it."""
-    one = [config.model_copy(update={"num_workers": 1, "min_results": None})]
+    one = [config.model_copy(update={"num_workers": 1})]
     async with rlightning_aio.build_env_group(one) as group:
         (meta,) = group.metas
         found.observation_space = str(meta.observation_space)

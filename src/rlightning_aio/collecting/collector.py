@@ -88,8 +88,8 @@ class Collector(Generic[G, R]):
         num_transitions: transitions of each rollout, counting sub-environments; T * N with
             `wait_all`.
         min_results: number of results to wait for before the policy is called, or all pending
-            ones if they are fewer; an env with sub-environments returns one result. None is the
-            sum of ``min_results`` of the config entries, or else half of the envs.
+            ones if they are fewer; an env with sub-environments returns one result. None is half
+            of the envs.
         wait_all: collect blocks ``[T, N]``.
         infos: names of numbers in infos, such as ``("success",)``. Each becomes a float64 column
             of the rollout, NaN where the info of a transition has no such number. A name that no

@@ -129,14 +129,6 @@ def _check_interpreter(config: EnvConfig) -> str | None:
     return f"{path!r} {reason}"
 
 
-def _check_min_results(config: EnvConfig) -> str | None:
-    if config.min_results is None or config.backend == "env_server":
-        return None
-    if config.min_results <= config.num_workers:
-        return None
-    return f"is {config.min_results}, more than num_workers: {config.num_workers}"
-
-
 def _check_snapshot_every(config: EnvConfig) -> str | None:
     resumes = config.on_worker_death == "resume"
     if "snapshot_every" in placement_of(config.backend, config.placement).refuses:
@@ -166,7 +158,6 @@ def _check_video(config: EnvConfig) -> str | None:
 
 _COMPARED_WITH = {
     "task": ("num_workers",),
-    "min_results": ("num_workers",),
     "snapshot_every": ("on_worker_death",),
     "video": ("num_workers", "num_envs", "env_kwargs"),
 }
@@ -176,7 +167,6 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "task": _check_task,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
-    "min_results": _check_min_results,
     "snapshot_every": _check_snapshot_every,
     "video": _check_video,
 }

@@ -121,9 +121,6 @@ class EnvConfig(_Fields):
     no limit (``placement: loop`` only)."""
     envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Envs that share a worker."""
-    min_results: int | None = Field(default=None, ge=1)
-    """Number of results for which `collect_async`, `Collector` and `evaluate` wait by default; the
-    values of all entries are added up."""
     step_timeout: float | None = Field(default=None, gt=0)
     """Seconds that one step may take before the env counts as hung."""
     reset_timeout: float | None = Field(default=None, gt=0)
@@ -146,8 +143,6 @@ class EnvConfig(_Fields):
     env_vars: dict[str, str] = Field(default_factory=dict)
     """Environment variables of the worker, set before anything is imported; ``{process_index}`` in
     a value stands for the number of the worker among the entry's."""
-    cpu_affinity: bool = False
-    """Pin worker k to the k-th core this process may use."""
     ray_options: dict[str, Any] = Field(default_factory=dict)
     """Arguments for ``.options()`` of a Ray actor, except `num_cpus` and `num_gpus`, and
     ``address``, the cluster's (``placement: ray`` only)."""

@@ -130,7 +130,7 @@ def evaluate(
             each to be played once by any free env.
         seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
             seed ``seed + n * N + k``; of sub-environments that reset themselves, only the first.
-        min_results: results to wait for; None is that of the entries, or else half of the envs.
+        min_results: results to wait for; None is half of the envs.
         max_attempts: for a queue: an episode that was lost this often has failed; None is 3.
         results: for a queue: the file to save episodes in; those that it has are not played again.
         video: for a queue: the episodes to film.

@@ -91,7 +91,6 @@ class StartOrder:
         worker_indices: of the envs in the entry.
         preprocess_fns: one for each env; None for the default.
         spins: waiting may use a core for some microseconds.
-        core: the only core to run on; None for any.
         trainer_pid: the process that gives the order; None if it runs on another machine.
         tasks: of `known_tasks`.
     """
@@ -101,7 +100,6 @@ class StartOrder:
     worker_indices: tuple[int, ...]
     preprocess_fns: tuple[Any, ...]
     spins: bool
-    core: int | None
     trainer_pid: int | None = field(default_factory=os.getpid)
     tasks: tuple[bytes, ...] = ()
 

@@ -98,7 +98,7 @@ _MinResults: TypeAlias = Annotated[
     typer.Option(
         min=1,
         help="Results to wait for in each collect.",
-        show_default="the config's, or half of the envs",
+        show_default="half of the envs",
     ),
 ]
 _Live: TypeAlias = Annotated[

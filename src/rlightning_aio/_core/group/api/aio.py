@@ -84,7 +84,7 @@ class EnvGroup(GroupInterface):
         self,
         timeout: float | None = None,  # noqa: ASYNC109  # Of the window, not of the call.
         wait_all: bool = False,
-        min_results: int | None = None,
+        min_results: int = 1,
         max_results: int | None = None,
         deadline: float | None = None,
     ) -> tuple[BatchedData, list[bool]]:

@@ -103,9 +103,8 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
 
 
 def default_min_results(group: Any) -> int:
-    """Number of results that a policy waits for: the sum of the entries', or half of the envs."""
-    core: Core = group._core  # noqa: SLF001
-    return core.envs.configured_min_results or max(1, len(group.env_ids) // 2)
+    """Number of results that a policy waits for: half of the envs."""
+    return max(1, len(group.env_ids) // 2)
 
 
 class Facade:
@@ -268,16 +267,13 @@ class Facade:
         self,
         timeout: float | None,
         wait_all: bool,
-        min_results: int | None,
+        min_results: int,
         max_results: int | None,
         deadline: float | None,
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
         if timeout is not None or deadline is not None:
             _check_seconds("timeout", timeout)
             _check_seconds("deadline", deadline)
-        if min_results is None:
-            usual = 1 if wait_all else self._core.envs.configured_min_results or 1
-            min_results = usual if max_results is None else max(1, min(usual, max_results))
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
         if max_results is not None and max_results < 1:

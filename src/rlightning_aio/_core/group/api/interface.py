@@ -100,7 +100,7 @@ class GroupInterface(Facade):
         self,
         timeout: float | None = None,
         wait_all: bool = False,
-        min_results: int | None = None,
+        min_results: int = 1,
         max_results: int | None = None,
         deadline: float | None = None,
     ) -> Any:
@@ -112,8 +112,7 @@ class GroupInterface(Facade):
             timeout: seconds of a further window, opened when the first result is ready, in
                 which more results join.
             wait_all: wait for all pending results; ignores `timeout`, with a warning.
-            min_results: return when this many are ready, or all that are pending. None is the
-                sum of the config entries' ``min_results``, or 1.
+            min_results: return when this many are ready, or all that are pending.
             max_results: leave results above this number to the next call, first come, first
                 served.
             deadline: limit in seconds, from now.

@@ -88,7 +88,7 @@ class EnvGroup(GroupInterface):
         self,
         timeout: float | None = None,
         wait_all: bool = False,
-        min_results: int | None = None,
+        min_results: int = 1,
         max_results: int | None = None,
         deadline: float | None = None,
     ) -> tuple[BatchedData, list[bool]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import itertools
-import os
 from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -34,7 +33,6 @@ def _has_worker_here(config: EnvConfig) -> bool:
 def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
     """The start order of each host: first those whose envs are built with the group."""
     shares = _all_shares(plan, num_cores)
-    cores = sorted(os.sched_getaffinity(0))
     num_processes = sum(_has_worker_here(config) for config, _ in shares)
     variables = _environment_variables([config for config, _ in shares])
     elsewhere = any(place_of(config).spreads for config, _ in shares)
@@ -48,7 +46,6 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
             worker_indices=tuple(index for index, _ in share),
             preprocess_fns=tuple(fn for _, fn in share),
             spins=num_processes <= num_cores,
-            core=cores[host_id % len(cores)] if config.cpu_affinity else None,
             tasks=tasks,
         )
         for host_id, (config, share) in enumerate(shares)
@@ -74,7 +71,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
 def _order_of_members(config: EnvConfig) -> StartOrder:
     """The order of a host whose envs join and leave."""
     count = place_of(config).max_members
-    return StartOrder(config, None, tuple(range(count)), (None,) * count, spins=False, core=None)
+    return StartOrder(config, None, tuple(range(count)), (None,) * count, spins=False)
 
 
 def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:

@@ -72,7 +72,6 @@ class EnvTable:
         self._slot_of = {env_id: slot for slot, env_id in enumerate(env_ids)}
         entry_names = list(dict.fromkeys(config.name for config in self.configs))
         number = {name: k for k, name in enumerate(entry_names)}
-        self._min_results = {config.name: config.min_results or 0 for config in self.configs}
         self.names = EnvNames(
             [*env_ids, *[""] * (size - len(env_ids))],
             shared_ids,
@@ -185,11 +184,6 @@ class EnvTable:
         ids = list(self._slot_of)
         known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")
         return f"no env of this group is called {env_id!r}; its envs are {known}"
-
-    @property
-    def configured_min_results(self) -> int:
-        """The sum of the entries' ``min_results``; 0 if none has any."""
-        return sum(self._min_results.values())
 
     def describe(self, slot: int) -> str:
         """The name of an env in messages, with its entry, backend and task."""

@@ -263,8 +263,6 @@ class Worker:
             self._begin_with(0)
             order = pickle.loads(frame.payload)
             assert order is not None
-            if order.core is not None:
-                os.sched_setaffinity(0, {order.core})
             self._spinner = Spinner(enabled=order.spins)
             self._timed = bool(limits_of(order.config))
             self._rings.own[CAREFUL] = self._timed
