@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
+from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.envs.sub_envs.sub_envs import adapted
@@ -307,7 +308,7 @@ class VecEnv(_Base):
             turn = {places[k]: k for k in reversed(left)}
             with self._exchange():
                 self._rows.call(name, args, kwargs, list(turn))
-                found = self._rows.values(self.group.collect_calls(), list(turn))
+                found = self._rows.values(collect_calls(self.group), list(turn))
             values.update(zip(turn.values(), found, strict=True))
         return [values[k] for k in range(len(places))]
 

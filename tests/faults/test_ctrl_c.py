@@ -16,6 +16,7 @@ from faults.striking import hear_of_interrupt, interrupt, press, struck
 from patience import HANG
 
 import rlightning_aio.sync
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvBusy, GroupClosed
 from rlightning_aio.vector.leftovers import drop_outstanding
 
@@ -51,8 +52,8 @@ def reset(group: Any, batch: BatchedData) -> None:
 
 def call(group: Any, batch: BatchedData) -> None:
     del batch
-    group.call_async("call_wrapped", "get_wrapper_attr", "render_mode")
-    group.collect_calls()
+    send_calls(group, "call_wrapped", "get_wrapper_attr", "render_mode")
+    collect_calls(group)
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ import pytest
 from faults.striking import hear_of_interrupt, struck
 
 import rlightning_aio.sync
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvRaised, NothingPending
 
 if TYPE_CHECKING:
@@ -76,7 +78,7 @@ class Answers:
             self.last[env_id] = self.group[env_id].get_attr("serial")
 
     def take_outstanding(self) -> None:
-        for collect in (self.group.collect_async, self.group.collect_calls):
+        for collect in (self.group.collect_async, partial(collect_calls, self.group)):
             while True:
                 try:
                     self.take(collect())
@@ -108,8 +110,8 @@ def reset_one(group: Any, batch: Any) -> Any:
 
 
 def call(group: Any, batch: Any) -> Any:
-    group.call_async("number")
-    return group.collect_calls()
+    send_calls(group, "number")
+    return collect_calls(group)
 
 
 USES = [step, step_async, step_one, reset, reset_one, call]

@@ -19,6 +19,7 @@ from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
+from rlightning_aio._core.group.drivers.aio_driver import AioDriver
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
@@ -35,6 +36,10 @@ class Awaited:
 
     def __getattr__(self, name: str) -> Any:
         attribute = getattr(self.wrapped, name)
+        if name == "_driver":  # That of `calling`.
+            return Awaited(attribute, AioDriver)
+        if name == "_core":
+            return attribute
         if not inspect.iscoroutinefunction(getattr(self._like, name)):
             return attribute
 

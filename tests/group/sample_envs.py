@@ -104,7 +104,6 @@ class Probe(BaseEnv):
         self.steps = 0
         self.seed = -1
         self.offloaded = False
-        self.label = "the env's own"
         self.env = ProbedSimulator()
         if config.env_kwargs.get("fails") == worker_index:
             raise RuntimeError("no simulator here")
@@ -164,6 +163,7 @@ class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self) -> None:
         inner = DrawnEnv(spaces.Discrete(2), spaces.Discrete(2))
         inner.label = "inner"  # type: ignore[attr-defined]
+        inner.depth = 2  # type: ignore[attr-defined]
         inner.render = lambda: np.full((2, 2, 3), 7, np.uint8)  # type: ignore[method-assign]
         inner.weigh = lambda factor: 3 * factor  # type: ignore[attr-defined]
         super().__init__(gym.Wrapper(inner))

@@ -10,6 +10,7 @@ import pytest
 from group.sample_envs import Gate
 
 from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio._core.group.state.conditions import ABORTING, DEATH, LOST_EPISODE
 from rlightning_aio.errors import EnvAborted, EnvRaised, GroupClosed
 
@@ -121,14 +122,14 @@ async def test_a_call_can_be_aborted(start: Any, entry: Any) -> None:
     """Its env is free, and `collect_calls` says so."""
     group = await start(entry)
     await group.reset(seed=3)
-    group.call_async("get_attr", "label", "outer", env_ids=IDS[:2])
+    send_calls(group, "get_attr", "label", env_ids=IDS[:2])
     await group.abort(IDS[:1])
     batch, _ = await group.step(steps(IDS[0]))
-    (outcome,) = await asyncio.gather(group.collect_calls(), return_exceptions=True)
+    (outcome,) = await asyncio.gather(collect_calls(group), return_exceptions=True)
     if isinstance(outcome, EnvAborted):
         assert outcome.env_id == IDS[0]
     else:
-        assert outcome == ["the env's own"] * 2  # It had ended before.
+        assert outcome == ["outer"] * 2  # It had ended before.
     assert batch.restarted.tolist() == [isinstance(outcome, EnvAborted)]
     await group.step(steps(*IDS))
 
@@ -175,11 +176,11 @@ async def test_a_drain_raises_errors_once_all_envs_are_idle(start: Any, entry: A
 async def test_a_drain_drops_the_values_of_calls(start: Any, entry: Any) -> None:
     group = await start(entry)
     await group.reset(seed=3)
-    group.call_async("get_attr", "label", "outer")
+    send_calls(group, "get_attr", "label")
     await group.drain()
     assert group.pending == []
     with pytest.raises(NothingPending):
-        await group.collect_calls()
+        await collect_calls(group)
     await group.step(steps(*IDS))
 
 

@@ -166,7 +166,7 @@ def test_an_error_of_a_cancelled_step_reaches_the_collector(new_group: NewGroup)
 def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str) -> None:
     """The env can be stepped once it has replied."""
     group = new_group(1)
-    running = group.begin(group.core.calls.call(group.now, 0, (name, (), {})))
+    running = group.begin(group.core.calls.call_one(group.now, 0, (name, (), {})))
     group.cancel(running)
     with pytest.raises(NothingPending):
         collect(group).result()
@@ -238,7 +238,7 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     with pytest.raises(GroupClosed, match=hint):
         group.begin(group.core.reset(group.now, None, None, None)).result()
     with pytest.raises(GroupClosed, match=hint):
-        group.begin(group.core.calls.call(group.now, 0, ("who", (), {}))).result()
+        group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))).result()
     group.close()
 
 
@@ -259,7 +259,7 @@ def test_values_that_cannot_be_pickled_are_refused_before_anything_is_sent(
     with pytest.raises(TypeError, match="options for env 'fake-0'"):
         group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
     with pytest.raises(TypeError, match=r"arguments of who\(\)"):
-        group.begin(group.core.calls.call(group.now, 0, ("who", (unpicklable,), {}))).result()
+        group.begin(group.core.calls.call_one(group.now, 0, ("who", (unpicklable,), {}))).result()
     assert not any(host.waiting for host in group.hosts)
     running = group.begin(group.steps.step(steps(0, 1), group.now))
     group.finish(0)
@@ -431,7 +431,7 @@ def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
 
 
 @pytest.mark.parametrize("ordinary", [True, False])
-@pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot", "call_async"])
+@pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot", "send_calls"])
 def test_requests_that_were_sent_in_part_disturb_no_other_call(
     new_group: NewGroup, ask: str, ordinary: bool
 ) -> None:
@@ -447,7 +447,7 @@ def test_requests_that_were_sent_in_part_disturb_no_other_call(
         "step_async": lambda: group.steps.step_async(both, group.now),
         "reset": lambda: group.begin(core.reset(group.now, None, None, ids)).result(),
         "snapshot": lambda: group.begin(core.snapshot(group.now, ids)).result(),
-        "call_async": lambda: core.calls.call_async(group.now, ids, ("who", (), {})),
+        "send_calls": lambda: core.calls.send_calls(group.now, ids, ("who", (), {})),
     }
     host: Any = group.hosts[1]
     with pytest.MonkeyPatch.context() as patch:
@@ -462,7 +462,7 @@ def test_requests_that_were_sent_in_part_disturb_no_other_call(
     assert not stepping.done
     group.finish(2)
     assert ids_of(stepping) == ["fake-2"]
-    if ask in ("snapshot", "call_async"):
+    if ask in ("snapshot", "send_calls"):
         group.steps.step_async(steps(0), group.now)
         group.finish(0)
     assert ids_of(collect(group)) == ["fake-0"]
@@ -486,7 +486,7 @@ def test_requests_have_a_worker_replaced_in_which_only_a_cancelled_call_still_ru
     group = new_group(1)
     group.hosts[0].refusals = 1
     die(group, 0)
-    group.cancel(group.begin(group.core.calls.call(group.now, 0, ("who", (), {}))))
+    group.cancel(group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))))
     group.now += 60.0
     with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
         group.steps.step_async(steps(0), group.now)

@@ -153,7 +153,7 @@ def test_fresh_observations_are_handed_over_uncopied() -> None:
     """The column is a view of the env's array."""
     with rlightning_aio.sync.build_env_group(fresh("array")) as group:
         batch = step(group, group.reset()[0])
-        assert np.shares_memory(batch.observation, group["array-0"].get_attr("given", "outer"))
+        assert np.shares_memory(batch.observation, group["array-0"].get_attr("given"))
 
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")

@@ -13,6 +13,7 @@ from group.conftest import INLINE, INLINE_SYNC, Place
 
 import rlightning_aio
 import rlightning_aio.sync
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 
 
 def test_inline_entries_take_turns() -> None:
@@ -63,7 +64,7 @@ async def test_a_cancelled_call_that_still_waits_for_its_turn_delays_no_request(
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(
     ("place", "calls"),
-    [(INLINE, "call_async"), (INLINE, "a handle"), (INLINE_SYNC, "call_async")],
+    [(INLINE, "two halves"), (INLINE, "a handle"), (INLINE_SYNC, "two halves")],
 )
 async def test_a_call_delays_no_ordinary_step_on_one_core(
     place: Place, calls: str, monkeypatch: pytest.MonkeyPatch
@@ -77,8 +78,8 @@ async def test_a_call_delays_no_ordinary_step_on_one_core(
         core: Any = getattr(group, "wrapped", group)._core
         assert not core.parts.tables.conditions.unusual
         core.supervisor.look_by = math.inf
-        if calls == "call_async":
-            group.call_async("get_attr", "gravity", env_ids=["pole-0"])
+        if calls == "two halves":
+            send_calls(group, "get_attr", "gravity", env_ids=["pole-0"])
             values = None
         else:
             values = asyncio.create_task(group["pole-0"].get_attr("gravity"))
@@ -86,4 +87,4 @@ async def test_a_call_delays_no_ordinary_step_on_one_core(
         group.step_async(batch.take([1]).respond(action=[0]))
         batch, _ = await group.collect_async()
         assert batch.ids() == ["pole-1"]
-        assert (await group.collect_calls() if values is None else [await values]) == [9.8]
+        assert (await collect_calls(group) if values is None else [await values]) == [9.8]

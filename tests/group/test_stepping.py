@@ -21,6 +21,7 @@ from rlightning_aio import (
     PolicyResponse,
     UnknownEnv,
 )
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.batch import joined
 
 # For decisions before any wait, and for handling results that have come.
@@ -221,12 +222,12 @@ async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -
     group = await start(ENTRY)
     assert group.pending == []
     await group.reset()
-    group.call_async("double", 1, env_ids=["probe-3"])
+    send_calls(group, "double", 1, env_ids=["probe-3"])
     group.step_async(responses(["probe-2", "probe-0"], 1, RAISE))
     assert group.pending == ["probe-0", "probe-2", "probe-3"]
     batch, _ = await group.step(responses(["probe-1"], 1))
     assert group.pending == ["probe-0", "probe-2", "probe-3"]
-    await group.collect_calls()
+    await collect_calls(group)
     left = {"probe-0", "probe-2"}
     while left:
         assert {*group.pending} == left
@@ -261,7 +262,7 @@ async def test_an_env_whose_error_was_not_collected_is_busy(start: Any, is_read:
         for send in (
             lambda: group.step_async(responses(["probe-0", "probe-1"], 1, 2)),
             lambda: group.reset_async(env_ids=["probe-1"]),
-            lambda: group.call_async("double", 1, env_ids=["probe-1"]),
+            lambda: send_calls(group, "double", 1, env_ids=["probe-1"]),
         ):
             with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first, with collect_async"):
                 send()
@@ -391,36 +392,51 @@ async def test_calls_of_methods_run_at_once_and_are_collected_together(start: An
     """Values are in the order of sending; an error leaves none behind."""
     group = await start(ENTRY)
     with pytest.raises(NothingPending, match="no call is outstanding"):
-        await group.collect_calls()
-    group.call_async("double", 1, env_ids=["probe-3", "probe-1"])
-    group.call_async("double", "ab", times=3, env_ids=["probe-0"])
+        await collect_calls(group)
+    send_calls(group, "double", 1, env_ids=["probe-3", "probe-1"])
+    send_calls(group, "double", "ab", times=3, env_ids=["probe-0"])
     with pytest.raises(EnvBusy, match="probe-0"):
-        group.call_async("double", 1)
-    assert await group.collect_calls() == [2, 2, "ababab"]
-    group.call_async("double", "ab", times="ab")
+        send_calls(group, "double", 1)
+    assert await collect_calls(group) == [2, 2, "ababab"]
+    send_calls(group, "double", "ab", times="ab")
     with pytest.raises(
         EnvRaised, match=r"in the call of double\(\): TypeError.*still usable"
     ) as caught:
-        await group.collect_calls()
+        await collect_calls(group)
     assert sorted(error.env_id for error in (caught.value, *caught.value.others)) == IDS
-    group.call_async("double", 4)
-    assert await group.collect_calls() == [8] * 4
+    send_calls(group, "double", 4)
+    assert await collect_calls(group) == [8] * 4
 
 
 @one_driver
-async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
-    """The target can be chosen; a new value is set when the call returns."""
+async def test_a_method_of_many_envs_is_called_at_once(start: Any) -> None:
+    """Values are in the order of the ids; errors are those of all envs."""
+    group = await start(ENTRY)
+    assert await group.call("double", 4) == [8] * 4
+    assert await group.call("double", "ab", env_ids=IDS[:1:-1], times=3) == ["ababab"] * 2
+    with pytest.raises(EnvBusy, match="probe-3"):
+        await group.call("double", 1, env_ids=["probe-3", "probe-3"])
+    with pytest.raises(UnknownEnv, match="probe_3"):
+        await group.call("double", 1, env_ids=["probe_3"])
+    with pytest.raises(EnvRaised, match=r"in the call of double\(\)") as caught:
+        await group.call("double", "ab", times="ab")
+    assert sorted(error.env_id for error in (caught.value, *caught.value.others)) == IDS
+    await group.call("set_attr", "episodes", 7, env_ids=["probe-2"])
+    assert await group.call("get_attr", "episodes") == [0, 0, 7, 0]
+
+
+@one_driver
+async def test_attributes_are_found_from_the_outside_in(start: Any) -> None:
+    """A value is set where it is found, or else of the simulator, when the call returns."""
     group = await start(ENTRY)
     env = group["probe-1"]
-    assert await env.get_attr("label") == "inner"
-    assert await env.get_attr("label", target="outer") == "outer"
-    await env.set_attr("label", "new")
-    await env.set_attr("label", ["newer"], target="outer")
-    assert await env.get_attr("label", target="unwrapped") == "new"
-    assert await env.get_attr("label", target="outer") == ["newer"]
-    assert await group["probe-0"].get_attr("label") == "inner"
-    with pytest.raises(EnvRaised, match="'unwrapped' or 'outer', not 'middle'"):
-        await env.get_attr("label", target="middle")
+    assert await env.get_attr("label") == "outer"
+    assert await env.get_attr("depth") == 2
+    await env.set_attr("label", ["newer"])
+    assert await env.get_attr("label") == ["newer"]
+    assert await group["probe-0"].get_attr("label") == "outer"
+    await env.set_attr("other", 1)
+    assert await env.get_attr("other") == 1
     with pytest.raises(EnvRaised, match="no_such"):
         await env.get_attr("no_such")
 

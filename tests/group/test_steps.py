@@ -164,7 +164,7 @@ class Twins(RuleBasedStateMachine):
         self.operations.append(
             self.both(
                 lambda group, _: group.begin(
-                    group.core.calls.call(group.now, slot % self.count, (name, (), {}))
+                    group.core.calls.call_one(group.now, slot % self.count, (name, (), {}))
                 )
             )
         )

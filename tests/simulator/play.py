@@ -34,6 +34,7 @@ from simulator.session import Session, action_of, stacked
 from simulator.world import Faults
 
 from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
@@ -610,7 +611,7 @@ class Play(Session):
         require(shown in possible, "another state", shown, possible)
         require(tuple(echo) == (token,), "another call's arguments", echo)
 
-    async def op_call_async(self, rng: Random) -> None:
+    async def op_send_calls(self, rng: Random) -> None:
         envs = self.some(rng, self.model.idle())
         if not envs or self.collecting_calls:
             return
@@ -618,7 +619,7 @@ class Play(Session):
         requests = {env.env_id: Request("call") for env in envs}
         self.send(requests, "calls")
         try:
-            self.group.call_async("peek", token, env_ids=[*requests])
+            send_calls(self.group, "peek", token, env_ids=[*requests])
         except WorkerDied as fault:
             self.refuse_dead(fault, requests)
         except EnvBusy:
@@ -635,15 +636,15 @@ class Play(Session):
     async def op_collect_calls(self, rng: Random) -> None:
         if self.collecting_calls:
             with self.expected(RLightningError, "a second collect_calls"):
-                await self.done(self.group.collect_calls())
+                await self.done(collect_calls(self.group))
             return
         if not self.calls:
             with self.expected(NothingPending, "a collect of no calls"):
-                await self.done(self.group.collect_calls())
+                await self.done(collect_calls(self.group))
             return
         self.collecting_calls = True
         try:
-            values = await self.done(self.group.collect_calls(self.hang))
+            values = await self.done(collect_calls(self.group, self.hang))
         except EnvFault as fault:
             self.note_faults(fault)
             cut_off = any(env.request.interrupted for env in self.model.pending("calls"))
@@ -1065,7 +1066,7 @@ class Play(Session):
             for call in (
                 lambda: self.group.step_async(BatchedData(ids, values)),
                 lambda: self.group.reset_async(env_ids=ids),
-                lambda: self.group.call_async("peek", 0, env_ids=ids),
+                lambda: send_calls(self.group, "peek", 0, env_ids=ids),
             ):
                 with self.expected(EnvBusy, kind):
                     call()

@@ -179,7 +179,7 @@ OPS: dict[str, tuple[int, str | None]] = {
     "enter": (4, "auto_reset"),
     "leave": (2, "auto_reset"),
     "call": (3, "calls"),
-    "call_async": (3, "calls"),
+    "send_calls": (3, "calls"),
     "collect_calls": (3, "calls"),
     "mark": (2, "calls"),
     "handle": (4, "handles"),

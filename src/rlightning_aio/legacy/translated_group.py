@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
@@ -246,7 +247,7 @@ class TranslatedGroup:
             return []
         self.settle()
         self._calling = True
-        self._core.call_async(name, *args, env_ids=self._local_core_ids)
+        send_calls(self._core, name, *args, env_ids=self._local_core_ids)
         return self._call_values()
 
     def end_calls(self) -> None:
@@ -258,7 +259,7 @@ class TranslatedGroup:
 
     def _call_values(self) -> list[Any]:
         with self._own_ids():
-            values = self._core.collect_calls()
+            values = collect_calls(self._core)
         self._calling = False
         return values
 

@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
+from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
@@ -135,8 +136,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             self.action_space,
         ) = adopted_spaces(self._rows.spaces, self.observation_mode)
         for name in ("metadata", "render_mode"):
-            self.group.call_async("call_wrapped", name, env_ids=self.group.env_ids[:1])
-            (value,) = self.group.collect_calls()
+            (value,) = self.group.call("call_wrapped", name, env_ids=self.group.env_ids[:1])
             setattr(self, name, value)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self._fits_rows = leaves(self.single_action_space) is not None
@@ -386,7 +386,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             TimeoutError: the calls continue; their values will be dropped.
             NoAsyncCallError: no call was sent.
         """
-        return tuple(self._rows.values(self._finish("call", timeout, self.group.collect_calls)))
+        collect = partial(collect_calls, self.group)
+        return tuple(self._rows.values(self._finish("call", timeout, collect)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Attribute `name` of each env, found through its wrappers."""
@@ -418,7 +419,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             send()
             self._pending = "call"
 
-        finish = partial(self._finish, "call", None, self.group.collect_calls)
+        finish = partial(self._finish, "call", None, partial(collect_calls, self.group))
         return _in_one_call(self.group, begin, finish)
 
     def set_attr(self, name: str, values: Any) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
+from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio.errors import EnvFault, NothingPending
 
 if TYPE_CHECKING:
@@ -14,7 +16,7 @@ __all__ = ["drop_outstanding"]
 
 def drop_outstanding(group: EnvGroup) -> None:
     """Wait until no env is busy, and discard all results and faults."""
-    for collect in (group.collect_async, group.collect_calls):
+    for collect in (group.collect_async, partial(collect_calls, group)):
         while True:
             try:
                 collect()

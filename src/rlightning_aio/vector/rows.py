@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.batch.contents import reported_info_list, reported_infos, reported_sub_env_infos
 from rlightning_aio.batch.infos import listed
 from rlightning_aio.batch.stacking import stacked_values
@@ -134,11 +135,11 @@ class Singles:
         """Send a call of a method to all envs, or to those at the places `chosen`."""
         env_ids = self._group.env_ids
         ids = None if chosen is None else [env_ids[k] for k in chosen]
-        self._group.call_async("call_wrapped", name, *args, env_ids=ids, **kwargs)
+        send_calls(self._group, "call_wrapped", name, *args, env_ids=ids, **kwargs)
 
     def look_up(self, name: str, place: int) -> None:
         """Ask an env for attribute `name`, or whether it is a method."""
-        self._group.call_async("look_up", name, env_ids=[self._group.env_ids[place]])
+        send_calls(self._group, "look_up", name, env_ids=[self._group.env_ids[place]])
 
     def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
         """Order the values of calls: one for each env that was called."""
@@ -148,20 +149,19 @@ class Singles:
     def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
         """Ask the envs at the places `chosen` whether they have a wrapper."""
         env_ids = [self._group.env_ids[k] for k in chosen]
-        self._group.call_async("is_wrapped", name_of(wrapper_class), env_ids=env_ids)
-        return self._group.collect_calls()
+        send_calls(self._group, "is_wrapped", name_of(wrapper_class), env_ids=env_ids)
+        return collect_calls(self._group)
 
     def set_attr(self, name: str, each: Sequence[Any]) -> None:
         """Send each env its own value of an attribute."""
+        call = ("call_wrapped", "set_wrapper_attr", name)
         for env_id, value in zip(self._group.env_ids, each, strict=True):
-            self._group.call_async(
-                "call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id]
-            )
+            send_calls(self._group, *call, value, env_ids=[env_id])
 
     def set_outermost(self, name: str, value: Any, chosen: Sequence[int]) -> None:
         """Set an attribute of the outermost wrapper of the envs at the places `chosen`."""
         self.call("__setattr__", (name, value), {}, chosen)
-        self._group.collect_calls()
+        collect_calls(self._group)
 
 
 class Batches(Singles):
@@ -181,10 +181,8 @@ class Batches(Singles):
                     f"{metas[0].env_id!r} {self._each}; the number must be the same everywhere"
                 )
         self.num_envs = len(metas) * self._each
-        found: list[list[Any]] = []
-        for name in ("single_observation_space", "single_action_space"):
-            group.call_async("call_wrapped", name)
-            found.append(group.collect_calls())
+        names = ("single_observation_space", "single_action_space")
+        found = [group.call("call_wrapped", name) for name in names]
         pairs = list(zip(*found, strict=True))
         for space in pairs[0]:
             if leaves(space) is None:
@@ -193,8 +191,7 @@ class Batches(Singles):
                     "callable"
                 )
         self.spaces = [pair for pair in pairs for _ in range(self._each)]
-        group.call_async("call_wrapped", "takes_masks")
-        self._takes_masks = all(group.collect_calls())
+        self._takes_masks = all(group.call("call_wrapped", "takes_masks"))
 
     def observation(self, batch: BatchedData) -> Any:
         return mapped(_flat, batch.observation)
@@ -295,16 +292,16 @@ class Batches(Singles):
 
     def call(self, name: str, args: Any, kwargs: Any, chosen: Sequence[int] | None = None) -> None:
         if chosen is None:
-            self._group.call_async("call_sub_envs", name, args, kwargs, None)
+            send_calls(self._group, "call_sub_envs", name, args, kwargs, None)
             return
         for number, which in self._by_batch(chosen):
             env_ids = [self._group.env_ids[number]]
-            self._group.call_async("call_sub_envs", name, args, kwargs, which, env_ids=env_ids)
+            send_calls(self._group, "call_sub_envs", name, args, kwargs, which, env_ids=env_ids)
 
     def look_up(self, name: str, place: int) -> None:
         number, own = divmod(place, self._each)
         env_ids = [self._group.env_ids[number]]
-        self._group.call_async("look_up_sub_env", own, name, env_ids=env_ids)
+        send_calls(self._group, "look_up_sub_env", own, name, env_ids=env_ids)
 
     def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
         if chosen is None:
@@ -314,14 +311,14 @@ class Batches(Singles):
         return [next(of_batch[k // self._each]) for k in chosen]
 
     def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
-        self._group.call_async("sub_envs_wrapped", name_of(wrapper_class))
-        wrapped = self._group.collect_calls()
+        send_calls(self._group, "sub_envs_wrapped", name_of(wrapper_class))
+        wrapped = collect_calls(self._group)
         return [wrapped[k // self._each] for k in chosen]
 
     def set_attr(self, name: str, each: Sequence[Any]) -> None:
         for k, env_id in enumerate(self._group.env_ids):
             own = list(each[k * self._each : (k + 1) * self._each])
-            self._group.call_async("set_sub_envs", name, own, env_ids=[env_id])
+            send_calls(self._group, "set_sub_envs", name, own, env_ids=[env_id])
 
     def set_outermost(self, name: str, value: Any, chosen: Sequence[int]) -> None:
         found = list(self._by_batch(chosen))
@@ -331,11 +328,9 @@ class Batches(Singles):
                 "separate envs, each with its own callable"
             )
         for number, _ in found:
-            values = [value] * self._each
-            self._group.call_async(
-                "set_sub_envs", name, values, env_ids=[self._group.env_ids[number]]
-            )
-        self._group.collect_calls()
+            env_ids = [self._group.env_ids[number]]
+            send_calls(self._group, "set_sub_envs", name, [value] * self._each, env_ids=env_ids)
+        collect_calls(self._group)
 
 
 def rows_of(group: EnvGroup, metas: Sequence[EnvMeta]) -> Singles:

@@ -97,8 +97,11 @@ class EnvGroup(GroupInterface):
     async def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
         return await self._driver.run(self._drain(deadline))
 
-    async def collect_calls(self, deadline: float | None = None) -> list[Any]:
-        return await self._driver.run(self._collect_calls(deadline))
+    async def call(
+        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        procedure = self._core.calls.call(time.monotonic(), env_ids, (name, args, kwargs))
+        return await self._driver.run(procedure)
 
     async def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
@@ -146,10 +149,10 @@ class EnvGroup(GroupInterface):
         return EnvEpisode(self, self[env_id], seed, options)
 
     async def offload(self) -> None:
-        await self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))
+        await self.call("offload")
 
     async def reload(self) -> None:
-        await self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
+        await self.call("reload")
 
     async def close(self) -> None:
         try:
@@ -175,14 +178,14 @@ class EnvHandle(EnvHandleInterface):
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.calls.call(time.monotonic(), slot, (name, args, kwargs))
+        procedure = self._core.calls.call_one(time.monotonic(), slot, (name, args, kwargs))
         return await self._driver.run(procedure)
 
-    async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        return await super().get_attr(name, target)
+    async def get_attr(self, name: str) -> Any:
+        return await super().get_attr(name)
 
-    async def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
-        await super().set_attr(name, value, target)
+    async def set_attr(self, name: str, value: Any) -> None:
+        await super().set_attr(name, value)
 
     async def render(self) -> Any:
         return await super().render()

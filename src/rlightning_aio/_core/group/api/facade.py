@@ -178,7 +178,8 @@ class Facade:
     def pending(self) -> list[str]:
         """Ids of the envs with a request whose result, value or error was not returned yet.
 
-        These envs are busy. `collect_async` returns results and errors, `collect_calls` values.
+        These envs are busy. `collect_async` returns the results of `step_async` and `reset_async`,
+        and their errors.
 
         Raises:
             GroupClosed: the group was not initialised, or is closed.
@@ -236,32 +237,9 @@ class Facade:
         """
         self._driver.call(self._core.reset_async, time.monotonic(), seed, options, env_ids)
 
-    def call_async(
-        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
-    ) -> None:
-        """Call method `name` of the envs `env_ids` in parallel; None for all local envs.
-
-        `collect_calls` returns the values. Never blocks.
-
-        Raises (before anything is sent):
-            EnvBusy: an env has a reply outstanding, or appears twice.
-            UnknownEnv: no env of this group has that id.
-            TypeError: the arguments can't be sent to a worker.
-            NotImplementedError: an env belongs to a client; its methods can't be called.
-            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
-            GroupClosed: the group was not initialised, or is closed.
-            RLightningError: another thread is using the group, or it belongs to another loop.
-        """
-        call = (name, args, kwargs)
-        self._driver.call(self._core.calls.call_async, time.monotonic(), env_ids, call)
-
     def _drain(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
-        _check_seconds("deadline", deadline)
+        check_seconds("deadline", deadline)
         return self._core.drain_requests(time.monotonic(), deadline)
-
-    def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
-        _check_seconds("deadline", deadline)
-        return self._core.calls.collect_calls(time.monotonic(), deadline)
 
     def _collect(
         self,
@@ -272,8 +250,8 @@ class Facade:
         deadline: float | None,
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
         if timeout is not None or deadline is not None:
-            _check_seconds("timeout", timeout)
-            _check_seconds("deadline", deadline)
+            check_seconds("timeout", timeout)
+            check_seconds("deadline", deadline)
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
         if max_results is not None and max_results < 1:
@@ -450,6 +428,6 @@ def _disown_all() -> None:
 os.register_at_fork(after_in_child=_disown_all)
 
 
-def _check_seconds(name: str, seconds: float | None) -> None:
+def check_seconds(name: str, seconds: float | None) -> None:
     if seconds is not None and not seconds > 0:
         raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")

@@ -59,4 +59,4 @@ def film(core: Core, env_ids: Sequence[str] | None, video: VideoConfig | None) -
 
 
 def _order(core: Core, slot: int, video: VideoConfig | None) -> Procedure[None]:
-    return core.calls.call(time.monotonic(), slot, (RECORD_VIDEO, (video,), {}))
+    return core.calls.call_one(time.monotonic(), slot, (RECORD_VIDEO, (video,), {}))

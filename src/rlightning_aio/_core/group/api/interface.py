@@ -165,8 +165,7 @@ class GroupInterface(Facade):
             deadline: seconds to wait for the results of `step_async` and `reset_async`; None
                 takes those that are ready now.
 
-        Requests that have not ended by then are aborted, as by `abort`, also those of other calls;
-        values of `call_async` are dropped.
+        Requests that have not ended by then are aborted, as by `abort`, also those of other calls.
 
         Returns results and a flag for each, as `collect_async` does, in the order of the group;
         an empty batch if there are none. Cancelled, it loses no result that was ready.
@@ -180,23 +179,32 @@ class GroupInterface(Facade):
         """
         raise NotImplementedError
 
-    def collect_calls(self, deadline: float | None = None) -> Any:
-        """Wait for the values of all calls that `call_async` has sent.
+    def call(
+        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+    ) -> Any:
+        """Call method `name` of envs in parallel, as `EnvHandle.call` does of one.
 
         Args:
-            deadline: limit in seconds, from now.
+            name: of a method of each env or of its simulator's wrappers, outermost first;
+                ``get_attr`` and ``set_attr`` read and set an attribute.
+            args: of the method.
+            env_ids: the envs; None for all local envs.
+            kwargs: of the method.
 
-        Returns the values in the order in which the calls were sent: copies from a worker, the
-        objects themselves from an inline env. Cancelled, it loses none.
+        Returns a list with the value of each env, in the order of `env_ids`: copies from a worker,
+        the objects themselves from an inline env. Cancelled, it lets the methods end on their own
+        and drops the values.
 
         Raises:
-            NothingPending: no call is outstanding.
-            TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
             EnvRaised: a method raised, or its value can't be pickled; further errors are in
                 ``others``, and the values of the others are gone.
+            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
+            UnknownEnv: no env of this group has that id; nothing was sent.
+            TypeError: the arguments can't be sent to a worker; nothing was sent.
+            NotImplementedError: an env belongs to a client; its methods can't be called.
             WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat the call.
             GroupClosed: the group was not initialised, or is closed.
-            RLightningError: another call is collecting values.
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
         raise NotImplementedError
 
@@ -389,15 +397,17 @@ class EnvHandleInterface:
         """
         raise NotImplementedError
 
-    def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Return attribute `name` of the simulator, or of its outermost wrapper with target
-        ``outer``; values and errors are those of `call`.
+    def get_attr(self, name: str) -> Any:
+        """Return attribute `name` of the first that has it: the env, its simulator's wrappers from
+        the outermost in, the simulator; values and errors are those of `call`.
         """
-        return self.call("get_attr", name, target)
+        return self.call("get_attr", name)
 
-    def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> Any:
-        """Set attribute `name` of the simulator or its outermost wrapper; errors as in `call`."""
-        return self.call("set_attr", name, value, target)
+    def set_attr(self, name: str, value: Any) -> Any:
+        """Set attribute `name` where `get_attr` finds it, or else of the simulator; errors are
+        those of `call`.
+        """
+        return self.call("set_attr", name, value)
 
     def render(self) -> Any:
         """Return one frame as the simulator renders it; errors are those of `call`."""

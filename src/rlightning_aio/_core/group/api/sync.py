@@ -101,8 +101,11 @@ class EnvGroup(GroupInterface):
     def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
         return self._driver.run(self._drain(deadline))
 
-    def collect_calls(self, deadline: float | None = None) -> list[Any]:
-        return self._driver.run(self._collect_calls(deadline))
+    def call(
+        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+    ) -> list[Any]:
+        procedure = self._core.calls.call(time.monotonic(), env_ids, (name, args, kwargs))
+        return self._driver.run(procedure)
 
     def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
@@ -127,10 +130,10 @@ class EnvGroup(GroupInterface):
         return self._handle(env_id, EnvHandle, ServerHandle)
 
     def offload(self) -> None:
-        self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))
+        self.call("offload")
 
     def reload(self) -> None:
-        self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
+        self.call("reload")
 
     def close(self) -> None:
         try:
@@ -160,7 +163,7 @@ class EnvHandle(EnvHandleInterface):
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.calls.call(time.monotonic(), slot, (name, args, kwargs))
+        procedure = self._core.calls.call_one(time.monotonic(), slot, (name, args, kwargs))
         return self._driver.run(procedure)
 
 

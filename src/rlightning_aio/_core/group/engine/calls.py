@@ -49,25 +49,28 @@ class Calls:
         self._sent: list[Ticket] = []
         self._collecting = False
 
-    def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
+    def call_one(self, now: float, slot: int, call: Call) -> Procedure[Any]:
         """Call a method of one env and return its value."""
         with self._observed.call("call", now):
             return (yield from self._call(now, self._requests.alone(slot), call))[0]
 
-    def call_all(self, now: float, name: str) -> Procedure[None]:
-        """Call a method of every local env, in parallel."""
+    def call(self, now: float, env_ids: Sequence[str] | None, call: Call) -> Procedure[list[Any]]:
+        """Call a method of envs, or of every local env, in parallel and return its values."""
         with self._observed.call("call", now):
-            yield from self._call(now, self._envs.all, (name, (), {}))
+            return (yield from self._call(now, self._slots(env_ids), call))
+
+    def _slots(self, env_ids: Sequence[str] | None) -> NDArray[np.intp]:
+        return self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
         send = partial(self._send_calls, now, slots, call)
         ticket, _ = yield from self._waiting.ask(now, slots, send, call[0])
         return values_of([ticket])
 
-    def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
+    def send_calls(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
         """Call a method without waiting; `collect_calls` returns the values."""
-        with self._observed.call("call_async", now):
-            slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        with self._observed.call("send_calls", now):
+            slots = self._slots(env_ids)
             send = partial(self._send_calls, now, slots, call)
             self._sent.append(self._waiting.begin(slots, send, call[0]))
 
@@ -106,7 +109,7 @@ class Calls:
         self._dispatch.hand_over(slots, entries, packed)
 
     def drop(self) -> list[EnvFault]:
-        """Drop the calls of `call_async`, all of which have ended; return errors of their envs."""
+        """Drop the calls of `send_calls`, all of which have ended; return errors of their envs."""
         if self._collecting:
             return []  # Whoever collects them gets what they led to.
         tickets, self._sent = self._sent, []
@@ -116,7 +119,7 @@ class Calls:
         return [fault for fault in faults if not isinstance(fault, EnvAborted)]
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
-        """Wait for all calls of `call_async`, and return their values in order of sending."""
+        """Wait for all calls of `send_calls`, and return their values in order of sending."""
         with self._observed.call("collect_calls", now):
             return (yield from self._collect(now, deadline))
 
@@ -127,7 +130,7 @@ class Calls:
                 "another collect_calls is already waiting on this group; one at a time"
             )
         if not self._sent:
-            raise NothingPending("no call is outstanding; send one with call_async")
+            raise NothingPending("no call is outstanding; send one with send_calls")
         end = None if deadline is None else now + deadline
         self._collecting = True
         try:

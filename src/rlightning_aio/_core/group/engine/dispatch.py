@@ -86,7 +86,7 @@ class Dispatch:
             return f"{why}; collect it first, with collect_async(), or end it with abort()"
         if state != State.BUSY:
             why = "the call that asked it has not returned yet"
-        return f"{why}; wait for that call first, with collect_calls() if it was call_async()"
+        return f"{why}; wait for that call first"
 
     def _end_call(self, now: float, slot: int) -> bool:
         """Note the end of a cancelled call that has ended since the group last waited.

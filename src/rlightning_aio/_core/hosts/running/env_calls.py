@@ -22,11 +22,15 @@ def call_env(env: BaseEnv, name: str, args: tuple[Any, ...], kwargs: dict[str, A
         return _get_attr(env, *args, **kwargs)
     if name == "set_attr":
         return _set_attr(env, *args, **kwargs)
+    return getattr(_layer_with(env, name, f"{name}()"), name)(*args, **kwargs)
+
+
+def _layer_with(env: BaseEnv, name: str, words: str) -> Any:
     for layer in _layers(env):
         if hasattr(layer, name):
-            return getattr(layer, name)(*args, **kwargs)
+            return layer
     raise AttributeError(
-        f"neither env {env.env_id!r} nor its simulator, nor a wrapper around that, has {name}()"
+        f"neither env {env.env_id!r} nor its simulator, nor a wrapper around that, has {words}"
     )
 
 
@@ -38,21 +42,17 @@ def _layers(env: BaseEnv) -> Iterator[Any]:
         yield layer
         seen.add(id(layer))
         layer = getattr(layer, "env", None)
-    yield _target(env, "unwrapped")
+    yield _simulator(env)
 
 
-def _target(env: BaseEnv, target: str) -> Any:
-    inner = env.env
-    if target == "outer" or inner is None:
-        return env if inner is None else inner
-    if target == "unwrapped":
-        return getattr(inner, "unwrapped", inner)
-    raise ValueError(f"target must be 'unwrapped' or 'outer', not {target!r}")
+def _simulator(env: BaseEnv) -> Any:
+    return env if env.env is None else getattr(env.env, "unwrapped", env.env)
 
 
-def _get_attr(env: BaseEnv, name: str, target: str = "unwrapped") -> Any:
-    return getattr(_target(env, target), name)
+def _get_attr(env: BaseEnv, name: str) -> Any:
+    return getattr(_layer_with(env, name, name), name)
 
 
-def _set_attr(env: BaseEnv, name: str, value: Any, target: str = "unwrapped") -> None:
-    setattr(_target(env, target), name, value)
+def _set_attr(env: BaseEnv, name: str, value: Any) -> None:
+    owner = next((layer for layer in _layers(env) if hasattr(layer, name)), _simulator(env))
+    setattr(owner, name, value)
