@@ -1,7 +1,8 @@
 """Each program in ``examples/``, in the README and in the documents runs unchanged.
 
 New pages are found automatically. Programs that train, and so need torch, are run by
-examples/test_programs.py, those with aiohttp and examples/agent.py by examples/test_agent.py.
+examples/test_programs.py, those with aiohttp and examples/agent.py by examples/test_agent.py, the
+trainer of remote.md, which needs a client, by cli/test_remote_commands.py.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def by_program(written: str) -> dict[str, str]:
     return dict(part.split("\n", 1) for part in written.split("\0")[1:])
 
 
-NEEDS_MORE = r"^(import (torch|aiohttp)$|from (libero|metaworld|stable_baselines3))"
+NEEDS_MORE = r"^(import (torch|aiohttp)$|from (libero|metaworld|stable_baselines3)|net = )"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)
 
 

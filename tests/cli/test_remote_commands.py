@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 import signal
+import socket
 import stat
 import subprocess
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 from cli.command import COMMAND, TESTS, invoke, invoke_json, start, write_config
 from patience import HANG
+from run_python import output_of
 
 from rlightning_aio.remote import make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
@@ -74,6 +76,27 @@ def test_the_two_commands_of_the_page_connect() -> None:
     steps = re.search(r": (\d+) steps in 1 session$", client_stdout, re.MULTILINE)
     assert steps is not None
     assert 500 <= int(steps[1]) <= 501
+
+
+def test_the_program_of_the_page_moves_a_client(tmp_path: Path) -> None:
+    """It runs as written, but for the port, which may be in use; its keys are keygen's."""
+    page = (ROOT / "docs" / "remote.md").read_text()
+    (program,) = re.findall(r"(?ms)^```python\n(# On the robot.*?)^```", page)
+    assert "rlightning-aio client arm.yaml --connect tcp://trainer:5555 --keys keys/arm" in program
+    assert invoke("keygen", tmp_path / "keys", "arm").exit_code == 0
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (tmp_path / "trainer.py").write_text(program.replace("5555", str(port)))
+    address, keys = f"tcp://127.0.0.1:{port}", tmp_path / "keys" / "arm"
+    client_words = ["--connect", address, "--keys", keys, "--json"]
+    with start("client", ROOT / "configs" / "cartpole.yaml", *client_words) as client:
+        trained = output_of("trainer.py", folder=tmp_path, asyncio_debug=False)
+        client.send_signal(signal.SIGINT)
+        stdout, stderr = client.communicate(timeout=HANG)
+    assert trained == ""
+    assert client.returncode == 130, stderr
+    assert json.loads(stdout)["steps"] > 1
 
 
 def test_keygens_keys_let_a_client_in(tmp_path: Path) -> None:
