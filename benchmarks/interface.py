@@ -29,8 +29,8 @@ MODULES: Final = {
     "": "the package", "sync": "blocking", "vector": "vector", "sb3": "vector",
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
     "policies": "evaluation", "policy_servers": "evaluation", "export": "evaluation",
-    "remote": "remote", "serving": "remote", "errors": "errors", "spaces": "envs",
-    "envs.contract": "envs", "registry": "envs", "legacy": "legacy",
+    "metrics": "metrics", "remote": "remote", "serving": "remote", "errors": "errors",
+    "spaces": "envs", "envs.contract": "envs", "registry": "envs", "legacy": "legacy",
 }  # fmt: skip
 """Modules that the documentation imports names from, each with its row of the table."""
 ONLY: Final = {"registry": ["Backend"]}

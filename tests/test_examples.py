@@ -25,6 +25,7 @@ ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
     "envpool": "test_docs.py",
     "lerobot": "vector/test_pages.py",
+    "metrics": "test_metrics.py",
     "rl_zoo3": "vector/test_pages.py",
     "rlightning": "test_docs.py",
     "rllib": "vector/test_pages.py",

@@ -58,7 +58,7 @@ def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     measured = {"latency_us": latencies(step=10.0, transfer=100.0)}
     with (
         caplog.at_level(logging.INFO, "rlightning_aio"),
-        patch.object(Stats, "summary", lambda _: measured),
+        patch.object(Stats, "summary", lambda *_: measured),
         sync.build_env_group(entry()) as group,
     ):
         batch, _ = group.reset(seed=0)
@@ -110,7 +110,7 @@ class Machine:
     def executed(self, since_ns: int) -> Any:
         return np.array([step for step in self.steps if step[1] >= since_ns]).reshape(-1, 3).T
 
-    def summary(self) -> Any:
+    def summary(self, now_ns: int) -> Any:
         return {"latency_us": {}}
 
     def look(self, num_cores: int = 2) -> None:

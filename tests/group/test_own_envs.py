@@ -313,5 +313,5 @@ def test_env_steps_count_sub_environments_but_no_resets() -> None:
             for _ in range(2):
                 batch, _ = group.step(idle_steps(group))
         assert all(part.is_reset.all() for part in batch.by_entry().values())
-        samples = list(group._core.stats._samples)[-4:]
-        assert [sample.steps().sum() for sample in samples] == [3, 2, 0, 0]
+        steps = group._core.stats.window(0).rows.steps[-6:]
+        assert steps.tolist() == [3, 1, 1, 0, 0, 0]

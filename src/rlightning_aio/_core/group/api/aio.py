@@ -56,10 +56,12 @@ class EnvGroup(GroupInterface):
     async def init(self) -> list[EnvMeta]:
         self._driver.settle()
         try:
-            return await self._driver.run(self._core.start(time.monotonic()))
+            metas = await self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise
+        self._driver.call_time.begin(time.monotonic())
+        return metas
 
     async def __aenter__(self) -> Self:
         await self.init()

@@ -118,6 +118,7 @@ class Facade:
         self._driver.drain = self._core.drain
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False
+        self._ended_ns = 0
         self._traces: list[Trace] = []
         _groups.add(self)
 
@@ -295,6 +296,20 @@ class Facade:
 
     # -- measurements -------------------------------------------------------------
 
+    def metrics(self, by_entry: bool = False) -> dict[str, float]:
+        """The numbers of the running group, as Weights & Biases and TensorBoard take them.
+
+        Which side starves, which env is slow, what fails: docs/metrics.md explains every number.
+        Names are stable, values are plain numbers, and what was not measured yet is left out.
+        Never waits, and works from any thread, before, during and after other calls.
+
+        Args:
+            by_entry: add the numbers of each config entry, as ``envs/<entry>/<name>``.
+        """
+        now_ns = self._ended_ns or time.monotonic_ns()
+        call_seconds = self._driver.call_time.so_far(now_ns / 1e9)
+        return self._core.metrics.read(now_ns, call_seconds, by_entry=by_entry)
+
     def get_stats(self) -> dict[str, Any]:
         """Throughput and latencies over the last ten seconds, at most the last thousand batches.
 
@@ -308,7 +323,7 @@ class Facade:
         ``transfer``, from the end in the env until the result is returned). The dicts are empty
         before anything was measured.
         """
-        return self._core.stats.summary()
+        return self._core.stats.summary(time.monotonic_ns())
 
     def get_env_stats(
         self, reset: bool = False, by_entry: bool = False
@@ -396,6 +411,7 @@ class Facade:
         if not self._core.lifetime.closed:
             return  # `close` raised before it closed anything.
         self._finalizer.detach()
+        self._ended_ns = self._ended_ns or time.monotonic_ns()
         for trace in list(self._traces):
             trace.stop()
         close_errors = self._core.supervisor.close_errors

@@ -60,10 +60,12 @@ class EnvGroup(GroupInterface):
 
     def init(self) -> list[EnvMeta]:
         try:
-            return self._driver.run(self._core.start(time.monotonic()))
+            metas = self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise
+        self._driver.call_time.begin(time.monotonic())
+        return metas
 
     def __enter__(self) -> Self:
         self.init()

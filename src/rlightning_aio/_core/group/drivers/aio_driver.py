@@ -8,7 +8,13 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rlightning_aio._core.group.drivers.wait import Parked, Patient, forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import (
+    CallTime,
+    Parked,
+    Patient,
+    forked_from,
+    this_process,
+)
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -41,6 +47,8 @@ class AioDriver:
         # The queue of completions, and the function that applies them; set by the group.
         self.completions: Sized = ()
         self.drain: Callable[[], None]
+        self.call_time = CallTime()
+        self._num_calls = 0
         # The future of each waiting call, until it is woken.
         self._waiting: list[asyncio.Future[None]] = []
         self._nudge: asyncio.TimerHandle | None = None
@@ -214,6 +222,10 @@ class AioDriver:
             RLightningError: the group belongs to another loop, or to another process.
         """
         self.check_caller()
+        call_time = self.call_time
+        self._num_calls += 1
+        if self._num_calls == 1:
+            call_time.waited = (call_time.waited[0], time.monotonic())
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
@@ -231,6 +243,11 @@ class AioDriver:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
+        finally:
+            self._num_calls -= 1
+            if not self._num_calls:
+                ended, since = call_time.waited
+                call_time.waited = (ended + time.monotonic() - since, 0.0)
 
     async def run_last(self, procedure: Procedure[None]) -> None:
         """Run the procedure that closes the group, on any loop.

@@ -17,7 +17,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
-from rlightning_aio._core.group.drivers.wait import TURN, forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import TURN, CallTime, forked_from, this_process
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class SyncDriver:
         self.completions: Sized = ()
         self.drain: Callable[[], None]
         self.awaited: Callable[[float], str]
+        self.call_time = CallTime()
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
@@ -122,6 +123,11 @@ class SyncDriver:
             raise KeyboardInterrupt
 
     def _run(self, procedure: Procedure[T]) -> T:
+        call_time = self.call_time
+        ended, before = call_time.waited
+        # A signal handler may call within a call, which goes on counting.
+        began = before or time.monotonic()
+        call_time.waited = (ended, began)
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
@@ -140,6 +146,9 @@ class SyncDriver:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
+        finally:
+            if not before:
+                call_time.waited = (ended + time.monotonic() - began, 0.0)
 
     def call(self, function: Callable[[*A], T], *args: *A) -> T:
         """Call a function of the group; errors are those of `run`.

@@ -17,6 +17,7 @@ from rlightning_aio._core.group.engine.arrivals import Arrivals
 from rlightning_aio._core.group.engine.calls import Calls
 from rlightning_aio._core.group.engine.dispatch import Dispatch
 from rlightning_aio._core.group.engine.intake import Intake
+from rlightning_aio._core.group.engine.metrics import Metrics
 from rlightning_aio._core.group.engine.resets import Resets
 from rlightning_aio._core.group.engine.results import Results
 from rlightning_aio._core.group.engine.snapshots import Snapshots
@@ -49,8 +50,8 @@ class Core:
         shares_thread: other tasks may use the group while a procedure waits.
 
     Attributes:
-        parts, shares_thread: as given; results, intake, waiting, stats, steps, newest, calls: made
-            of them.
+        parts, shares_thread: as given; results, intake, waiting, stats, metrics, steps, newest,
+            calls: made of them.
     """
 
     def __init__(self, parts: Parts, *, zero_copy: bool, shares_thread: bool) -> None:
@@ -65,6 +66,7 @@ class Core:
         self.observed = tables.observed
         self.lifetime = tables.lifetime
         self.stats = stats = Stats(envs, requests)
+        self.metrics = Metrics(tables, stats, shares_thread=shares_thread)
         self.results = results = Results(
             envs, tables.layout, tables.conditions, zero_copy=zero_copy
         )

@@ -179,7 +179,7 @@ class Steps:
                 ticket, now = yield from self._waiting.ask(now, slots, send)
                 if ticket.errors:
                     self._raise_faults(ticket)
-            results, flags = self.hand_out(slots, synchronous=True)
+            results, flags = self.hand_out(slots, synchronous=True, since=began, needed=len(slots))
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("step", began)
@@ -215,7 +215,9 @@ class Steps:
             slots, local = collector.take(most), self._envs.all
             if len(slots) == len(local) > slots[-1]:
                 slots = local  # The same slots, which lie side by side.
-            return self.hand_out(slots, synchronous=False)
+            # In a window, others are waited for, too.
+            needed = 0 if rules.timeout is not None else need
+            return self.hand_out(slots, synchronous=False, since=began, needed=needed)
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("collect_async", began)
@@ -372,11 +374,18 @@ class Steps:
             fault.add_note(f"the results of {others} of the same call are in the error's `results`")
         raise fault
 
-    def hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
+    def hand_out(
+        self,
+        slots: NDArray[np.intp],
+        *,
+        synchronous: bool,
+        since: float = 0.0,
+        needed: int = 0,
+    ) -> tuple[BatchedData, Flags]:
         """Return the results of `slots`, all ready.
 
         They stay ready until the batch is complete: if memory runs out on the way, the next
-        collect returns them.
+        collect returns them. For `since` and `needed` see `Sample`.
         """
         results, continuity, observer = self._results, self._continuity, self._observed.observer
         noted = None if observer is None else observer.before_results(slots)
@@ -398,7 +407,7 @@ class Steps:
             if self._first_observations.left:
                 self._first_observations.check(parts)
             self._watcher.check_interrupt()
-            self._stats.account(parts, synchronous=synchronous)
+            self._stats.account(parts, synchronous=synchronous, since=since, needed=needed)
             continuity.returned(slots, flagged, judged)
             if self._conditions.unusual & BESIDE_ROWS:
                 results.let_go(slots)

@@ -180,6 +180,13 @@ class EnvTable:
         except KeyError:
             raise UnknownEnv(self._unknown(env_id)) from None
 
+    def position(self, slot: int) -> int:
+        """The position of an env among the ids of a group, where a member has that of its host."""
+        num_local = len(self.local_ids)
+        if slot < num_local:
+            return slot
+        return num_local + self.server_ids.index(self.names.shared_ids[slot])
+
     def _unknown(self, env_id: Any) -> str:
         ids = list(self._slot_of)
         known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")

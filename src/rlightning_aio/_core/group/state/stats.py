@@ -7,19 +7,20 @@ them on request.
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
+from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window, rows_of
 from rlightning_aio.protocol.slab import IS_RESET, TERMINATED, TRUNCATED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Requests
@@ -28,36 +29,10 @@ if TYPE_CHECKING:
 __all__ = ["Stats"]
 
 _WINDOW_SAMPLES: Final = 1024
-_WINDOW_SECONDS: Final = 10.0
 _VERDICTS: Final = ("success", "fail")
 """Keys of booleans in the info that ends an episode: the env's verdicts on it."""
 _HOLDERS: Final = (*_VERDICTS, "final_info")
 """Keys of infos that may have them."""
-
-
-class _Sample(msgspec.Struct):
-    """The results with one layout of a returned batch. Times in ns of the monotonic clock.
-
-    Attributes:
-        batch: number of the batch.
-        num_envs: sub-environments per result.
-        resets: mask of the sub-environments that were reset; None if none was.
-    """
-
-    batch: int
-    at_ns: int
-    slots: NDArray[np.intp]
-    sent_ns: NDArray[np.int64]
-    times: NDArray[np.int64]
-    num_envs: int
-    resets: NDArray[np.bool_] | None
-    synchronous: bool
-
-    def steps(self) -> NDArray[np.int64]:
-        """The number of env steps in each result, ``[n]``."""
-        if self.resets is None:
-            return np.full(len(self.slots), self.num_envs)
-        return self.num_envs - self.resets.reshape(len(self.slots), -1).sum(axis=1)
 
 
 @dataclass(slots=True)
@@ -76,17 +51,23 @@ class _Verdicts:
         return int(self.true[slots].sum()) / count if count else None
 
 
+OUTCOMES: Final = ("terminated", "truncated", "lost")
+"""How an episode may come to an end; lost is one whose env was replaced or restored meanwhile."""
+
+
 class Stats:
     """A window over returned results, and sums over ended episodes.
 
     Attributes:
         num_batches: the number of returned batches.
+        times: where the time of the envs has gone.
     """
 
     def __init__(self, envs: EnvTable, requests: Requests) -> None:
         self._envs = envs
         self._requests = requests
-        self._samples: deque[_Sample] = deque(maxlen=_WINDOW_SAMPLES)
+        self.times = EnvTimes(envs, requests)
+        self._samples: deque[Sample] = deque(maxlen=_WINDOW_SAMPLES)
         self.num_batches = 0
         # Sums have one more row per config entry, for former members whose slots were taken by
         # others. Columns: number of episodes, sum of their returns, sum of their lengths.
@@ -96,6 +77,9 @@ class Stats:
         self._last = np.zeros((len(envs), 2))
         self._requests_before = np.zeros(size, np.int64)
         self._verdicts = {name: _Verdicts.of(size) for name in _VERDICTS}
+        # By entry, of each kind.
+        count = len(envs.names.entry_names)
+        self._outcomes = {kind: np.zeros(count, np.int64) for kind in OUTCOMES}
 
     def move_to_entry(self, slot: int) -> None:
         """Move the sums of `slot` to its entry's former members, before another one takes it."""
@@ -104,6 +88,7 @@ class Stats:
             sums[former] += sums[slot]
             sums[slot] = 0
         self._last[slot] = 0
+        self.times.forget(slot)
         number = self._requests.numbering.number(slot)
         self._requests_before[former] += self._requests_before[slot] - number
         self._requests_before[slot] = number
@@ -116,10 +101,17 @@ class Stats:
         verdicts = self._verdicts.values()
         return [self._sums, *(v.count for v in verdicts), *(v.true for v in verdicts)]
 
-    def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
-        """Record results that are about to be returned."""
+    def account(
+        self,
+        parts: Sequence[ResultColumns],
+        *,
+        synchronous: bool,
+        since: float = 0.0,
+        needed: int = 0,
+    ) -> None:
+        """Record results that are about to be returned; for `since` and `needed` see `Sample`."""
         now = time.monotonic_ns()
-        sent_ns = self._requests.sent_ns
+        sent_ns, times = self._requests.sent_ns, self.times
         self.num_batches += 1
         for part in parts:
             slots, shape = part.slots, part.reward.shape
@@ -128,18 +120,22 @@ class Stats:
             if part.episode_return is not None:  # Flags are set.
                 resets = part.flags[:, IS_RESET] if part.flags.ndim == 2 else part.is_reset
                 resets = resets.copy()
-            self._samples.append(
-                _Sample(
-                    self.num_batches,
-                    now,
-                    slots,
-                    sent_ns[slots],
-                    part.times,
-                    shape[-1] if has_sub_envs else 1,
-                    resets,
-                    synchronous,
-                )
+            sample = Sample(
+                self.num_batches,
+                now,
+                slots,
+                sent_ns[slots],
+                part.times,
+                shape[-1] if has_sub_envs else 1,
+                resets,
+                synchronous,
+                int(since * 1e9),
+                needed,
             )
+            self._samples.append(sample)
+            times.kept.append(sample)
+            if len(times.kept) >= times.most_kept:
+                times.sum_up()
             if part.episode_return is not None and part.episode_length is not None:
                 self._note_episodes(part, part.episode_return, part.episode_length)
 
@@ -151,10 +147,13 @@ class Stats:
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
+            self._count_outcomes("lost", part.slots[part.restarted])
         rows: NDArray[np.intp] = ended.nonzero()[0]
         if not len(rows):
             return
-        slots = part.slots[rows]
+        slots, terminated = part.slots[rows], flags[..., TERMINATED][ended]
+        self._count_outcomes("terminated", slots[terminated])
+        self._count_outcomes("truncated", slots[~terminated])
         outcomes = np.empty((len(rows), 3))
         outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[ended], lengths[ended]
         with np.errstate(over="ignore", invalid="ignore"):  # The means show them.
@@ -167,6 +166,23 @@ class Stats:
                     slot = part.slots.item(row)
                     with suppress(Exception):  # The info may be malformed; its reader gets it.
                         self._note_verdicts(slot, part.reported_info_of(row), ended[row])
+
+    def _count_outcomes(self, kind: str, slots: NDArray[np.intp]) -> None:
+        """Count episodes of `slots` that came to an end of some kind."""
+        counts = self._outcomes[kind]
+        counts += np.bincount(self._envs.names.entries[slots], minlength=len(counts))
+
+    def outcomes(self, entries: NDArray[np.intp]) -> dict[str, int]:
+        """Return how many episodes of some entries came to an end, by its kind."""
+        return {kind: int(counts[entries].sum()) for kind, counts in self._outcomes.items()}
+
+    def mean_episode(self, entries: NDArray[np.intp]) -> dict[str, float]:
+        """Return the mean return and length of ended episodes of some entries, if there are any."""
+        slots: list[int] = np.flatnonzero(np.isin(self._envs.names.entries, entries)).tolist()
+        found = self._summed([*slots, *map(self._former, entries.tolist())])
+        if not found["episodes"]:
+            return {}
+        return {f"episode_{what}_mean": found[f"mean_{what}"] for what in ("return", "length")}
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count the verdicts in `info` on the episodes that have `ended`."""
@@ -184,26 +200,31 @@ class Stats:
                 verdicts.count[slot] += np.count_nonzero(known)
                 verdicts.true[slot] += np.count_nonzero(array & known)
 
-    def summary(self) -> dict[str, Any]:
+    def window(self, now_ns: int) -> Window:
+        """The newest results; any thread may ask for them."""
+        return Window(list(self._samples), now_ns)
+
+    def summary(self, now_ns: int) -> dict[str, Any]:
         """The figures that `EnvGroup.get_stats` documents, over the window."""
-        samples = self._window()
-        if not samples:
+        window = self.window(now_ns)
+        sizes = window.batch_sizes()
+        if not sizes:
             return {"steps_per_second": 0.0, "entries": {}, "batch_size": {}, "latency_us": {}}
-        seconds = max((samples[-1].at_ns - samples[0].at_ns) / 1e9, 1e-9)
-        sizes = Counter[int]()
-        for sample in samples:
-            sizes[sample.batch] += len(sample.slots)
-        # The first batch opens the window, so its steps were made before the window.
-        counted = [sample for sample in samples if sample.batch != samples[0].batch]
+        rows, synchronous = window.rows, window.synchronous()
+        entries = self._envs.names.entries[rows.slots]
+        rates: dict[str, dict[str, float]] = {}
+        for entry, name in enumerate(self._envs.names.entry_names):
+            own = entries == entry
+            if (own & window.kept).any():
+                kinds = {"sync": own & synchronous, "async": own & ~synchronous}
+                rates[name] = {kind: window.rate(chosen) for kind, chosen in kinds.items()}
         return {
-            "steps_per_second": sum(int(s.steps().sum()) for s in counted) / seconds,
-            "entries": self._rates_by_entry(counted, seconds),
-            "batch_size": {
-                "mean": sizes.total() / len(sizes),
-                "min": min(sizes.values()),
-                "max": max(sizes.values()),
+            "steps_per_second": window.rate(window.kept),
+            "entries": rates,
+            "batch_size": {"mean": sum(sizes) / len(sizes), "min": min(sizes), "max": max(sizes)},
+            "latency_us": {
+                kind: {"p50": p50, "p99": p99} for kind, (p50, p99) in window.latencies().items()
             },
-            "latency_us": self._latencies(samples),
         }
 
     def executed(
@@ -213,43 +234,10 @@ class Stats:
 
         Slots, beginnings and ends (ns of the monotonic clock), in the order of the results.
         """
-        samples = [sample for sample in self._samples if sample.at_ns >= since_ns]
-        if not samples:
-            nothing = np.zeros(0, np.int64)
-            return nothing, nothing, nothing
-        slots = np.concatenate([sample.slots for sample in samples])
-        done, busy = np.concatenate([sample.times for sample in samples]).T
-        later = done - busy >= since_ns
-        return slots[later], (done - busy)[later], done[later]
-
-    def _window(self) -> list[_Sample]:
-        if not self._samples:
-            return []
-        since = self._samples[-1].at_ns - int(_WINDOW_SECONDS * 1e9)
-        return [sample for sample in self._samples if sample.at_ns >= since]
-
-    def _rates_by_entry(
-        self, samples: list[_Sample], seconds: float
-    ) -> dict[str, dict[str, float]]:
-        rates: dict[str, dict[str, float]] = {}
-        for sample in samples:
-            kind = "sync" if sample.synchronous else "async"
-            names = self._envs.names.names(sample.slots)
-            for name, steps in zip(names, sample.steps().tolist(), strict=True):
-                entry = rates.setdefault(name, {"sync": 0.0, "async": 0.0})
-                entry[kind] += steps / seconds
-        return rates
-
-    @staticmethod
-    def _latencies(samples: list[_Sample]) -> dict[str, dict[str, float]]:
-        done, busy = np.concatenate([s.times for s in samples]).T
-        sent = np.concatenate([s.sent_ns for s in samples])
-        taken = np.concatenate([np.full(len(s.slots), s.at_ns) for s in samples])
-        stepped = np.concatenate([s.steps() for s in samples]) > 0
-        if not stepped.any():
-            return {}
-        kinds = {"step": busy, "wait": done - busy - sent, "transfer": taken - done}
-        return {kind: _percentiles(values[stepped] / 1e3) for kind, values in kinds.items()}
+        rows = rows_of([sample for sample in self._samples if sample.at_ns >= since_ns])
+        begun = rows.done - rows.busy
+        later = begun >= since_ns
+        return rows.slots[later], begun[later], rows.done[later]
 
     def by_env(self) -> dict[str, dict[str, Any]]:
         """The figures of each env that `EnvGroup.get_env_stats` documents."""
@@ -288,14 +276,3 @@ class Stats:
         for sums in (*self._all_sums(), self._last, self._requests_before):
             sums[:] = 0
         self._requests_before[: len(self._envs)] = self._requests.numbering.numbers()
-
-
-def _percentiles(values: NDArray[np.float64]) -> dict[str, float]:
-    """Return the median and the 99th percentile of at least one value.
-
-    `numpy.percentile` gives the same, but imports a module at its first call. That fails in a
-    process that is out of descriptors, which must still be able to collect.
-    """
-    ranks = np.array([0.5, 0.99]) * (len(values) - 1)
-    p50, p99 = np.interp(ranks, np.arange(len(values)), np.sort(values)).tolist()
-    return {"p50": p50, "p99": p99}

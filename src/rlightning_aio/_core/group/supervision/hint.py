@@ -175,7 +175,7 @@ class Hints:
         )
         warned = {name for name, since in self._since.items() if since is None}
         configs = [r.config for r in self._records if r.config.name not in warned]
-        text = hint(configs, workers, num_cores, stats.summary()["latency_us"])
+        text = hint(configs, workers, num_cores, stats.summary(time.monotonic_ns())["latency_us"])
         if text is not None:
             _log.info("%s; `rlightning-aio bench` measures what is best", text)
 

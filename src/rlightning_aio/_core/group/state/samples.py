@@ -1,0 +1,251 @@
+"""`Sample`: the results of one returned batch, as the hot path keeps them; and their figures.
+
+`rows_of` puts samples together, `Window` computes the figures of the newest ones, and `EnvTimes`
+adds up all of them: where the time of the envs has gone.
+Rule: the hot path only appends. Whatever is computed is computed from many samples at once.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio._core.group.state.request_states import State
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.requests import Requests
+
+__all__ = ["EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
+
+WINDOW_SECONDS: Final = 10.0
+_MOST_KEPT: Final = 256
+"""The number of samples that are summed at once: one by one, that would take longer than a step."""
+_MOST_ROWS: Final = 1 << 14
+"""The number of results in them, which bounds how long that takes."""
+
+
+class Sample(msgspec.Struct):
+    """The results with one layout of a returned batch. Times in ns of the monotonic clock.
+
+    Attributes:
+        batch: number of the batch.
+        num_envs: sub-environments per result.
+        resets: mask of the sub-environments that were reset; None if none was.
+        since_ns: when the call began that has returned the batch.
+        needed: the number of results of the whole batch that it waited for; 0 if others may have
+            been waited for, too.
+    """
+
+    batch: int
+    at_ns: int
+    slots: NDArray[np.intp]
+    sent_ns: NDArray[np.int64]
+    times: NDArray[np.int64]
+    num_envs: int
+    resets: NDArray[np.bool_] | None
+    synchronous: bool
+    since_ns: int
+    needed: int
+
+
+class Rows(NamedTuple):
+    """Results as columns. `steps` is the number of env steps in each, other columns are in ns."""
+
+    slots: NDArray[np.intp]
+    sent: NDArray[np.int64]
+    done: NDArray[np.int64]
+    busy: NDArray[np.int64]
+    taken: NDArray[np.int64]
+    steps: NDArray[np.int64]
+
+
+def rows_of(samples: Sequence[Sample]) -> Rows:
+    """The results of samples, in their order."""
+    if not samples:
+        nothing = np.zeros(0, np.int64)
+        return Rows(np.zeros(0, np.intp), *[nothing] * 5)
+    lengths = np.array([len(one.slots) for one in samples])
+    steps = np.array([one.num_envs for one in samples]).repeat(lengths)
+    resets = [one.resets for one in samples if one.resets is not None]
+    if resets:
+        has_resets = np.array([one.resets is not None for one in samples]).repeat(lengths)
+        steps[has_resets] -= np.concatenate([*map(_by_env, resets)])
+    times = np.concatenate([one.times for one in samples])
+    return Rows(
+        slots=np.concatenate([one.slots for one in samples]),
+        sent=np.concatenate([one.sent_ns for one in samples]),
+        done=times[:, 0],
+        busy=times[:, 1],
+        taken=np.array([one.at_ns for one in samples]).repeat(lengths),
+        steps=steps,
+    )
+
+
+def _by_env(resets: NDArray[np.bool_]) -> NDArray[Any]:
+    """The number of resets of each env."""
+    return resets if resets.ndim == 1 else resets.reshape(len(resets), -1).sum(axis=1)
+
+
+class Window:
+    """The figures of the newest results. Percentiles are pairs, the median and the 99th.
+
+    Args:
+        samples: the newest ones.
+        now_ns: a rate is that until now, so it sinks while nothing is returned.
+
+    Attributes:
+        rows: the results.
+        kept: which of them count in a rate: not those of the first batch, which opens the window.
+    """
+
+    def __init__(self, samples: Sequence[Sample], now_ns: int) -> None:
+        since = samples[-1].at_ns - int(WINDOW_SECONDS * 1e9) if samples else 0
+        self._samples = samples = [sample for sample in samples if sample.at_ns >= since]
+        self.rows = rows_of(samples)
+        first = [len(sample.slots) for sample in samples if sample.batch == samples[0].batch]
+        self.kept = np.arange(len(self.rows.slots)) >= sum(first)
+        self._seconds = max(now_ns - samples[0].at_ns, 1) / 1e9 if samples else 1.0
+
+    def rate(self, chosen: NDArray[np.bool_]) -> float:
+        """Env steps per second, of the results that are `chosen`."""
+        return int(self.rows.steps[chosen & self.kept].sum()) / self._seconds
+
+    def batch_sizes(self) -> list[int]:
+        """The number of results in each batch."""
+        sizes = Counter[int]()
+        for sample in self._samples:
+            sizes[sample.batch] += len(sample.slots)
+        return list(sizes.values())
+
+    def synchronous(self) -> NDArray[np.bool_]:
+        """``[n]``, whether each result was returned by the call that had asked for it."""
+        lengths = [len(sample.slots) for sample in self._samples]
+        return np.repeat(np.array([s.synchronous for s in self._samples], np.bool_), lengths)
+
+    def latencies(self) -> dict[str, tuple[float, float]]:
+        """Percentiles of the times of steps in µs, by kind; empty before the first step."""
+        rows = self.rows
+        stepped = rows.steps > 0
+        if not stepped.any():
+            return {}
+        kinds = {
+            "step": rows.busy,
+            "wait": rows.done - rows.busy - rows.sent,
+            "transfer": rows.taken - rows.done,
+        }
+        return {kind: percentiles(values[stepped] / 1e3) for kind, values in kinds.items()}
+
+    def lags(self) -> NDArray[np.float64]:
+        """Return how late calls returned that had to wait, in seconds.
+
+        A call is due when the last result that it needs is ready, which its env has noted. So
+        nothing is measured for this: the envs' clocks are the probes.
+        """
+        batches: dict[int, list[Sample]] = {}
+        for sample in self._samples:
+            if sample.needed:
+                batches.setdefault(sample.batch, []).append(sample)
+        lags: list[int] = []
+        for parts in batches.values():
+            done = parts[0].times[:, 0]
+            if len(parts) > 1:
+                done = np.concatenate([part.times[:, 0] for part in parts])
+            needed, since = min(parts[0].needed, len(done)), parts[0].since_ns
+            due = int(done.max() if needed == len(done) else np.sort(done)[needed - 1])
+            if due > since:
+                lags.append(parts[0].at_ns - due)
+        return np.array(lags) / 1e9
+
+
+class EnvTimes:
+    """Where the time of envs has gone: sums by config entry.
+
+    From one result to the next, an env waits for an action; then its request waits until the env
+    begins, the env executes it, and its result waits to be collected. Any thread may read this.
+
+    Attributes:
+        kept: samples that are not in the sums yet; whoever adds one calls `sum_up` where there are
+            most_kept.
+    """
+
+    def __init__(self, envs: EnvTable, requests: Requests) -> None:
+        self._envs = envs
+        self._requests = requests
+        self.kept: deque[Sample] = deque()
+        self.most_kept = max(1, min(_MOST_KEPT, _MOST_ROWS // max(len(envs), 1)))
+        # Columns as in `so_far`; times in ns.
+        self._sums = np.zeros((len(envs.names.entry_names), 5))
+        # When each slot's last result was returned; 0 before the first one.
+        self._taken_ns = np.zeros(len(envs), np.int64)
+        self._lock = threading.Lock()
+
+    def forget(self, slot: int) -> None:
+        """Another env takes `slot`: the time before its first result is nobody's."""
+        self.sum_up()
+        self._taken_ns[slot] = 0
+
+    def sum_up(self) -> None:
+        """Add to the sums what is kept."""
+        kept: list[Sample] = []
+        with self._lock:
+            while self.kept:  # The trainer may append meanwhile.
+                kept.append(self.kept.popleft())
+            if not kept:
+                return
+            rows = rows_of(kept)
+            # The waits of a slot for actions are the times that it was sent requests, without the
+            # first one, minus the times that results of it were taken, without the last one.
+            before = self._taken_ns.copy()
+            first = np.flatnonzero(before[rows.slots] == 0)[::-1]
+            before[rows.slots[first]] = rows.sent[first]
+            self._taken_ns[rows.slots] = rows.taken
+            columns = (
+                rows.steps,
+                rows.busy,
+                np.maximum(rows.done - rows.busy - rows.sent, 0),
+                rows.taken - rows.done,
+                rows.sent - rows.taken,
+            )
+            entries, size = self._envs.names.entries, len(self._sums)
+            own = entries[rows.slots] if size > 1 else None
+            for k, column in enumerate(columns):
+                summed = column.sum() if own is None else np.bincount(own, column, size)
+                self._sums[:, k] += summed
+            self._sums[:, 4] += np.bincount(entries, self._taken_ns - before, size)
+
+    def so_far(self, now_ns: int) -> NDArray[np.float64]:
+        """By entry: env steps, and seconds in envs, before envs, until collected, for actions.
+
+        The first three of these are of requests whose results were returned, the last one is until
+        now.
+        """
+        local = slice(0, len(self._envs.local_ids))
+        # Read first: a request that ends meanwhile is in the sums, and its env was taken from then.
+        idle = self._requests.state[local] == int(State.IDLE)
+        until = np.where(idle, now_ns, self._requests.sent_ns[local])
+        self.sum_up()
+        with self._lock:
+            found, taken = self._sums.copy(), self._taken_ns[local].copy()
+        waits = np.where(taken > 0, np.maximum(until - taken, 0), 0)
+        found[:, 4] += np.bincount(self._envs.names.entries[local], waits, len(found))
+        found[:, 1:] /= 1e9
+        return found
+
+
+def percentiles(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the median and the 99th percentile of at least one value.
+
+    `numpy.percentile` gives the same, but imports a module at its first call. That fails in a
+    process that is out of descriptors, which must still be able to collect.
+    """
+    ranks = np.array([0.5, 0.99]) * (len(values) - 1)
+    p50, p99 = np.interp(ranks, np.arange(len(values)), np.sort(values)).tolist()
+    return p50, p99
