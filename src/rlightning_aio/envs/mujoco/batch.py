@@ -233,14 +233,16 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
                 for k, seed in zip(ids.tolist(), given, strict=True)
             ]
             return Begun(ids, None, each)
-        columns, each = self._draw(ids, given)
+        begun = self._draw(ids, given)
         self._task.moved(ids, Some(self._simulations, ids))
         observations[ids] = self._task.observation(ids)
-        return Begun(ids, columns, each)
+        return begun
 
-    def _draw(self, ids: NDArray[np.intp], seeds: Sequence[int | None]) -> tuple[Any, Any]:
+    def _draw(self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None) -> Begun:
         """Draw first states of the simulations `ids`, and have MuJoCo compute what follows."""
-        env, task, simulations, each = self.env, self._task, self._simulations, []
+        env, task, simulations = self.env, self._task, self._simulations
+        each: list[dict[str, Any]] = []
+        seeds = [None] * len(ids) if seeds is None else seeds
         generators = [self._generator(k, seed) for k, seed in zip(ids.tolist(), seeds, strict=True)]
         places = ids.astype(np.int32)
         if self._randomizer is not None:
@@ -256,7 +258,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         simulations.qvel[ids] = env.init_qvel + velocities
         simulations.forward(places)
         self._before[ids], self._substeps[ids] = simulations.moving[ids], 0
-        return task.begun(Some(simulations, ids)), each
+        return Begun(ids, task.begun(Some(simulations, ids)), each)
 
     def _generator(self, k: int, seed: int | None) -> np.random.Generator:
         """The generator of simulation `k`, seeded like that of a Gymnasium env."""
@@ -332,13 +334,15 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         due = (
             np.flatnonzero(ended) if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
         )
-        failures = self._simulate(actions, None if due is None else ~ended)
+        self._simulations.ctrl[:] = actions
+        # Before the others step, so that the observations of all are gathered together.
+        begun = None if due is None or not self._resets_together else self._draw(due)
+        finished, failures = None, self._simulate(None if due is None else ~ended)
         observations, (rewards, terminated, columns) = self._task.stepped(actions)
         self._num_steps += 1
-        begun, finished = None, None
         if due is not None:
-            begun = self._begin(due, observations)
-            rewards[due], terminated[due] = 0.0, False
+            begun = self._begin(due, observations) if begun is None else begun
+            self._num_steps[due], rewards[due], terminated[due] = 0, 0.0, False
         truncated = self._num_steps >= self._limit
         if failures:
             failed = list(failures)
@@ -355,13 +359,14 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._is_whole = True
         return observations, rewards, terminated, truncated, self._infos(infos)
 
-    def _simulate(self, actions: NDArray[Any], stepped: NDArray[np.bool_] | None) -> dict[int, str]:
+    def _simulate(self, stepped: NDArray[np.bool_] | None) -> dict[int, str]:
         """Step the simulations `stepped`, or all. Return failures with their reasons."""
-        simulations = self._simulations
+        simulations, ids = self._simulations, None
         self._before[:] = simulations.moving
         self._substeps[:] = self.env.frame_skip
-        simulations.ctrl[:] = actions
-        ids = None if stepped is None else np.flatnonzero(stepped).astype(np.int32)
+        if stepped is not None:
+            ids = np.flatnonzero(stepped).astype(np.int32)
+            self._substeps[~stepped] = 0
         failures = simulations.step(self.env.frame_skip, ids)
         for k in failures:
             self._before[k], self._substeps[k] = simulations.moving[k], 0

@@ -227,7 +227,7 @@ class Hopper(Task):
 
     def finish(self, observations: NDArray[np.float64]) -> None:
         velocities = observations[:, self.velocities :]
-        np.clip(velocities, -10, 10, out=velocities)
+        velocities.clip(-10, 10, out=velocities)
 
     def position(self, fields: Any) -> Any:
         return fields.qpos[..., :1].copy()
@@ -265,8 +265,11 @@ class Hopper(Task):
         return forward + survive - control, ~healthy & bool(env._terminate_when_unhealthy), infos
 
     def begun(self, fields: Any) -> Columns:
-        x, z = fields.qpos[:, 0], fields.qpos[:, 1] - self.env.init_qpos[1]
-        return lambda: {"x_position": x, "z_distance_from_origin": z}
+        positions, height = fields.qpos, self.env.init_qpos[1]
+        return lambda: {
+            "x_position": positions[:, 0],
+            "z_distance_from_origin": positions[:, 1] - height,
+        }
 
 
 class Walker2d(Hopper):
@@ -296,7 +299,7 @@ class Ant(Task):
 
     def finish(self, observations: NDArray[np.float64]) -> None:
         forces = observations[:, self.first_force :]
-        np.clip(forces, *self.env._contact_force_range, out=forces)
+        forces.clip(*self.env._contact_force_range, out=forces)
 
     def judge(self) -> Judgement:
         env, state = self.env, self.state
@@ -307,7 +310,7 @@ class Ant(Task):
         forward = velocity[:, 0] * env._forward_reward_weight
         survive = healthy * env._healthy_reward
         control = env._ctrl_cost_weight * _squares(self.actions)
-        forces = np.clip(self.forces, *env._contact_force_range)
+        forces = self.forces.clip(*env._contact_force_range)
         contact = env._contact_cost_weight * _squares(forces)
 
         def infos() -> dict[str, Any]:
@@ -356,15 +359,15 @@ class _Humanoid(Task):
 
     def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
         """Cost of external forces."""
-        return np.clip(weight * _squares(self.forces), *limits)
+        return (weight * _squares(self.forces)).clip(*limits)
 
 
 class Humanoid(_Humanoid):
     def position(self, fields: Any) -> Any:
         single = not hasattr(fields, "model_field")
         masses = self.env.model.body_mass if single else fields.model_field("body_mass")
-        weighted = masses[..., np.newaxis] * fields.xipos[..., :2]
-        return weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True)
+        weighted = masses[..., np.newaxis] * fields.xipos
+        return (weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True))[..., :2]
 
     def judge(self) -> Judgement:
         env, start = self.env, self.start()
@@ -468,7 +471,7 @@ class InvertedDoublePendulum(Task):
         np.sin(sines, out=sines)
         np.cos(cosines, out=cosines)
         rest = observations[:, 1 + 2 * count :]
-        np.clip(rest, -10, 10, out=rest)
+        rest.clip(-10, 10, out=rest)
 
     def judge(self) -> Judgement:
         tips, speeds = self.tip().tolist(), self.speeds().tolist()
@@ -507,15 +510,8 @@ class Pusher(Task):
         near = -_lengths(thing - arm) * env._reward_near_weight
         distance = -_lengths(thing - goal) * env._reward_dist_weight
         control = -_squares(self.actions) * env._reward_control_weight
-
-        def infos() -> dict[str, Any]:
-            return {
-                "reward_dist": distance,
-                "reward_ctrl": control,
-                "reward_near": near,
-            }
-
-        return distance + control + near, self.never(), infos
+        infos = {"reward_dist": distance, "reward_ctrl": control, "reward_near": near}
+        return distance + control + near, self.never(), infos.copy
 
 
 class Reacher(Task):
@@ -548,14 +544,8 @@ class Reacher(Task):
         env = self.env
         distance = -_lengths(self.tip() - self.target()) * env._reward_dist_weight
         control = -_squares(self.actions) * env._reward_control_weight
-
-        def infos() -> dict[str, Any]:
-            return {
-                "reward_dist": distance,
-                "reward_ctrl": control,
-            }
-
-        return distance + control, self.never(), infos
+        infos = {"reward_dist": distance, "reward_ctrl": control}
+        return distance + control, self.never(), infos.copy
 
 
 _KINDS: dict[str, type[Task]] = {
