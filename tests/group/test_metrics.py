@@ -9,23 +9,29 @@ import random
 import signal
 import threading
 import time
+from collections import Counter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from faults.test_outcomes import CUT, DIE, GO, RAISE, Fails
+from faults.test_outcomes import END as FAIL_END
+from faults.test_outcomes import HANG as HANG_UP
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
 from patience import HANG
 
 import rlightning_aio
-from rlightning_aio import sync
+from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window
 from rlightning_aio.metrics import FIGURES, _Reader
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+gym.register("Fails-v0", Fails)
 OF_LOOP = {"loop_lag_seconds_p99", "loop_lag_seconds_max"}
 OF_GROUP = {"batch_size", "seconds_waiting_for_envs", "seconds_in_trainer"} | OF_LOOP
 OF_ENVS = [
@@ -251,8 +257,44 @@ def test_a_killed_worker_is_counted() -> None:
         assert batch.restarted.sum() == 2
         for entry, lost in (("", 2), ("probe", 2), ("more", 0)):
             found = numbers(group, entry)
-            assert (found.restarts, found.outcomes_lost) == (lost // 2, lost)
+            assert (found.restarts, found.outcomes_env_died) == (lost // 2, lost)
             assert found.outcomes_truncated == found.outcomes_terminated == 0
+
+
+@pytest.mark.parametrize("fields", [{"envs_per_process": 2}, {"num_envs": 2}], ids=repr)
+def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None:
+    """In batches and in errors, of every kind; steps that are aborted are cancelled."""
+    rng, counted = random.Random(1), Counter[str]()
+    task = {"backend": "gymnasium", "task": "group.test_metrics:Fails-v0", **fields}
+    config = {"name": "f", **task, "step_timeout": 0.3, "max_restarts": 100}
+
+    def note(batch: rlightning_aio.BatchedData | None) -> None:
+        if batch is not None:
+            counted.update(one.kind for one in np.ravel(batch.outcome) if one is not None)
+
+    with sync.build_env_group({**config, "num_workers": 4}) as group:
+        group.reset()
+        with group.auto_reset(7):
+            for turn in range(60):
+                likely = [GO] * 8 + [FAIL_END, CUT, RAISE, DIE] + [HANG_UP] * (turn % 20 == 0)
+                shape = group.get_action_spaces()[0].shape
+                actions = [np.full(shape, rng.choice(likely)) for _ in range(4)]
+                values = [PolicyResponse(*one) for one in zip(group.env_ids, actions, strict=True)]
+                try:
+                    note(group.step(BatchedData(group.env_ids, values))[0])
+                except EnvRaised as error:
+                    note(error.results)
+                    counted.update(one.outcome.kind for one in (error, *error.others))
+                    group.reset(env_ids=[one.env_id for one in (error, *error.others)])
+        group.reset()
+        group.step_async(BatchedData(group.env_ids, values))
+        group.abort()
+        found = vars(numbers(group))
+    counted["cancelled"] += 4
+    kinds = {name.removeprefix("outcomes_") for name in found if name.startswith("outcomes_")}
+    assert {kind: found[f"outcomes_{kind}"] for kind in kinds if counted[kind]} == counted
+    assert set(counted) >= {"terminated", "truncated", "env_raised", "env_died", "env_hung"}
+    assert sum(found[f"outcomes_{kind}"] for kind in kinds) == counted.total()
 
 
 def test_other_threads_may_read() -> None:

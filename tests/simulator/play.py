@@ -1090,6 +1090,10 @@ class Play(Session):
             require(set(worker["owed"]) <= pending | limbo, "owed", worker, pending)
         self.check_stats()
         self.group.get_stats()
+        numbers = self.group.metrics(by_entry=True)
+        require(not any(map(math.isnan, numbers.values())), "numbers", numbers)
+        there = [numbers[f"envs/{state}"] for state in ("idle", "in_flight", "uncollected")]
+        require(min(there) >= 0 and sum(there) == numbers["envs/envs"], "numbers", numbers)
         if self.batches and rng.random() < 0.3:
             batch = self.batches[-1]
             twin = pickle.loads(pickle.dumps(batch))

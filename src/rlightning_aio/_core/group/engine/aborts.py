@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.intake import Intake
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
@@ -44,6 +45,7 @@ class Aborts:
         arrivals: Arrivals,
         intake: Intake,
         waiting: Waiting,
+        stats: Stats,
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
@@ -54,6 +56,7 @@ class Aborts:
         self._arrivals = arrivals
         self._intake = intake
         self._waiting = waiting
+        self._stats = stats
 
     def drop(self, slots: NDArray[np.intp]) -> None:
         """Drop those results of `slots` that wait for the collector; errors that do so stay."""
@@ -62,6 +65,7 @@ class Aborts:
         if len(ready):
             self._requests.claim(ready, None)
             self._results.let_go(ready)
+            self._stats.note_failures(ready, _WHY.kind)
         failed = self._requests.collector.free(slots.tolist())
         dropped = np.concatenate((ready, failed))
         self._abandon(dropped)
@@ -76,6 +80,7 @@ class Aborts:
         aborted = self._requests.aborted
         for slot in slots.tolist():
             aborted.add(slot, self._fault(slot))
+        self._stats.note_failures(slots, _WHY.kind)
         self._abandon(slots)
         for host_id, entry in self._supervisor.detector.abort(slots, now):
             self._requests.end(host_id, entry)

@@ -71,7 +71,7 @@ class Core:
             envs, tables.layout, tables.conditions, zero_copy=zero_copy
         )
         self._arrivals = arrivals = Arrivals(tables, results, stats)
-        self.intake = intake = Intake(tables, supervisor, results, arrivals)
+        self.intake = intake = Intake(tables, supervisor, results, arrivals, stats)
         self.drain = intake.drain
         self.waiting = waiting = Waiting(
             tables, supervisor, poller, intake, parts.watcher, shares_thread=shares_thread
@@ -84,7 +84,7 @@ class Core:
             envs, supervisor, dispatch, self.calls, tables.continuity, waiting
         )
         self._resets = Resets(tables, supervisor, dispatch, results, intake, waiting)
-        self._aborts = Aborts(tables, supervisor, results, arrivals, intake, waiting)
+        self._aborts = Aborts(tables, supervisor, results, arrivals, intake, waiting, stats)
 
     # -- life -------------------------------------------------------------------------
 

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.results import Results
+    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.errors import EnvFault
@@ -63,6 +64,7 @@ class Intake:
         supervisor: Supervisor,
         results: Results,
         arrivals: Arrivals,
+        stats: Stats,
     ) -> None:
         self.now = 0.0
         self._completions = tables.completions
@@ -74,6 +76,7 @@ class Intake:
         self._results = results
         self._continuity = tables.continuity
         self._arrivals = arrivals
+        self._stats = stats
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
             Result: self._on_result,
@@ -204,7 +207,9 @@ class Intake:
     ) -> None:
         """End requests that are no longer in flight, with one error for each caller."""
         for owner, mine in self._requests.owners(slots).items():
-            self._requests.fail(mine, owner, error_for(mine))
+            fault = error_for(mine)
+            self._stats.note_failures(mine, fault.outcome.kind)
+            self._requests.fail(mine, owner, fault)
 
     def _on_died(self, completion: Died) -> None:
         """Carry out what a death means: mark lost, end requests, replace, send again."""

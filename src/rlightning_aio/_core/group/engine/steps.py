@@ -340,6 +340,7 @@ class Steps:
         except BaseException as error:
             requests.numbering.renew(slots, _STEP)
             fault = self._intake.raised(0, ErrorText.of(error))
+            self._stats.note_failures(slots, fault.outcome.kind)
             if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
                 requests.collector.keep(slots, fault)
                 raise

@@ -10,11 +10,12 @@ import time
 from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import numpy as np
 
 from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window, rows_of
+from rlightning_aio.outcomes import Outcome, OutcomeKind
 from rlightning_aio.protocol.slab import IS_RESET, TERMINATED, TRUNCATED
 
 if TYPE_CHECKING:
@@ -51,8 +52,8 @@ class _Verdicts:
         return int(self.true[slots].sum()) / count if count else None
 
 
-OUTCOMES: Final = ("terminated", "truncated", "lost")
-"""How an episode may come to an end; lost is one whose env was replaced or restored meanwhile."""
+OUTCOMES: Final[tuple[OutcomeKind, ...]] = get_args(OutcomeKind)
+_CODE_OF: Final = {kind: code for code, kind in enumerate(OUTCOMES)}
 
 
 class Stats:
@@ -77,9 +78,8 @@ class Stats:
         self._last = np.zeros((len(envs), 2))
         self._requests_before = np.zeros(size, np.int64)
         self._verdicts = {name: _Verdicts.of(size) for name in _VERDICTS}
-        # By entry, of each kind.
-        count = len(envs.names.entry_names)
-        self._outcomes = {kind: np.zeros(count, np.int64) for kind in OUTCOMES}
+        # By entry and kind.
+        self._outcomes = np.zeros((len(envs.names.entry_names), len(OUTCOMES)), np.int64)
 
     def move_to_entry(self, slot: int) -> None:
         """Move the sums of `slot` to its entry's former members, before another one takes it."""
@@ -147,19 +147,17 @@ class Stats:
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
-            self._count_outcomes("lost", part.slots[part.restarted])
+        self._note_outcomes(part, ended)
         rows: NDArray[np.intp] = ended.nonzero()[0]
         if not len(rows):
             return
-        slots, terminated = part.slots[rows], flags[..., TERMINATED][ended]
-        self._count_outcomes("terminated", slots[terminated])
-        self._count_outcomes("truncated", slots[~terminated])
-        outcomes = np.empty((len(rows), 3))
-        outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[ended], lengths[ended]
+        slots = part.slots[rows]
+        sums = np.empty((len(rows), 3))
+        sums[:, 0], sums[:, 1], sums[:, 2] = 1, returns[ended], lengths[ended]
         with np.errstate(over="ignore", invalid="ignore"):  # The means show them.
             # A result with sub-environments or agents may end several: its slot repeats.
-            np.add.at(self._sums, slots, outcomes)
-        self._last[slots] = outcomes[:, 1:]
+            np.add.at(self._sums, slots, sums)
+        self._last[slots] = sums[:, 1:]
         if part.info_marks is not None or part.out_of_band:
             for row in dict.fromkeys(rows.tolist()):
                 if part.may_hold(row, _HOLDERS):
@@ -167,14 +165,38 @@ class Stats:
                     with suppress(Exception):  # The info may be malformed; its reader gets it.
                         self._note_verdicts(slot, part.reported_info_of(row), ended[row])
 
-    def _count_outcomes(self, kind: str, slots: NDArray[np.intp]) -> None:
-        """Count episodes of `slots` that came to an end of some kind."""
-        counts = self._outcomes[kind]
-        counts += np.bincount(self._envs.names.entries[slots], minlength=len(counts))
+    def _note_outcomes(self, part: ResultColumns, ended: NDArray[np.bool_]) -> None:
+        """Count the outcomes that `BatchedData.outcome` has."""
+        terminated = part.flags[..., TERMINATED]
+        if part.agents:  # An episode has ended with that of its last agent.
+            ended = np.logical_or.reduce(ended, 1) & part.has_ended
+            terminated = np.logical_and.reduce(terminated, 1)
+        if part.restarted is not None:
+            ended = ended.copy()
+            ended[part.restarted] = True
+        rows: NDArray[np.intp] = ended.nonzero()[0]
+        if not len(rows):
+            return
+        codes = np.where(terminated, _CODE_OF["terminated"], _CODE_OF["truncated"])
+        if part.info_marks is not None or part.out_of_band:
+            for row in dict.fromkeys(rows.tolist()):
+                if part.may_hold(row, ("outcome",)):
+                    with suppress(Exception):  # The info may be malformed; its reader gets it.
+                        reported: Any = part.reported_info_of(row).get("outcome")
+                        if isinstance(reported, Outcome):
+                            codes[row] = _CODE_OF[reported.kind]
+        entries = self._envs.names.entries[part.slots[rows]]
+        np.add.at(self._outcomes, (entries, codes[ended]), 1)
+
+    def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> None:
+        """Count steps and resets of `slots` that end without a result; other requests don't."""
+        slots = slots[~self._requests.numbering.awaits_value(slots)]
+        entries = self._envs.names.entries[slots]
+        self._outcomes[:, _CODE_OF[kind]] += np.bincount(entries, minlength=len(self._outcomes))
 
     def outcomes(self, entries: NDArray[np.intp]) -> dict[str, int]:
-        """Return how many episodes of some entries came to an end, by its kind."""
-        return {kind: int(counts[entries].sum()) for kind, counts in self._outcomes.items()}
+        """Return how often episodes of some entries came to an end of each kind."""
+        return dict(zip(OUTCOMES, self._outcomes[entries].sum(axis=0).tolist(), strict=True))
 
     def mean_episode(self, entries: NDArray[np.intp]) -> dict[str, float]:
         """Return the mean return and length of ended episodes of some entries, if there are any."""
