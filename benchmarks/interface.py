@@ -30,10 +30,11 @@ MODULES: Final = {
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
     "policies": "evaluation", "policy_servers": "evaluation", "export": "evaluation",
     "metrics": "metrics", "remote": "remote", "serving": "remote", "errors": "errors",
-    "spaces": "envs", "envs.contract": "envs", "registry": "envs", "legacy": "legacy",
+    "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
+    "registry": "envs", "legacy": "legacy",
 }  # fmt: skip
 """Modules that the documentation imports names from, each with its row of the table."""
-ONLY: Final = {"registry": ["Backend"]}
+ONLY: Final = {"registry": ["Backend"], "envs.fast_path": ["FastPath"]}
 """Modules of which it imports these alone."""
 PACKAGE: Final = "rlightning_aio"
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rlightning_aio import PolicyResponse
 from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.base import initialised
 
 TASKS = (
     *("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum"),
@@ -28,7 +29,7 @@ class Made:
 
     def __init__(self, seed: int, **fields: Any) -> None:
         self.env = build_env(EnvConfig(**{"name": "e", **fields}))
-        self.env.initialised()
+        initialised(self.env)
         self.env.reset(seed=seed)
 
     def run(self, actions: list[Any]) -> list[Any]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from unittest import mock
 
 from rlightning_aio import ENVS
+from rlightning_aio.envs.fast_path import FastPath
 from rlightning_aio.registry import BACKENDS, load
 
 if TYPE_CHECKING:
@@ -49,8 +50,7 @@ def _twin(kind: type[Any]) -> type[Any]:
             await asyncio.sleep(0)
             return kind.step(self, policy_resp)
 
-        def bare_step(self) -> None:
-            return None
-
+    if issubclass(kind, FastPath):
+        Twin.bare_step = lambda self: None
     Twin.__module__, Twin.__qualname__ = kind.__module__, kind.__qualname__
     return Twin

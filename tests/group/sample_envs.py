@@ -18,7 +18,8 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
-from rlightning_aio.envs.base import BareStep, result_of
+from rlightning_aio.envs.base import result_of
+from rlightning_aio.envs.fast_path import BareStep, FastPath
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -250,7 +251,7 @@ HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"
 
 
 @ENVS.register("halved")
-class Halved(BaseEnv):
+class Halved(FastPath, BaseEnv):
     """Adds up its actions, in steps of two halves.
 
     Attributes:
@@ -310,7 +311,7 @@ class Halved(BaseEnv):
 
 
 @ENVS.register("fresh")
-class Fresh(BaseEnv):
+class Fresh(FastPath, BaseEnv):
     """Returns observations of the task's space without keeping references to them.
 
     A step returns ``gives`` of its ``env_kwargs``, or a sample of the space.

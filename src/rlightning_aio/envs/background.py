@@ -18,7 +18,7 @@ def _nobody() -> None: ...
 class Background:
     """Calls a function in a thread of its own, one call at a time.
 
-    `start` and `wait` are the two halves of `BaseEnv.bare_step_async`. If the thread has not begun
+    `start` and `wait` are the two halves of `FastPath.bare_step_async`. If the thread has not begun
     when the caller waits, the caller computes: that saves two switches between threads.
 
     Args:

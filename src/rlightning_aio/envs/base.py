@@ -2,7 +2,7 @@
 
 Rule: an env knows its simulator and its config, never its group, its process or
 its channel. `reset` and `step` speak `EnvRet`; a backend whose step is exactly
-Gymnasium's may also offer it bare (`bare_step`), which saves the wrapping.
+Gymnasium's may also offer it bare (`fast_path`), which saves the wrapping.
 """
 
 from __future__ import annotations
@@ -28,17 +28,14 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.fast_path import BareResult
 
 __all__ = [
     "Answer",
-    "BareReset",
-    "BareResult",
-    "BareStep",
-    "BareStepAsync",
-    "BareStepWait",
     "BaseEnv",
     "PreprocessFn",
     "Result",
+    "initialised",
     "result_of",
 ]
 
@@ -46,11 +43,6 @@ PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
 Answer = Result | Awaitable[Result]
 """What `reset` and `step` return; those of awaitable envs are coroutine functions."""
-BareReset = Callable[..., tuple[Any, dict[str, Any]]]
-BareResult = tuple[Any, Any, Any, Any, dict[str, Any]]
-BareStep = Callable[[Any], BareResult]
-BareStepAsync = Callable[[Any], None]
-BareStepWait = Callable[[], BareResult]
 
 
 def result_of(env_id: str, outcome: BareResult) -> EnvRet:
@@ -92,10 +84,6 @@ class BaseEnv(abc.ABC):
         autoreset: what sub-environments do after the end of their episode; see `EnvMeta`.
         switches_task: `reset` accepts the name of any task of the same spaces as
             ``options["task"]``, and switches to it until the next such reset.
-        fresh_results: `bare_step` returns new arrays and dicts, and keeps no reference to them.
-            With inline placement, observation and info are then passed on without a copy.
-        steps_briefly: a step takes so little time that it isn't worth a switch of threads. An env
-            with `bare_step_async` is then stepped when its result is collected.
     """
 
     transforms_actions: ClassVar[bool] = False
@@ -105,8 +93,6 @@ class BaseEnv(abc.ABC):
     agents: tuple[str, ...] = ()
     autoreset: Autoreset = "disabled"
     switches_task: bool = False
-    fresh_results: bool = False
-    steps_briefly: bool = False
 
     def __init__(
         self,
@@ -157,49 +143,9 @@ class BaseEnv(abc.ABC):
         """Wait for the step that `step_async` started, and return its result."""
         raise NotImplementedError(f"env {self.env_id!r} has no collect_async()")
 
-    def bare_step(self) -> BareStep | None:
-        """Return the simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
-
-        Return it only if `step` adds nothing to it but a call of ``self._preprocess_fn``, which
-        the runtime then makes itself. With None (the default) the runtime calls `step`. The
-        function owns the action: the runtime doesn't write to it again.
-        """
-        return None
-
-    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
-        """Return `bare_step` as two functions: one starts a step, the other waits for its end.
-
-        Return them, in addition to `bare_step`, if the simulator computes on its own in between.
-        With inline placement, a step whose action fits its row then starts when it is sent
-        instead of when it is collected. Ctrl-C during the first function is raised with the
-        result.
-        """
-        return None
-
-    def on_stepped(self, notify: Callable[[], None]) -> bool:
-        """Have `notify` called, in any thread, when a step that the first half of `bare_step_async`
-        started has ended, so that the second half doesn't have to wait.
-
-        Return False, the default, if the env can't do that: an event loop then waits with it.
-        """
-        del notify
-        return False
-
-    def bare_reset(self) -> BareReset | None:
-        """Return the simulator's own ``(seed=, options=) -> (obs, info)``, if `reset` adds nothing.
-
-        The runtime uses it together with `bare_step`.
-        """
-        return None
-
     def init(self) -> EnvMeta | None:
         """Finish construction where the env runs; called once. None stands for `get_metadata`."""
         return self.get_metadata()
-
-    def initialised(self) -> EnvMeta:
-        """Call `init` and return the metadata; every runner of an env starts with this."""
-        meta = self.init()
-        return self.get_metadata() if meta is None else meta
 
     def get_metadata(self) -> EnvMeta:
         """Return id, spaces and counts of this env."""
@@ -297,3 +243,9 @@ class BaseEnv(abc.ABC):
 
         An awaitable env may define it as `async def`.
         """
+
+
+def initialised(env: BaseEnv) -> EnvMeta:
+    """Call `init` and return the metadata; every runner of an env starts with this."""
+    meta = env.init()
+    return env.get_metadata() if meta is None else meta

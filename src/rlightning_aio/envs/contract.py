@@ -14,6 +14,8 @@ from unittest import SkipTest
 
 import numpy as np
 
+from rlightning_aio.envs.base import initialised
+from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.results import step_of
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.protocol.bounds import out_of_bounds
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.envs.base import BareResult, BareStep, BaseEnv
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.envs.fast_path import BareResult, BareStep
 
 __all__ = ["EnvContract", "Expected", "same", "values_of"]
 
@@ -71,7 +74,7 @@ class EnvContract:
     def make_env(self) -> BaseEnv:
         """Return the env under test, initialised."""
         env = ENVS.resolve(self.config.backend)(self.config)
-        env.initialised()
+        initialised(env)
         return env
 
     @contextlib.contextmanager
@@ -168,7 +171,7 @@ class EnvContract:
 
     def test_bare_steps_are_steps(self) -> None:
         """`bare_step`, where there is one, gives what `step` gives."""
-        self._compare_steps(lambda env: env.bare_step())
+        self._compare_steps(lambda env: fast_path_of(env).bare_step())
 
     def test_bare_halves_are_steps(self) -> None:
         """So do the two halves of `bare_step_async`, where there are any."""
@@ -269,7 +272,7 @@ def _check_columns(outcome: Expected, agents: tuple[str, ...], shape: tuple[int,
 
 
 def _joined_halves(env: BaseEnv) -> BareStep | None:
-    halves = env.bare_step_async()
+    halves = fast_path_of(env).bare_step_async()
     if halves is None:
         return None
     start, wait = halves

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.protocol.columns import stacked
 from rlightning_aio.types import (
@@ -45,7 +46,7 @@ def has_preprocess_fn(env: BaseEnv) -> bool:
 def reads_extras(env: BaseEnv) -> bool:
     """Return True if `env` can read more of a response than its action."""
     built_in = type(env).__module__.startswith("rlightning_aio.envs.")
-    return has_preprocess_fn(env) or not (built_in or env.bare_step() is not None)
+    return has_preprocess_fn(env) or not (built_in or fast_path_of(env).bare_step() is not None)
 
 
 def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
@@ -55,7 +56,7 @@ def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
     preprocess function. For `step_of` it is a `PolicyResponse`.
     """
     env_id = env.env_id
-    if env.bare_step() is None:
+    if fast_path_of(env).bare_step() is None:
         return lambda action, extras: PolicyResponse(env_id, action, **extras)
     if not has_preprocess_fn(env):
         return lambda action, _extras: action

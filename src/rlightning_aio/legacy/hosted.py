@@ -17,7 +17,8 @@ import numpy as np
 from gymnasium.vector.utils import create_empty_array
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.base import BareReset, BareStep, BaseEnv
+from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.envs.fast_path import BareReset, BareStep, FastPath
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.legacy.tensors import on_cpu
@@ -90,7 +91,7 @@ class _PackedMaker:
         return EnvMaker(*pickle.loads(self._packed))()
 
 
-class HostedEnv(BaseEnv):
+class HostedEnv(FastPath, BaseEnv):
     """An env of RLightning's as one of ours.
 
     Actions that fit the action space travel in the row. Any other is sent as a whole

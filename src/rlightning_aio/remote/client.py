@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from rlightning_aio.envs.base import initialised
+from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -115,7 +117,7 @@ class RemoteEnvClient:
         self._heartbeat = heartbeat
         try:
             self._session = ClientSession(
-                env.initialised(),
+                initialised(env),
                 self.name,
                 heartbeat=heartbeat,
                 free_actions=env.transforms_actions or has_preprocess_fn(env),
@@ -123,7 +125,7 @@ class RemoteEnvClient:
             )
         except UnsupportedSpace as error:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
-        self._bare_step = env.bare_step()
+        self._bare_step = fast_path_of(env).bare_step()
         self._env_step = step_of(env)
         self._input = input_of(env)
         self._request: StepRequest | ResetRequest | None = None

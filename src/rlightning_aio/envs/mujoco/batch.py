@@ -80,9 +80,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     Attributes:
         env: the unwrapped env, in the state of the simulation that used it last.
         takes_masks: True, as it can reset only some simulations.
-        fresh_results: see `BaseEnv`.
+        fresh_results: see `FastPath`.
         releases_gil: True, as steps may be computed in a thread.
-        steps_briefly: see `BaseEnv`.
+        steps_briefly: see `FastPath`.
 
     Raises:
         NotImplementedError: the task isn't one of Gymnasium's v5 tasks, or is wrapped; or MuJoCo is

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.fast_path import FastPath
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, outdated_assets_accepted
 from rlightning_aio.envs.sub_envs.only_sub_env import OnlySubEnv
 from rlightning_aio.errors import ConfigError
@@ -100,7 +101,7 @@ class _GivenEnv(GymnasiumEnv):
         return gym.wrappers.TimeLimit(made, config.max_episode_steps)
 
 
-class _AwaitableEnv(BaseEnv):
+class _AwaitableEnv(FastPath, BaseEnv):
     """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions.
 
     A space that it doesn't have is `Anything`.

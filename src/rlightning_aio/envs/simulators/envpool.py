@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.base import (
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.fast_path import (
     BareResult,
     BareStep,
     BareStepAsync,
     BareStepWait,
-    BaseEnv,
-    PreprocessFn,
-    result_of,
+    FastPath,
 )
 from rlightning_aio.envs.results import has_preprocess_fn
 from rlightning_aio.envs.tensors import as_numpy
@@ -46,7 +45,7 @@ Places: TypeAlias = "int | dict[str, Places]"
 """The position of a value among a pool's arrays, or the positions of its parts."""
 
 
-class EnvPoolEnv(BaseEnv):
+class EnvPoolEnv(FastPath, BaseEnv):
     """A pool of ``num_envs`` C++ environments; ``env_kwargs`` go to `envpool.make`.
 
     With ``batch_size`` M below ``num_envs`` the pool is asynchronous: each result holds

@@ -12,15 +12,8 @@ import gymnasium as gym
 from gymnasium.vector import SyncVectorEnv
 
 from rlightning_aio.envs.background import Background
-from rlightning_aio.envs.base import (
-    BareReset,
-    BareStep,
-    BareStepAsync,
-    BareStepWait,
-    BaseEnv,
-    PreprocessFn,
-    result_of,
-)
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.fast_path import BareReset, BareStep, BareStepAsync, BareStepWait, FastPath
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
@@ -38,7 +31,7 @@ if TYPE_CHECKING:
 __all__ = ["GymnasiumEnv", "MujocoEnv", "outdated_assets_accepted", "spec_of"]
 
 
-class GymnasiumEnv(BaseEnv):
+class GymnasiumEnv(FastPath, BaseEnv):
     """A Gymnasium environment, or ``num_envs`` of them; ``env_kwargs`` go to `gymnasium.make`.
 
     The step limit is the config's ``max_episode_steps``, or the registered one. If ``num_envs`` is

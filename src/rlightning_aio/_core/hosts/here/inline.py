@@ -97,7 +97,7 @@ class InlineHost:
             given = None if arguments is None else arguments[position]
             if given is not None or op_of(entry) != _STEP:
                 execute = partial(runner.execute, op_of(entry), given)
-            elif runner.begin_step is None or runner.env.steps_briefly:
+            elif runner.begin_step is None or runner.fast_path.steps_briefly:
                 execute = runner.step
             else:
                 try:
@@ -179,7 +179,7 @@ class _Threads:
         self.indices = {
             index
             for index, runner in enumerate(runners)
-            if runner.env.on_stepped(partial(inbox.put, partial(self._ended, index)))
+            if runner.fast_path.on_stepped(partial(inbox.put, partial(self._ended, index)))
         }
         watcher.watch(self)
 

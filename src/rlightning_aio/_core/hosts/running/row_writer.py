@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput
-    from rlightning_aio.envs.base import BareResult, BareStep
+    from rlightning_aio.envs.fast_path import BareResult, BareStep
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset, MultiAgentEnvRet
 

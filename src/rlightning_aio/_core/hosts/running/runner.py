@@ -30,6 +30,8 @@ from rlightning_aio._core.hosts.running.checkpoint import Checkpoints, Saver
 from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.env_steps import followed, step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
+from rlightning_aio.envs.base import initialised
+from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -100,6 +102,7 @@ class EnvRunner:
 
     Attributes:
         restarts: how many workers had this env before.
+        fast_path: what the env offers to save time.
         checkpoints: of the env.
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
@@ -115,17 +118,18 @@ class EnvRunner:
         self, env: BaseEnv, *, inline: bool = False, video: VideoConfig | None = None
     ) -> None:
         self.env = env
-        self.meta: EnvMeta = env.initialised()
+        self.meta: EnvMeta = initialised(env)
         self.restarts = 0
         self._inline = inline
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
-        bare = env.bare_step()
+        self.fast_path = fast_path_of(env)
+        bare = self.fast_path.bare_step()
         self._step_env: Callable[[Any], Any] = bare or (
             env.step if self.is_awaitable else step_of(env)
         )
         self._is_bare = bare is not None
-        self._bare_reset = env.bare_reset() if self._is_bare else None
+        self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
         self._input = input_of(env)
         self._read_action: Callable[[], Any] = _no_action
         self.checkpoints: Checkpoints
@@ -143,7 +147,7 @@ class EnvRunner:
     def layout(self) -> RowLayout:
         """The row that this env needs."""
         # The results of bare steps are handed over if the env doesn't use their arrays again.
-        hands_over = self._inline and self.env.fresh_results and self._is_bare
+        hands_over = self._inline and self._is_bare and self.fast_path.fresh_results
         return RowLayout.of(self.meta, observations_out_of_band=hands_over)
 
     def attach(
@@ -268,7 +272,7 @@ class EnvRunner:
         """Return a function that steps with the action in the row; set `begin_step`."""
         env, step_env, store, clock = self.env, self._step_env, self._store_step, time.monotonic_ns
         if self._is_bare:
-            halves, store = env.bare_step_async(), self._writer.write_step
+            halves, store = self.fast_path.bare_step_async(), self._writer.write_step
         else:
             halves = (env.step_async, env.collect_async) if is_async_first(env) else None
         read_action, make = self._read_action, self._input
