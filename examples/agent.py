@@ -1,6 +1,6 @@
 """64 concurrent episodes of an LLM agent with tools, against any OpenAI-compatible server.
 
-    pip install '.[agents]'
+    pip install . -r requirements/agents.txt
     python examples/agent.py --base-url http://127.0.0.1:8000/v1 --model Qwen/Qwen3-4B
 
 The environment (shop.py) asks questions and runs tools; observations and actions are messages.

@@ -14,7 +14,7 @@ MOST = {
     "fields": 24,
     "commands": 8,
     "options": 31,
-    "extras": 16,
+    "extras": 15,
 }
 
 
