@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import deque
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -22,12 +23,18 @@ def worker(entry: str, owed: list[str], **fields: Any) -> dict[str, Any]:
     return {**known, "pid": None, "restarts": 0, **fields}
 
 
+def numbers(steps: int, seconds: float) -> dict[str, float]:
+    """Those of a group, which has spent three of four seconds in its steps."""
+    episodes = {"outcomes_terminated": 3, "outcomes_truncated": 1, "episode_return_mean": 2.5}
+    times = {"in_envs": 3 * seconds, "queued": 0.0, "waiting_to_be_collected": 0.0}
+    named = {f"seconds_{state}": value for state, value in times.items()}
+    waiting = {"seconds_waiting_for_actions": seconds}
+    return {f"envs/{k}": v for k, v in {"steps": steps, **episodes, **named, **waiting}.items()}
+
+
 def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> Display:
     """The display of a rollout after 10 seconds, with a recent rate of 50 steps/s."""
-    group = SimpleNamespace(
-        get_workers=lambda: workers,
-        get_env_stats=lambda by_entry: {"a": {"episodes": 4, "mean_return": 2.5}},
-    )
+    group = SimpleNamespace(get_workers=lambda: workers)
     statistics = SimpleNamespace(
         steps=steps,
         idle=lambda now: idle,
@@ -37,8 +44,8 @@ def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> 
     )
     shown = Display.__new__(Display)
     shown._group, shown._statistics = cast("Any", group), cast("Any", statistics)
+    shown._recent = deque([(0.0, numbers(300, 1)), (2.0, numbers(400, 3))])
     shown._steps, shown._seconds, shown._doing, shown._since = 1000, None, "", 0.0
-    shown._recent = cast("Any", [(0.0, 300), (2.0, 400)])
     return shown
 
 
@@ -51,6 +58,7 @@ def test_the_line_has_the_rate_and_the_time_left() -> None:
         "400 steps",
         "4 episodes ended",
         "return of these 2.50",
+        "envs: 75% in steps, 0% queued, 0% to be collected, 25% wait for actions",
     ]
     assert live._fitting(parts, 32) == "50 steps/s  0:12 left  400 steps"
 

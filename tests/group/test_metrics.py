@@ -198,6 +198,25 @@ def test_a_call_is_due_with_the_last_result_that_it_needs() -> None:
     assert lags(9, 0, 100, 900, 400) == [100]
 
 
+def test_a_batch_of_several_layouts_is_one() -> None:
+    """Its size, its lag, and its part in the rate, of which the first batch is none."""
+
+    def part(batch: int, at: int, needed: int, *done: int) -> Sample:
+        times = np.array([[d, 0] for d in done])
+        sent = np.zeros(len(done), int)
+        return Sample(batch, at, np.arange(len(done)), sent, times, 1, None, False, 0, needed)
+
+    parts = [part(1, 1000, 3, 100, 900), part(1, 1000, 3, 800), part(2, 2000, 1, 1500)]
+    window = Window(parts, 10**9 + 1000)
+    assert window.batch_sizes().tolist() == [3, 1]
+    assert (window.lags() * 1e9).round().tolist() == [100, 500]
+    assert window.rate(np.ones(4, np.bool_)) == pytest.approx(1)
+    parts[0].needed = parts[1].needed = 2
+    assert (Window(parts, 0).lags() * 1e9).round().tolist() == [200, 500]
+    assert len(Window([], 0).lags()) == len(Window([], 0).batch_sizes()) == 0
+    assert Window(parts[:2], 10**9).rate(np.ones(3, np.bool_)) == 0
+
+
 async def test_the_lag_of_the_loop_is_how_late_calls_return() -> None:
     """Something else blocks the loop while workers have done their part."""
 

@@ -39,6 +39,13 @@ _REFRESH_SECONDS: Final = 0.25
 _PATIENCE_SECONDS: Final = 1.0
 """Seconds without a result after which the display says that it is waiting."""
 _RATE_SECONDS: Final = 3.0
+_STATES: Final = {
+    "envs/seconds_in_envs": "in steps",
+    "envs/seconds_queued": "queued",
+    "envs/seconds_waiting_to_be_collected": "to be collected",
+    "envs/seconds_waiting_for_actions": "wait for actions",
+}
+"""The numbers that say what envs spend their time on."""
 _SPINNER: Final = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _BAR: Final = 16
 _NAMED: Final = 3
@@ -79,7 +86,7 @@ class Display:
         self._doing = f"starting {counted(len(group), 'env')}"
         self._since = time.monotonic()
         self._next_at = 0.0
-        self._recent: deque[tuple[float, int]] = deque()
+        self._recent: deque[tuple[float, dict[str, float]]] = deque()
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
@@ -140,7 +147,7 @@ class Display:
         self._next_at = now + _REFRESH_SECONDS
         if not self._console.is_terminal:
             return
-        self._recent.append((now, self._statistics.steps))
+        self._recent.append((now, self._group.metrics()))
         while self._recent[0][0] < now - _RATE_SECONDS:
             self._recent.popleft()
         self._live.update(self._drawn(now), refresh=True)
@@ -173,21 +180,20 @@ class Display:
         steps = f"{count(self._statistics.steps)} steps"
         if idle > _PATIENCE_SECONDS:
             return [*(self._awaited(idle) or [f"waiting {idle:.0f} s"]), steps]
-        rate = self._rate()
-        stats = self._group.get_env_stats(by_entry=True).values()
-        episodes = sum(own["episodes"] for own in stats)
-        total = sum((own["mean_return"] or 0.0) * own["episodes"] for own in stats)
+        (then, before), (latest, numbers) = self._recent[0], self._recent[-1]
+        grown = {name: numbers[name] - before[name] for name in ("envs/steps", *_STATES)}
+        rate = grown["envs/steps"] / (latest - then) if latest > then else 0.0
+        total = sum(grown[state] for state in _STATES)
+        shares = [f"{grown[state] / total:.0%} {what}" for state, what in _STATES.items() if total]
+        episodes = numbers["envs/outcomes_terminated"] + numbers["envs/outcomes_truncated"]
         return [
             f"{count(rate)} steps/s",
             *self._time_left(now, rate),
             steps,
             f"{count(episodes)} episodes ended",
-            f"return of these {number(total / episodes if episodes else None)}",
+            f"return of these {number(numbers.get('envs/episode_return_mean'))}",
+            *([f"envs: {', '.join(shares)}"] if shares else []),
         ]
-
-    def _rate(self) -> float:
-        (then, steps), (now, more) = self._recent[0], self._recent[-1]
-        return (more - steps) / (now - then) if now > then else 0.0
 
     def _time_left(self, now: float, rate: float) -> list[str]:
         left: list[float] = []

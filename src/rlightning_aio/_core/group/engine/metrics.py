@@ -52,8 +52,8 @@ class Metrics:
         names = self._tables.envs.names.entry_names
         numbers = reading.of(np.arange(len(names)))
         sizes = reading.window.batch_sizes()
-        if sizes:
-            numbers["batch_size"] = sum(sizes) / len(sizes)
+        if len(sizes):
+            numbers["batch_size"] = float(sizes.mean())
         numbers["seconds_waiting_for_envs"], numbers["seconds_in_trainer"] = call_seconds
         if self._shares_thread and len(lags := reading.window.lags()):
             numbers["loop_lag_seconds_p99"] = percentiles(lags)[1]

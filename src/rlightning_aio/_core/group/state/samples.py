@@ -8,7 +8,7 @@ Rule: the hot path only appends. Whatever is computed is computed from many samp
 from __future__ import annotations
 
 import threading
-from collections import Counter, deque
+from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -110,20 +110,26 @@ class Window:
         since = samples[-1].at_ns - int(WINDOW_SECONDS * 1e9) if samples else 0
         self._samples = samples = [sample for sample in samples if sample.at_ns >= since]
         self.rows = rows_of(samples)
-        first = [len(sample.slots) for sample in samples if sample.batch == samples[0].batch]
-        self.kept = np.arange(len(self.rows.slots)) >= sum(first)
+        # Of each batch, the first sample (there is one for each layout) and the first row.
+        self._firsts: list[Sample] = []
+        begins: list[int] = []
+        row = 0
+        for sample in samples:
+            if not begins or sample.batch != self._firsts[-1].batch:
+                self._firsts.append(sample)
+                begins.append(row)
+            row += len(sample.slots)
+        self._begins = np.array(begins, np.intp)
+        self.kept = np.arange(row) >= (begins[1] if len(begins) > 1 else row)
         self._seconds = max(now_ns - samples[0].at_ns, 1) / 1e9 if samples else 1.0
 
     def rate(self, chosen: NDArray[np.bool_]) -> float:
         """Env steps per second, of the results that are `chosen`."""
         return int(self.rows.steps[chosen & self.kept].sum()) / self._seconds
 
-    def batch_sizes(self) -> list[int]:
+    def batch_sizes(self) -> NDArray[np.int64]:
         """The number of results in each batch."""
-        sizes = Counter[int]()
-        for sample in self._samples:
-            sizes[sample.batch] += len(sample.slots)
-        return list(sizes.values())
+        return np.diff(self._begins, append=len(self.kept))
 
     def synchronous(self) -> NDArray[np.bool_]:
         """``[n]``, whether each result was returned by the call that had asked for it."""
@@ -149,20 +155,17 @@ class Window:
         A call is due when the last result that it needs is ready, which its env has noted. So
         nothing is measured for this: the envs' clocks are the probes.
         """
-        batches: dict[int, list[Sample]] = {}
-        for sample in self._samples:
-            if sample.needed:
-                batches.setdefault(sample.batch, []).append(sample)
-        lags: list[int] = []
-        for parts in batches.values():
-            done = parts[0].times[:, 0]
-            if len(parts) > 1:
-                done = np.concatenate([part.times[:, 0] for part in parts])
-            needed, since = min(parts[0].needed, len(done)), parts[0].since_ns
-            due = int(done.max() if needed == len(done) else np.sort(done)[needed - 1])
-            if due > since:
-                lags.append(parts[0].at_ns - due)
-        return np.array(lags) / 1e9
+        if not self._firsts:
+            return np.zeros(0)
+        done, begins, sizes = self.rows.done, self._begins, self.batch_sizes()
+        due = np.maximum.reduceat(done, begins)
+        needed = np.array([first.needed for first in self._firsts])
+        for k in np.flatnonzero((needed > 0) & (needed < sizes)).tolist():
+            own = done[begins[k] : begins[k] + sizes[k]]
+            due[k] = np.partition(own, needed[k] - 1)[needed[k] - 1]
+        since = np.array([first.since_ns for first in self._firsts])
+        waited = (needed > 0) & (due > since)
+        return (self.rows.taken[begins] - due)[waited] / 1e9
 
 
 class EnvTimes:

@@ -230,7 +230,7 @@ class Stats:
         """The figures that `EnvGroup.get_stats` documents, over the window."""
         window = self.window(now_ns)
         sizes = window.batch_sizes()
-        if not sizes:
+        if not len(sizes):
             return {"steps_per_second": 0.0, "entries": {}, "batch_size": {}, "latency_us": {}}
         rows, synchronous = window.rows, window.synchronous()
         entries = self._envs.names.entries[rows.slots]
@@ -243,7 +243,11 @@ class Stats:
         return {
             "steps_per_second": window.rate(window.kept),
             "entries": rates,
-            "batch_size": {"mean": sum(sizes) / len(sizes), "min": min(sizes), "max": max(sizes)},
+            "batch_size": {
+                "mean": float(sizes.mean()),
+                "min": int(sizes.min()),
+                "max": int(sizes.max()),
+            },
             "latency_us": {
                 kind: {"p50": p50, "p99": p99} for kind, (p50, p99) in window.latencies().items()
             },
