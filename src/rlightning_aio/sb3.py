@@ -1,4 +1,4 @@
-"""Stable-Baselines3's vector interface: a group of envs as one of its `VecEnv`s.
+"""Stable-Baselines3's vector interface: a group of envs, or any vector env, as its `VecEnv`.
 
 It replaces `stable_baselines3.common.vec_env.SubprocVecEnv`, with bit-identical results.
 docs/stable_baselines3.md lists the differences.
@@ -19,8 +19,10 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.infos import listed
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.envs.sub_envs.sub_envs import adapted
+from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.protocol.columns import index
 from rlightning_aio.sync import EnvGroup, build_env_group
@@ -28,7 +30,7 @@ from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.deaths import cause_and_rest
 from rlightning_aio.vector.lazy_infos import LazyInfos
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.making import imports_of, steps_together, together
+from rlightning_aio.vector.making import alone, imports_of, steps_together, together
 from rlightning_aio.vector.rows import rows_of
 
 if TYPE_CHECKING:
@@ -92,21 +94,25 @@ def make_vec_env(
         spec := spec_of(env_id), kwargs, separate=separate
     ):
         kwargs = {"disable_env_checker": True, **kwargs}
-        fields = {**imports_of(spec), **fields}
-        makers, fields = together(spec, kwargs, n_envs, AutoresetMode.SAME_STEP, fields)
-        made = VecEnv(makers, **fields)
+        if fields.keys() <= {"start_method"}:
+            made = VecEnv(alone(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
+        else:
+            fields = {**imports_of(spec), **fields}
+            makers, fields = together(spec, kwargs, n_envs, AutoresetMode.SAME_STEP, fields)
+            made = VecEnv(makers, **fields)
         made.seed(seed)
         return vec_envs.VecMonitor(made)
     return make(env_id, n_envs, seed, vec_env_cls=VecEnv, **given)
 
 
 class VecEnv(_Base):
-    """Envs in worker processes behind Stable-Baselines3's vector interface.
+    """Envs in worker processes, or a vector env, behind Stable-Baselines3's vector interface.
 
     Args:
         env_fns: one callable for each env, or for each of several vector environments with the
             same size and same-step autoreset. They are called only in the workers; lambdas and
-            functions of ``__main__`` are allowed.
+            functions of ``__main__`` are allowed. Or a `gymnasium.vector.VectorEnv` with same-step
+            autoreset, Gymnasium's own included: it stays in this process, without a group.
         start_method: accepted and ignored.
         entry: further fields of `EnvConfig` (``envs_per_process``, ``step_timeout``, …).
 
@@ -120,13 +126,22 @@ class VecEnv(_Base):
         TypeError: `env_fns` is no list of callables.
     """
 
+    def __new__(cls, env_fns: Any, *arguments: Any, **entry: Any) -> Any:
+        """Make one for a vector env, if that is given in place of callables."""
+        del arguments, entry
+        is_vector = isinstance(env_fns, gym.vector.VectorEnv)
+        chosen: Any = _OfVector if is_vector else cls
+        return object.__new__(chosen)
+
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]],
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]]
+        | gym.vector.VectorEnv[Any, Any, Any],
         start_method: str | None = None,
         **entry: Any,
     ) -> None:
         del start_method
+        assert not isinstance(env_fns, gym.vector.VectorEnv)  # See `__new__`.
         limit = entry.pop("max_episode_steps", None)
         makers = adapted(env_fns, AutoresetMode.SAME_STEP, limit)
         self.group: EnvGroup = build_env_group({"name": "env", "task": makers, **entry})
@@ -306,11 +321,14 @@ class VecEnv(_Base):
         while left := [k for k in range(len(places)) if k not in values]:
             # An env that is named several times is called several times, once in each turn.
             turn = {places[k]: k for k in reversed(left)}
-            with self._exchange():
-                self._rows.call(name, args, kwargs, list(turn))
-                found = self._rows.values(collect_calls(self.group), list(turn))
+            found = self._call_each(list(turn), name, args, kwargs)
             values.update(zip(turn.values(), found, strict=True))
         return [values[k] for k in range(len(places))]
+
+    def _call_each(self, places: list[int], name: str, args: Any, kwargs: Any) -> Sequence[Any]:
+        with self._exchange():
+            self._rows.call(name, args, kwargs, places)
+            return self._rows.values(collect_calls(self.group), places)
 
     def _places(self, indices: Any) -> list[int]:
         return [range(self.num_envs)[k] for k in self._get_indices(indices)]
@@ -320,13 +338,122 @@ class VecEnv(_Base):
         return list(dict.fromkeys(self._places(indices)))
 
 
+class _OfVector(VecEnv):
+    """A vector env with same-step autoreset behind Stable-Baselines3's vector interface.
+
+    Args:
+        env_fns: the vector env.
+        start_method: accepted and ignored.
+        entry: must be empty.
+
+    Raises:
+        ConfigError: it has another autoreset mode, or fields of an entry are given.
+    """
+
+    def __init__(self, env_fns: Any, start_method: str | None = None, **entry: Any) -> None:
+        del start_method
+        envs, mode = env_fns, autoreset_mode_of(env_fns)
+        if entry:
+            raise ConfigError(f"{', '.join(entry)}: a vector env has no workers to configure")
+        if mode != AutoresetMode.SAME_STEP:
+            raise ConfigError(
+                f"{type(envs.unwrapped).__name__} has autoreset_mode {mode}; Stable-Baselines3 "
+                "needs AutoresetMode.SAME_STEP"
+            )
+        self.envs: Any = envs
+        self._inner: Any = envs.unwrapped
+        is_sync = isinstance(envs.unwrapped, gym.vector.SyncVectorEnv)
+        self._separate: list[Any] | None = envs.unwrapped.envs if is_sync else None
+        self._sent: Any = None
+        self.render_mode = envs.render_mode
+        spaces = envs.single_observation_space, envs.single_action_space
+        _Base.__init__(self, envs.num_envs, *spaces)
+        self.metadata = {**envs.metadata, **self.metadata}
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "group":  # That of a `VectorEnv`; others say what they lack.
+            return self._inner.group
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def reset(self) -> Any:
+        seeds = None if all(seed is None for seed in self._seeds) else list(self._seeds)
+        options = self._options[0] or None
+        if any((own or None) != options for own in self._options):
+            raise ValueError("reset options differ between envs that a vector env resets together")
+        observations, infos = self.envs.reset(seed=seeds, options=options)
+        self.reset_infos = listed(infos, self.num_envs)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: Any) -> None:
+        space = self.action_space
+        if not isinstance(space, gym.spaces.Dict | gym.spaces.Tuple):
+            self._sent = np.array(actions, space.dtype)
+            return
+        if len(actions) != self.num_envs:
+            raise ValueError(f"{len(actions)} actions for num_envs={self.num_envs}")
+        empty: Any = gym.vector.utils.create_empty_array(space, self.num_envs)
+        self._sent = gym.vector.utils.concatenate(space, actions, empty)
+
+    def step_wait(self) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
+        observations, rewards, terminated, truncated, found = self.envs.step(self._sent)
+        done = terminated | truncated
+        infos = LazyInfos(lambda: _with_cuts(listed(found, self.num_envs), truncated & ~terminated))
+        for k in np.flatnonzero(done).tolist():
+            cut = infos[k].pop("TimeLimit.truncated")
+            infos[k], self.reset_infos[k] = _last_and_first(infos[k], None)
+            infos[k]["TimeLimit.truncated"] = cut
+        return observations, rewards, done, infos
+
+    def close(self) -> None:
+        self.envs.close()
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        chosen = self._chosen(indices)
+        if self._separate is not None:
+            for k in chosen:
+                setattr(self._separate[k], attr_name, value)
+            return
+        if len(chosen) < self.num_envs:
+            raise ValueError(
+                f"{attr_name} can't be set for only some of the envs that are stepped together; "
+                "make separate envs, each with its own callable"
+            )
+        self._inner.set_attr(attr_name, [value] * self.num_envs)
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        places = self._places(indices)
+        if self._separate is not None:
+            name = name_of(wrapper_class)
+            return [has_wrapper(self._separate[k], name) for k in places]
+        ask: Any = getattr(self._inner, "env_is_wrapped", None)
+        return [ask is not None and ask(wrapper_class)] * len(places)
+
+    def _call_each(self, places: list[int], name: str, args: Any, kwargs: Any) -> Sequence[Any]:
+        if len(places) == self.num_envs:
+            values = self._inner.call(name, *args, **kwargs)
+            return [values[k] for k in places]
+        if self._separate is not None:
+            each = [self._separate[k].get_wrapper_attr(name) for k in places]
+            return [one(*args, **kwargs) if callable(one) else one for one in each]
+        if not hasattr(self._inner, "call_one"):
+            raise ValueError(
+                f"{type(self._inner).__name__} can't call {name}() of only some of its envs"
+            )
+        return [self._inner.call_one(k, name, *args, **kwargs) for k in places]
+
+
+def _with_cuts(each: list[dict[str, Any]], cuts: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """Add ``TimeLimit.truncated`` to each info, and return them."""
+    for info, cut in zip(each, cuts.tolist(), strict=True):
+        info["TimeLimit.truncated"] = cut
+    return each
+
+
 def _infos_of_step(rows: Singles, batch: BatchedData) -> list[dict[str, Any]]:
     """List the infos of a step, with ``TimeLimit.truncated``."""
-    infos = rows.info_list(batch)
-    truncated = rows.flat(batch.truncated & ~batch.terminated).tolist()
-    for info, cut in zip(infos, truncated, strict=True):
-        info["TimeLimit.truncated"] = cut
-    return infos
+    return _with_cuts(rows.info_list(batch), rows.flat(batch.truncated & ~batch.terminated))
 
 
 def _last_and_first(

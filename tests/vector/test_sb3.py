@@ -16,6 +16,7 @@ from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
 
 from rlightning_aio.envs.mujoco.of_spec import BatchOf, OneOf
+from rlightning_aio.vector import make_vec
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -247,6 +248,104 @@ def test_actions_may_be_trees(together: int) -> None:
     with pytest.raises(ValueError, match="3 actions"):
         envs.step(actions[:3])
     envs.close()
+
+
+def short_hopper() -> gym.Env[Any, Any]:
+    return gym.make("Hopper-v5", max_episode_steps=15, disable_env_checker=True)
+
+
+def hoppers(kind: str) -> Any:
+    mode = AutoresetMode.SAME_STEP
+    if kind == "together":
+        return make_vec("Hopper-v5", 3, autoreset_mode=mode, max_episode_steps=15)
+    if kind == "group":
+        return make_vec("Hopper-v5", 3, "async", autoreset_mode=mode, max_episode_steps=15)
+    if kind == "sync":
+        return gym.vector.SyncVectorEnv([short_hopper] * 3, autoreset_mode=mode)
+    # Without shared memory, of which Gymnasium leaves descriptors behind.
+    return gym.vector.AsyncVectorEnv([short_hopper] * 3, shared_memory=False, autoreset_mode=mode)
+
+
+@pytest.mark.parametrize("kind", ["together", "group", "sync", "async"])
+def test_any_vector_env_does_the_same_as_dummy_vec_env(kind: str) -> None:
+    """Observations, rewards, dones, infos, infos of resets, seeds, calls of some, attributes."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from rlightning_aio.sb3 import VecEnv
+
+    ours, theirs = VecEnv(hoppers(kind)), DummyVecEnv([short_hopper] * 3)
+    assert isinstance(ours, VecEnv)
+    for env in (ours, theirs):
+        env.seed(5)
+    assert_alike(ours.reset(), theirs.reset())
+    draws = np.random.default_rng(0)
+    for turn in range(60):
+        actions = draws.uniform(-1, 1, (3, 3)).astype(np.float32)
+        found, expected = ours.step(actions), theirs.step(actions)
+        assert_alike(found[0], expected[0], f"{turn}")
+        np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)
+        assert_alike(found[2], expected[2])
+        for each, other in ((list(found[3]), expected[3]), (ours.reset_infos, theirs.reset_infos)):
+            assert len(each) == len(other)
+            for info, plain in zip(each, other, strict=True):
+                assert info.keys() == plain.keys(), f"{turn}"
+                for key, value in plain.items():
+                    np.testing.assert_array_equal(info[key], value, key)
+    assert ours.get_attr("dt") == theirs.get_attr("dt")
+    assert ours.has_attr("frame_skip")
+    assert not ours.has_attr("nothing")
+    if kind == "async":
+        with pytest.raises(ValueError, match="AsyncVectorEnv can't call get_wrapper_attr"):
+            ours.get_attr("dt", indices=[1])
+    else:
+        assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
+        assert ours.get_attr("np_random_seed", indices=[2, -3]) == [7, 5]
+    ours.set_attr("frame_skip", 2)
+    assert ours.get_attr("frame_skip") == [2, 2, 2]
+    ours.close()
+    theirs.close()
+
+
+def test_a_vector_env_in_another_mode_is_refused() -> None:
+    """As are fields of an entry, and a group is asked for."""
+    from rlightning_aio.errors import ConfigError
+    from rlightning_aio.sb3 import VecEnv, make_vec_env
+
+    pole = gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")])
+    with pytest.raises(ConfigError, match=r"NEXT_STEP; Stable-Baselines3 needs"):
+        VecEnv(pole)
+    envs: Any = make_vec_env("Hopper-v5", 2)
+    with pytest.raises(AttributeError, match="without a group"):
+        _ = envs.venv.group
+    with pytest.raises(ConfigError, match="step_timeout: a vector env has no workers"):
+        VecEnv(envs.venv.envs, step_timeout=3.0)
+    with pytest.raises(ValueError, match="can't be set for only some"):
+        envs.set_attr("frame_skip", 2, indices=[1])
+    envs.set_options([{"a": 1}, {}])
+    with pytest.raises(ValueError, match="options differ"):
+        envs.reset()
+    envs.close()
+    pole.close()
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_ppo_learns_the_same_on_envs_that_are_stepped_together(n_envs: int) -> None:
+    """The same weights as with Stable-Baselines3's own envs, in a `VecMonitor`."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+
+    from rlightning_aio.sb3 import make_vec_env
+
+    weights: list[Any] = []
+    for env in (make_vec_env("Hopper-v5", n_envs), VecMonitor(DummyVecEnv([hopper] * n_envs))):
+        model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, seed=1, device="cpu").learn(128)
+        weights.append(model.policy.state_dict())
+        env.close()
+    assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
+
+
+def hopper() -> gym.Env[Any, Any]:
+    return gym.make("Hopper-v5", disable_env_checker=True)
 
 
 def test_a_step_limit_of_the_entry_ends_episodes() -> None:

@@ -397,14 +397,20 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def envs(self) -> list[Any]:
         """A proxy of each env; it fetches attributes when they are read."""
         return [
-            EnvProxy(partial(self._look_up, place), partial(self._call_one, place))
+            EnvProxy(partial(self._look_up, place), partial(self.call_one, place))
             for place in range(self.num_envs)
         ]
 
-    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the env at `place`, or get its attribute."""
         check_name(name)
         send = partial(self._rows.call, name, args, kwargs, [place])
         return self._rows.values(self._answered("call_async", send), [place])[0]
+
+    def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
+        """Return True if `wrapper_class` is among the wrappers of any env."""
+        self._begin("call_async")
+        return any(self._rows.are_wrapped(wrapper_class, range(self.num_envs)))
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
         send = partial(self._rows.look_up, name, place)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
+from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.vector.lazy_infos import LazyColumns
 from rlightning_aio.vector.pending import check_free, check_running, check_sent
 from rlightning_aio.vector.proxies import EnvProxy, check_name
@@ -150,18 +151,23 @@ class MujocoVectorEnv(MujocoBatch):
     def envs(self) -> list[Any]:
         """A proxy of each env; it fetches attributes when they are read."""
         return [
-            EnvProxy(partial(self._look_up, k), partial(self._call_one, k))
+            EnvProxy(partial(self._look_up, k), partial(self.call_one, k))
             for k in range(self.num_envs)
         ]
 
     def _look_up(self, k: int, name: str) -> tuple[bool, Any]:
         is_method = callable(getattr(self.env, name, None))
-        return is_method, None if is_method else self._call_one(k, name)
+        return is_method, None if is_method else self.call_one(k, name)
 
-    def _call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+    def call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of env `k`, or get its attribute."""
         check_free(self, self._pending, "call_async")
         check_name(name)
-        return self.call_one(k, name, *args, **kwargs)
+        return super().call_one(k, name, *args, **kwargs)
+
+    def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
+        """Return True if `wrapper_class` is among the wrappers of the envs."""
+        return self.is_wrapped(name_of(wrapper_class))
 
     @property
     def np_random(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # As theirs.
