@@ -120,7 +120,7 @@ def recorded_calls(count: int) -> Record:
         batch, _ = recorded.reset(seed=0)
         recorded.step_async(batch.respond(action=[0, 0]))
         for _ in range(count):
-            batch, _ = recorded.collect_async(None, False, None, 1)
+            batch, _ = recorded.collect_async(None, False, 1, 1)
             recorded.step_async(batch.respond(action=[0]))
     return recorded.record
 
