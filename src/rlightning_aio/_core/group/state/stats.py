@@ -147,7 +147,12 @@ class Stats:
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
-        self._note_outcomes(part, ended)
+        # The outcomes that `BatchedData.outcome` has; the first two are terminated, truncated.
+        over, codes = ended, (~flags[..., TERMINATED]).astype(np.int64)
+        if part.info_marks is not None or part.out_of_band or part.agents:
+            over, codes = self._as_reported(part, ended, codes)
+        entries = self._envs.names.entries[part.slots[over.nonzero()[0]]]
+        np.add.at(self._outcomes, (entries, codes[over]), 1)
         rows: NDArray[np.intp] = ended.nonzero()[0]
         if not len(rows):
             return
@@ -165,28 +170,30 @@ class Stats:
                     with suppress(Exception):  # The info may be malformed; its reader gets it.
                         self._note_verdicts(slot, part.reported_info_of(row), ended[row])
 
-    def _note_outcomes(self, part: ResultColumns, ended: NDArray[np.bool_]) -> None:
-        """Count the outcomes that `BatchedData.outcome` has."""
-        terminated = part.flags[..., TERMINATED]
+    def _as_reported(
+        self, part: ResultColumns, over: NDArray[np.bool_], codes: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Return which episodes of unusual results are over, and their outcomes.
+
+        Args:
+            part: of results that have agents, infos, or were marked as restarted.
+            over: as the flags say.
+            codes: of outcomes, likewise.
+        """
         if part.agents:  # An episode has ended with that of its last agent.
-            ended = np.logical_or.reduce(ended, 1) & part.has_ended
-            terminated = np.logical_and.reduce(terminated, 1)
+            over = np.logical_or.reduce(over, 1) & part.has_ended
+            codes = np.maximum.reduce(codes, 1)
         if part.restarted is not None:
-            ended = ended.copy()
-            ended[part.restarted] = True
-        rows: NDArray[np.intp] = ended.nonzero()[0]
-        if not len(rows):
-            return
-        codes = np.where(terminated, _CODE_OF["terminated"], _CODE_OF["truncated"])
-        if part.info_marks is not None or part.out_of_band:
-            for row in dict.fromkeys(rows.tolist()):
-                if part.may_hold(row, ("outcome",)):
-                    with suppress(Exception):  # The info may be malformed; its reader gets it.
-                        reported: Any = part.reported_info_of(row).get("outcome")
-                        if isinstance(reported, Outcome):
-                            codes[row] = _CODE_OF[reported.kind]
-        entries = self._envs.names.entries[part.slots[rows]]
-        np.add.at(self._outcomes, (entries, codes[ended]), 1)
+            over = over.copy()
+            over[part.restarted] = True
+        rows: list[int] = over.nonzero()[0].tolist()
+        for row in dict.fromkeys(rows):
+            if part.may_hold(row, ("outcome",)):
+                with suppress(Exception):  # The info may be malformed; its reader gets it.
+                    reported: Any = part.reported_info_of(row).get("outcome")
+                    if isinstance(reported, Outcome):
+                        codes[row] = _CODE_OF[reported.kind]
+        return over, codes
 
     def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> None:
         """Count steps and resets of `slots` that end without a result; other requests don't."""
