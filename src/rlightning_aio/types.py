@@ -7,7 +7,7 @@ Absent on purpose: anything that knows where an env runs.
 from __future__ import annotations
 
 import time
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, Self, TypeAlias
 
 import gymnasium as gym
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
@@ -64,6 +64,21 @@ class _Ret(BaseModel):
         super().__init__(**data)
         if _extra is not None:
             self._extra = _extra
+
+    @classmethod
+    def of(cls, fields: dict[str, Any], extra: dict[str, Any] | None = None) -> Self:
+        """Make a result of all its fields, unchecked: in an eighth of the time.
+
+        Args:
+            fields: becomes a part of it.
+            extra: its `_extra`.
+        """
+        made, give = cls.__new__(cls), object.__setattr__
+        give(made, "__dict__", fields)
+        give(made, "__pydantic_fields_set__", set(fields))
+        give(made, "__pydantic_extra__", None)
+        give(made, "__pydantic_private__", {"_extra": {} if extra is None else extra})
+        return made
 
 
 class EnvRet(_Ret):

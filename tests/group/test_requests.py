@@ -122,7 +122,7 @@ class Driven:
 
     def _fail(self) -> None:
         slots = self.table.alone(self._end())
-        ((owner, mine),) = self.table.owners(slots).items()
+        ((owner, mine),) = self.table.owners(slots)
         self.table.fail(mine, owner, fault())
 
     def _abort(self) -> None:
@@ -536,7 +536,7 @@ class RequestsMachine(RuleBasedStateMachine):
 
     def fail(self, slots: list[int]) -> None:
         """End requests that are no longer in flight in one error for each owner."""
-        owners = self.table.owners(np.array(slots, np.intp)).items()
+        owners = self.table.owners(np.array(slots, np.intp))
         assert sorted(slot for _, mine in owners for slot in mine.tolist()) == sorted(slots)
         for owner, mine in owners:
             error = fault()

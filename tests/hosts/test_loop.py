@@ -225,22 +225,30 @@ async def test_an_episode_that_is_left_during_a_step_leaves_its_env_idle(
     """At once, though the step would never end. Its env is replaced; no other notices anything."""
     sent = asyncio.Event()
 
+    async def until_sent() -> None:
+        while "e-0" not in group.pending:  # noqa: ASYNC110  # Twice.
+            await asyncio.sleep(0)
+        sent.set()
+
+    async def expire(limit: asyncio.Timeout) -> None:
+        await until_sent()
+        limit.reschedule(0)
+
     async def agent() -> None:
         async with group.episode("e-0", seed=3) as env:
             await env.step(STEP)
-            asyncio.get_running_loop().call_soon(sent.set)
-            if leave == "timeout":
-                async with asyncio.timeout(0.01):
-                    await env.step(action)
-            if leave == "caught":
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(0.01):
+            if leave in ("timeout", "caught"):
+                caught = TimeoutError if leave == "caught" else ()
+                with contextlib.suppress(caught):
+                    async with asyncio.timeout(None) as limit:
+                        expiring = asyncio.ensure_future(expire(limit))
                         await env.step(action)
+                await expiring
                 return
             async with asyncio.TaskGroup() as tasks:
                 step = tasks.create_task(env.step(action))
+                await until_sent()
                 if leave == "exception":
-                    await asyncio.sleep(0.01)
                     raise ZeroDivisionError
                 await step
 

@@ -117,6 +117,10 @@ class ResultColumns(msgspec.Struct):
         over = self.flags[..., OVER]
         return np.logical_and.reduce(over, 1) if self.agents else over
 
+    def by_env(self, column: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+        """Return a column of envs, ``[n]``; None is all False."""
+        return np.zeros(len(self), np.bool_) if column is None else column
+
     def by_sub_env(self, column: NDArray[Any] | None) -> NDArray[Any]:
         """Broadcast a column of envs, ``[n]``, to the shape of `is_reset`; None is all False."""
         shape = self.is_reset.shape
@@ -225,16 +229,23 @@ class ResultColumns(msgspec.Struct):
         kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return self._ret_handed_over(row, kept["ret"])
+        if self.reward.ndim == 1:  # As `head_of`, in an eighth of the time.
+            reward = self.reward.item(row)
+            terminated = self.flags.item(row, TERMINATED)
+            truncated = self.flags.item(row, TRUNCATED)
+        else:
+            heads = self.reward, self.terminated, self.truncated
+            reward, terminated, truncated = (self.head_of(head, row) for head in heads)
         fields = {
-            "env_id": self.names.ids(self.slots[row : row + 1])[0],
+            "env_id": self.names.env_ids[self.slots.item(row)],
             "observation": self.observation_of(row),
-            "last_reward": self.head_of(self.reward, row),
-            "last_terminated": self.head_of(self.terminated, row),
-            "last_truncated": self.head_of(self.truncated, row),
+            "last_reward": reward,
+            "last_terminated": terminated,
+            "last_truncated": truncated,
             "info": self.info_of(row),
             "ts_env_sent_ns": self.sent_ns_of(row),
         }
-        return (MultiAgentEnvRet if self.agents else EnvRet)(_extra=kept.get("extra"), **fields)
+        return (MultiAgentEnvRet if self.agents else EnvRet).of(fields, kept.get("extra"))
 
     def _ret_handed_over(self, row: int, ret: Any) -> Any:
         changed: dict[str, Any] = {}
@@ -251,7 +262,7 @@ class ResultColumns(msgspec.Struct):
     def sent_ns_of(self, row: int) -> int:
         """Time when one env sent its result, in ns since the epoch."""
         if self.sent_ns is None:
-            return int(self.times[row, 0]) + _EPOCH_NS
+            return self.times.item(row, 0) + _EPOCH_NS
         return int(self.sent_ns[row])
 
     def head_of(self, column: NDArray[Any], row: int) -> Any:

@@ -9,7 +9,7 @@ users.
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "all_agents",
+    "are_over",
     "columns_of_responses",
     "ended_episodes",
     "has_ended",
+    "lost_rows",
     "names_of",
     "origin_of",
     "parts_of",
@@ -139,3 +141,32 @@ def names_of(batch: BatchedData) -> EnvNames | None:
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
     """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
     return batch._columns
+
+
+def are_over(batch: BatchedData) -> list[bool]:
+    """Return for each result whether it ends the episodes of all agents and sub-environments."""
+    return column_of_parts(batch._parts, _over_of_rows).tolist()
+
+
+def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
+    if not part.whole_results:
+        done = part.done
+        return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
+    rets = [part.ret(row) for row in range(len(part))]
+    return np.array([_all_flags(r.last_terminated, r.last_truncated) for r in rets], np.bool_)
+
+
+def _all_flags(terminated: Any, truncated: Any) -> bool:
+    """Return True if one of the two is set for each agent and sub-environment."""
+    if isinstance(terminated, dict):
+        pairs = cast("dict[str, Any]", terminated).items()
+        return all(_all_flags(flags, truncated[agent]) for agent, flags in pairs)
+    return bool(np.all(np.logical_or(terminated, truncated)))
+
+
+def lost_rows(batch: BatchedData) -> set[int]:
+    """Return the positions of results whose episode before was lost."""
+    if all(part.restarted is None for part in batch._parts):
+        return set()
+    lost = column_of_parts(batch._parts, lambda part: part.by_env(part.restarted))
+    return {*np.flatnonzero(lost).tolist()}

@@ -9,7 +9,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from rlightning_aio._core.group.api.episode import EnvEpisode
+from rlightning_aio._core.group.api.episode import Agents, EnvEpisode
 from rlightning_aio._core.group.api.facade import only_result, steps_of
 from rlightning_aio._core.group.api.filming import film, video_of
 from rlightning_aio._core.group.api.interface import (
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Coroutine, Mapping, Sequence
 
+    from rlightning_aio._core.group.setup.plan import Plan
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -49,6 +50,10 @@ class EnvGroup(GroupInterface):
 
     _driver: AioDriver
     _shares_thread = True
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__(plan)
+        self._agents = Agents(self._core.agent_steps, self._driver)
 
     def _new_driver(self) -> AioDriver:
         return AioDriver()
@@ -148,7 +153,7 @@ class EnvGroup(GroupInterface):
         Raises:
             UnknownEnv: no env of this group has that id.
         """
-        return EnvEpisode(self, self[env_id], seed, options)
+        return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
     async def offload(self) -> None:
         await self.call("offload")

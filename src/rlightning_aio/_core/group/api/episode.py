@@ -7,22 +7,51 @@ result of it ever comes to a call that collects those of other envs.
 from __future__ import annotations
 
 import asyncio
+import time
+from contextvars import Context
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio._core.group.api.facade import only_result, steps_of
-from rlightning_aio.batch.contents import all_agents
+from rlightning_aio._core.group.api.facade import only_result, response_to
+from rlightning_aio._core.group.engine.agent_steps import AgentStep
+from rlightning_aio._core.hosts.awaiting.event_loop import new_task
+from rlightning_aio.batch.contents import are_over
 from rlightning_aio.errors import EpisodeLost
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
-
     from rlightning_aio._core.group.api.interface import EnvHandleInterface, GroupInterface
+    from rlightning_aio._core.group.drivers.aio_driver import AioDriver
+    from rlightning_aio._core.group.engine.agent_steps import AgentSteps, StepEnd
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
-    Answer = Coroutine[Any, Any, tuple[BatchedData, Any]]
+__all__ = ["Agents", "EnvEpisode"]
 
-__all__ = ["EnvEpisode"]
+
+class Agents:
+    """The agents of one group: `AgentSteps` on its event loop."""
+
+    def __init__(self, steps: AgentSteps, driver: AioDriver) -> None:
+        self._steps = steps
+        self._driver = driver
+        self._serving: asyncio.Task[None] | None = None
+
+    def ask(
+        self, env_id: str, response: PolicyResponse
+    ) -> tuple[AgentStep, asyncio.Future[StepEnd]]:
+        """Have a step sent in the next turn of the loop; return it, and what gets its outcome."""
+        self._driver.check_caller()
+        loop = asyncio.get_running_loop()
+        reply: asyncio.Future[StepEnd] = loop.create_future()
+        step = AgentStep(env_id, response, reply)
+        if self._steps.ask(step):
+            serving = self._driver.run(self._steps.serve(time.monotonic()))
+            self._serving = new_task(serving, loop, Context())  # In no agent's context.
+            self._serving.add_done_callback(self._on_end)
+        return step, reply
+
+    def _on_end(self, task: asyncio.Task[None]) -> None:
+        if task is self._serving and task.cancelled():
+            self._steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
 
 
 class EnvEpisode:
@@ -43,30 +72,39 @@ class EnvEpisode:
     def __init__(
         self,
         group: GroupInterface,
+        agents: Agents,
         env: EnvHandleInterface,
         seed: int | None,
         options: dict[str, Any] | None,
     ) -> None:
-        self._group, self.env = group, env
+        self._group, self._agents, self.env = group, agents, env
         self._seed, self._options = seed, options
         self.lost: str | None = None
-        # The newest call, and earlier ones that were cancelled or raised.
-        self._tasks: list[asyncio.Task[tuple[BatchedData, Any]]] = []
+        self._reset: asyncio.Future[tuple[BatchedData, Any]] | None = None
+        # Steps that were cancelled after they had been sent.
+        self._given_up: list[AgentStep] = []
 
     async def __aenter__(self) -> Self:
         try:
             seeds = None if self._seed is None else [self._seed]
-            found = await self._answer(self._group.reset(seeds, self._options, [self.env.env_id]))
-            self._note(found)
+            reset: Any = self._group.reset(seeds, self._options, [self.env.env_id])
+            self._reset = task = asyncio.ensure_future(reset)
+            found = await asyncio.shield(task)
+            self.last, (self.is_over,) = only_result(found), are_over(found[0])
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        tasks, self._tasks = self._tasks, []
-        if any(not task.done() for task in tasks):
-            tasks.append(asyncio.ensure_future(self._group.abort([self.env.env_id])))
+        tasks: list[asyncio.Future[Any]] = []
+        if self._reset is not None:
+            tasks.append(self._reset)
+            self._reset = None
+        in_flight = any(not task.done() for task in tasks)
+        if in_flight or any(step.is_outstanding for step in self._given_up):
+            abort: Any = self._group.abort([self.env.env_id])
+            tasks.append(asyncio.ensure_future(abort))
             # However often this is cancelled, they go on, and the env is idle in the end.
             await asyncio.wait(tasks)
         for task in tasks:
@@ -83,30 +121,24 @@ class EnvEpisode:
             EpisodeLost: the env was replaced during this step or an earlier one, so there is no
                 result; the env has begun another episode.
         """
-        found: BatchedData | None = None
+        loss: BatchedData | None = None
         if self.lost is None:
-            answer = await self._answer(self._group.step(steps_of(self.env.env_id, response)))
-            found = answer[0]
-            if not found.restarted.any():
-                self._note(answer)
-                return self.last
-            info = found.values()[0].info
-            self.lost = str(info.get("worker_restarted") or info.get("client_lost"))
+            env_id = self.env.env_id
+            step, reply = self._agents.ask(env_id, response_to(env_id, response))
+            try:
+                ret, is_over, loss = await reply
+            except BaseException:
+                if step.is_outstanding:
+                    self._given_up.append(step)
+                raise
+            if loss is None:
+                self.last, self.is_over = ret, is_over
+                return ret
+            self.lost = str(ret.info.get("worker_restarted") or ret.info.get("client_lost"))
             self.is_over = True
         lost = EpisodeLost(
             f"the episode of env {self.env.env_id!r} is lost: its env {self.lost}",
             env_id=self.env.env_id,
         )
-        lost.results = found
+        lost.results = loss
         raise lost
-
-    async def _answer(self, answer: Answer) -> tuple[BatchedData, Any]:
-        task = asyncio.ensure_future(answer)
-        self._tasks.append(task)
-        found = await asyncio.shield(task)
-        self._tasks.remove(task)
-        return found
-
-    def _note(self, found: tuple[BatchedData, Any]) -> None:
-        self.last = only_result(found)
-        self.is_over = bool(all_agents(found[0].done).all())

@@ -36,6 +36,7 @@ __all__ = [
     "default_min_results",
     "ensure_auto_reset",
     "only_result",
+    "response_to",
     "steps_of",
 ]
 
@@ -52,14 +53,19 @@ def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
 
 def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
     """A batch of one step; raises `BadAction` for a response to another env."""
+    return BatchedData([env_id], [response_to(env_id, response)])
+
+
+def response_to(env_id: str, response: PolicyResponse | Any) -> PolicyResponse:
+    """Return the response to an env, given it or an action; `BadAction` if it is another env's."""
     if not isinstance(response, PolicyResponse):
-        response = PolicyResponse(env_id, response)
-    elif response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
+        return PolicyResponse(env_id, response)
+    if response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
         raise BadAction(
             f"the response is for env {response.env_id!r}, and this is the handle of {env_id!r}; "
             "step that env, or the group; nothing was sent"
         )
-    return BatchedData([env_id], [response])
+    return response
 
 
 class AutoResetContext(Scope):

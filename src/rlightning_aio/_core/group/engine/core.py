@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio._core.group.engine.aborts import Aborts
+from rlightning_aio._core.group.engine.agent_steps import AgentSteps
 from rlightning_aio._core.group.engine.arrivals import Arrivals
 from rlightning_aio._core.group.engine.calls import Calls
 from rlightning_aio._core.group.engine.dispatch import Dispatch
@@ -51,7 +52,7 @@ class Core:
 
     Attributes:
         parts, shares_thread: as given; results, intake, waiting, stats, metrics, steps, newest,
-            calls: made of them.
+            agent_steps, calls: made of them.
     """
 
     def __init__(self, parts: Parts, *, zero_copy: bool, shares_thread: bool) -> None:
@@ -79,6 +80,7 @@ class Core:
         dispatch = Dispatch(tables, supervisor, poller, waiting, parts.watcher)
         self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)
         self.newest = self.steps.newest
+        self.agent_steps = AgentSteps(requests, self.steps, waiting)
         self.calls = Calls(tables, dispatch, intake, waiting)
         self._snapshots = Snapshots(
             envs, supervisor, dispatch, self.calls, tables.continuity, waiting

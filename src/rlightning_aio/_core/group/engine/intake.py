@@ -206,7 +206,7 @@ class Intake:
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
     ) -> None:
         """End requests that are no longer in flight, with one error for each caller."""
-        for owner, mine in self._requests.owners(slots).items():
+        for owner, mine in self._requests.owners(slots):
             fault = error_for(mine)
             self._stats.note_failures(mine, fault.outcome.kind)
             self._requests.fail(mine, owner, fault)

@@ -158,8 +158,8 @@ class Steps:
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps, whose results `collect` returns."""
         try:
-            slots, packed = self._write(batch, now)
-            self._send(slots, packed, now, None)
+            slots, packed = self.write(batch, now)
+            self.send(slots, packed, now, None)
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("step_async", now)
@@ -170,12 +170,12 @@ class Steps:
         """Send a batch of steps and wait for all of them."""
         began = now
         try:
-            slots, packed = self._write(batch, now)
+            slots, packed = self.write(batch, now)
             at_once = self._alone is not None and len(slots) > 0
             if at_once and not (self._conditions.unusual or self._continuity.due[0]):
                 self._step_at_once(now)
             else:
-                send = partial(self._send, slots, packed, now)
+                send = partial(self.send, slots, packed, now)
                 ticket, now = yield from self._waiting.ask(now, slots, send)
                 if ticket.errors:
                     self._raise_faults(ticket)
@@ -247,7 +247,7 @@ class Steps:
 
     # -- check, write, send -----------------------------------------------------------
 
-    def _write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
+    def write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Write the actions of a batch into the rows of its envs, all of which are idle.
 
         Args:
@@ -306,7 +306,7 @@ class Steps:
         slots = slots_of(batch, self._group)
         return self._dispatch.distinct(_answered(batch)) if slots is None else slots
 
-    def _send(
+    def send(
         self, slots: NDArray[np.intp], packed: Packed | None, now: float, ticket: Ticket | None
     ) -> None:
         """Number the requests of a batch that is written, and give them to their hosts."""

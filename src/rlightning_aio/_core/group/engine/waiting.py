@@ -14,6 +14,8 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
@@ -22,7 +24,6 @@ from rlightning_aio._core.hosts.spinner import Spinner
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.intake import Intake
@@ -72,6 +73,8 @@ class Waiting:
         self._shares_thread = shares_thread
         # Of the ticket whose call leads; 0 if none does.
         self._leader = 0
+        # Of the call of `serve`, while there is one.
+        self._served: Ticket | None = None
         self.wanted: dict[int, int] = {}
 
     def poll(self) -> None:
@@ -167,9 +170,9 @@ class Waiting:
         elif not self.wanted:
             self._bell.disarm()
 
-    def _park(self, ticket: Ticket) -> Procedure[float]:
+    def _park(self, ticket: Ticket, wanted: int) -> Procedure[float]:
         """Wait for replies to a ticket, or to lead; return the time after that."""
-        wanted, parked = ticket.remaining, self._tickets.parked
+        parked = self._tickets.parked
         self._want(wanted, 1)
         try:
             if self._poller.arm(min(self.wanted)):
@@ -211,22 +214,61 @@ class Waiting:
             if self._supervisor.members.possible:
                 self.poll()  # Replies of members that were read before cause no wake-up.
             while ticket.remaining > 0:
-                if self._leader in (0, ticket.owner) or not self._shares_thread:
-                    self._leader = ticket.owner
-                    now = yield from self.turn(ticket.remaining, None)
-                else:
-                    now = yield from self._park(ticket)
+                now = yield from self._next(ticket, ticket.remaining)
                 self.poll()
         except BaseException:
             self._give_up(ticket)
             raise
         finally:
-            if self._leader == ticket.owner:
-                self._leader = 0
-                if self._tickets.parked:
-                    self._hand_on()
+            self._leave(ticket)
         self._requests.settle(ticket)
         return ticket, now
+
+    def serve(self, now: float, work: Callable[[Ticket, float], bool]) -> Procedure[None]:
+        """Do some work again and again, whenever replies to its requests are ready.
+
+        After an error, it is as with `ask`.
+
+        Args:
+            now: monotonic seconds.
+            work: takes the replies that its ticket has, sends more requests for it, and returns
+                True if any is outstanding. Gets the ticket and the time.
+        """
+        self._served = ticket = self._requests.tickets.open(np.zeros(0, np.intp), apart=True)
+        try:
+            while work(ticket, now):
+                now = yield from self._next(ticket, 1)
+                self.poll()
+        except BaseException:
+            self._give_up(ticket)
+            raise
+        finally:
+            self._served = None
+            self._leave(ticket)
+        self._requests.settle(ticket)
+
+    def wake_server(self) -> None:
+        """Let the call of `serve` work in the next turn."""
+        if self._served is None:
+            return  # It has not begun.
+        if wait := self._tickets.parked.pop(self._served.owner, None):
+            wait.unpark()
+        else:
+            self._watcher.wake()
+
+    def _next(self, ticket: Ticket, wanted: int) -> Procedure[float]:
+        """Wait once for `wanted` replies to a ticket, as the leader or not; return the time."""
+        if self._leader in (0, ticket.owner) or not self._shares_thread:
+            self._leader = ticket.owner
+            return (yield from self.turn(wanted, None))
+        return (yield from self._park(ticket, wanted))
+
+    def _leave(self, ticket: Ticket) -> None:
+        """End the wait of a call, which no longer leads."""
+        if self._leader == ticket.owner:
+            self._leader = 0
+            if self._tickets.parked:
+                self._hand_on()
 
     def begin(
         self, slots: NDArray[np.intp], send: Callable[[Ticket], object], method: str = ""

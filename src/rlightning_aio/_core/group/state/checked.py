@@ -184,6 +184,11 @@ class CheckedRequests(Requests):
         with self.changes((Event.SETTLED, ticket.slots)):
             super().settle(ticket)
 
+    def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
+        ended = ticket.slots[self.state[ticket.slots] != State.BUSY]
+        with self.changes((Event.SETTLED, ended)):
+            return super().settle_ended(ticket)
+
     def give_up(self, ticket: Ticket) -> None:
         slots = ticket.submitted(self.owner)
         slots = slots[self.state[slots] != State.IDLE]  # An interrupt came before it was sent.

@@ -45,6 +45,7 @@ class Ticket(msgspec.Struct):
     Attributes:
         remaining: number of its requests that have not ended.
         method: name of the method that it calls; empty for steps and resets.
+        apart: each of its requests is somebody else's, and has an error of its own.
         errors: the error that a request ended in, by slot.
         values: returned by method calls, by slot.
     """
@@ -53,6 +54,7 @@ class Ticket(msgspec.Struct):
     slots: NDArray[np.intp]
     remaining: int
     method: str
+    apart: bool = False
     errors: dict[int, EnvFault] = {}
     values: dict[int, Any] = {}
 
@@ -95,14 +97,15 @@ class Tickets:
         self.replied: list[int] = []
         self._next_owner = 1
 
-    def open(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
+    def open(self, slots: NDArray[np.intp], *, method: str = "", apart: bool = False) -> Ticket:
         """Open a ticket for a call whose requests are about to be submitted.
 
         Args:
             slots: whose requests.
             method: of the envs that is called; empty for steps and resets.
+            apart: as of `Ticket`.
         """
-        ticket = Ticket(self._next_owner, slots, len(slots), method)
+        ticket = Ticket(self._next_owner, slots, len(slots), method, apart)
         self._next_owner += 1
         self.waiting[ticket.owner] = ticket
         return ticket
@@ -405,7 +408,7 @@ class Requests:
         A call that waits for one gets its error, the collector nothing; the slot is free.
         """
         aborted = self.aborted.among(slots)
-        for owner, mine in self.owners(slots[aborted]).items():
+        for owner, mine in self.owners(slots[aborted]):
             faults = self.aborted.pop(mine)
             if owner > 0:
                 ticket = self.tickets.note_ended(owner, len(mine))
@@ -460,12 +463,19 @@ class Requests:
             self.tickets.note_ended(owner, 1).values[slot] = value
             self.state[slot] = _SPENT_CODE
 
-    def owners(self, slots: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
-        """Return the slots of each owner among `slots`."""
+    def owners(self, slots: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
+        """Return each owner among `slots`, with those that have an error in common."""
         # `np.unique` would import a module at its first call, and after a death there may be no
         # free descriptor to read it.
         found: list[int] = sorted({*self.owner[slots].tolist()})
-        return {owner: slots[self.owner[slots] == owner] for owner in found}
+        each: list[tuple[int, NDArray[np.intp]]] = []
+        for owner in found:
+            mine = slots[self.owner[slots] == owner]
+            if owner > 0 and self.tickets.waiting[owner].apart:
+                each += [(owner, self.alone(slot)) for slot in mine.tolist()]
+            else:
+                each.append((owner, mine))
+        return each
 
     def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
         """End requests of one owner that are no longer in flight, in one error."""
@@ -523,6 +533,18 @@ class Requests:
         self.owner[ticket.slots] = COLLECTOR
         if ticket.method or ticket.errors:
             self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
+
+    def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
+        """Take what has ended out of a ticket that stays open; return the slots of the results."""
+        states = self.state[ticket.slots]
+        is_busy = states == _BUSY_CODE
+        if is_busy.all():
+            return ticket.slots[:0]
+        ended, states = ticket.slots[~is_busy], states[~is_busy]
+        ticket.slots = ticket.slots[is_busy]
+        self.owner[ended] = COLLECTOR
+        self._forget(ended[states == _SPENT_CODE])
+        return ended[states == _READY_CODE]
 
     def give_up(self, ticket: Ticket) -> None:
         """Close a ticket that no longer waits: its steps and resets go to the collector."""

@@ -1,0 +1,187 @@
+"""`AgentSteps`: the steps of agents, each of which is a coroutine that plays one env.
+
+What agents ask for in one turn of the event loop is sent as one batch, and results that are ready
+together are handed out as one. One call waits for all of them, while any agent waits: a step costs
+a row of a batch, and no call of its own.
+"""
+
+from __future__ import annotations
+
+from asyncio import CancelledError
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from rlightning_aio.batch.contents import are_over, lost_rows
+from rlightning_aio.batch.data import BatchedData
+from rlightning_aio.errors import EnvAway
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.steps import Steps
+    from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.state.requests import Requests, Ticket
+    from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["AgentStep", "AgentSteps", "StepEnd"]
+
+
+class StepEnd(NamedTuple):
+    """What a step has led to.
+
+    Attributes:
+        ret: the result.
+        is_over: it ends the episodes of all agents and sub-environments.
+        lost: the batch of that result, if the episode before was lost with its worker or client.
+    """
+
+    ret: EnvRet | MultiAgentEnvRet
+    is_over: bool
+    lost: BatchedData | None
+
+
+class _Reply(Protocol):
+    """A future of an agent that waits for an `StepEnd`; done early if the agent is cancelled."""
+
+    def done(self) -> bool: ...
+
+    def cancel(self) -> Any: ...
+
+    def set_result(self, result: Any, /) -> None: ...
+
+    def set_exception(self, exception: BaseException, /) -> None: ...
+
+
+class AgentStep:
+    """A step that an agent has asked for.
+
+    Args:
+        env_id, response: of it.
+        reply: gets its `StepEnd`, or the error.
+
+    Attributes:
+        env_id, response, reply: as given.
+        is_outstanding: it was sent, and has not ended.
+    """
+
+    __slots__ = ("env_id", "is_outstanding", "reply", "response")
+
+    def __init__(self, env_id: str, response: PolicyResponse, reply: _Reply) -> None:
+        self.env_id = env_id
+        self.response = response
+        self.reply = reply
+        self.is_outstanding = False
+
+
+class AgentSteps:
+    """See the module; the arguments are the group's parts."""
+
+    def __init__(self, requests: Requests, steps: Steps, waiting: Waiting) -> None:
+        self._requests = requests
+        self._steps = steps
+        self._waiting = waiting
+        self._asked: list[AgentStep] = []
+        # Those that are outstanding, by slot.
+        self._sent: dict[int, AgentStep] = {}
+        self._is_served = False
+
+    def ask(self, step: AgentStep) -> bool:
+        """Have a step sent.
+
+        Returns True if the caller is to run `serve`, which begins in a later turn of its loop.
+        """
+        self._asked.append(step)
+        if not self._is_served:
+            self._is_served = True
+            return True
+        if len(self._asked) == 1:
+            self._waiting.wake_server()
+        return False
+
+    def serve(self, now: float) -> Procedure[None]:
+        """Send the steps that agents ask for, and hand out their results, until none is left."""
+        try:
+            yield from self._waiting.serve(now, self._work)
+        except BaseException as error:
+            self.fail(error)
+            if not isinstance(error, Exception):
+                raise
+        self._is_served = False
+
+    def _work(self, ticket: Ticket, now: float) -> bool:
+        """Hand out what is ready and send what is asked for; False if nothing is outstanding."""
+        self._hand_out(ticket)
+        asked = [step for step in self._asked if not step.reply.done()]
+        self._asked.clear()
+        if asked:
+            self._send(asked, ticket, now)
+            self._waiting.poll()  # Some may have ended at once.
+            self._hand_out(ticket)
+        return bool(self._sent or self._asked)
+
+    def _send(self, asked: Sequence[AgentStep], ticket: Ticket, now: float) -> None:
+        """Send steps as one batch; if that can't be, one by one, so that each has its own error."""
+        batch = BatchedData([step.env_id for step in asked], [step.response for step in asked])
+        try:
+            slots, packed = self._steps.write(batch, now)
+            if len(slots) < len(asked):
+                raise EnvAway(
+                    f"the client of env {asked[0].env_id!r} has left since its last result; the "
+                    "first result of one that is back comes through collect_async",
+                    env_id=asked[0].env_id,
+                )
+        except Exception as error:  # noqa: BLE001  # Nothing was sent.
+            if len(asked) == 1:
+                asked[0].reply.set_exception(error)
+            else:
+                for step in asked:
+                    self._send([step], ticket, now)
+            return
+        for slot, step in zip(slots.tolist(), asked, strict=True):
+            self._sent[slot] = step
+            step.is_outstanding = True
+        ticket.slots = np.concatenate((ticket.slots, slots))
+        ticket.remaining += len(slots)
+        self._steps.send(slots, packed, now, ticket)
+
+    def _hand_out(self, ticket: Ticket) -> None:
+        """Give each agent whose request has ended its result or error."""
+        for slot, fault in ticket.errors.items():
+            if not (reply := self._ended(slot)).done():
+                reply.set_exception(fault)
+        ticket.errors.clear()
+        slots = self._requests.settle_ended(ticket)
+        if len(slots):
+            batch, _ = self._steps.hand_out(slots, synchronous=True)
+            self._resolve(batch, slots)
+
+    def _resolve(self, batch: BatchedData, slots: NDArray[np.intp]) -> None:
+        lost = lost_rows(batch)
+        rows = zip(slots.tolist(), batch.values(), are_over(batch), strict=True)
+        for row, (slot, ret, is_over) in enumerate(rows):
+            if not (reply := self._ended(slot)).done():
+                loss = batch.take([row]) if row in lost else None
+                reply.set_result(StepEnd(ret, is_over, loss))
+
+    def _ended(self, slot: int) -> _Reply:
+        step = self._sent.pop(slot)
+        step.is_outstanding = False
+        return step.reply
+
+    def fail(self, error: BaseException) -> None:
+        """Let all agents know of an error of the group, which nobody serves any more."""
+        self._is_served = False
+        steps = [*self._sent.values(), *self._asked]
+        self._sent.clear()
+        self._asked.clear()
+        for step in steps:
+            if step.reply.done():
+                continue
+            if isinstance(error, CancelledError):
+                step.reply.cancel()
+            else:
+                step.reply.set_exception(error)
