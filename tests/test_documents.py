@@ -18,13 +18,24 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
 INTERNAL = {"_core", "batch", "cli", "config", "envs", "protocol", "registry", "sharing"}
-INTERNAL |= {"files", "json_text", "piper", "sealing", "types", "video", "__init__", "__main__"}
+INTERNAL |= {
+    "files",
+    "json_text",
+    "outcomes",
+    "piper",
+    "sealing",
+    "types",
+    "video",
+    "__init__",
+    "__main__",
+}
 # "The words" of ARCHITECTURE.md.
 WORDS = {
     "config",
     "errors",
     "files",
     "json_text",
+    "outcomes",
     "registry",
     "sealing",
     "sharing",

@@ -16,6 +16,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.evaluation import (
     EpisodeRecord,
     EpisodeSpec,
@@ -24,7 +25,7 @@ from rlightning_aio.evaluation import (
     ResultsFile,
     evaluate,
 )
-from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
+from rlightning_aio.evaluation.queue import Attempts
 
 if TYPE_CHECKING:
     from pathlib import Path

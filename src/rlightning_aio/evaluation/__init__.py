@@ -7,11 +7,12 @@ episodes that end first would favour short ones.
 
 from __future__ import annotations
 
+from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.evaluation.episode_video import EpisodeVideo
 from rlightning_aio.evaluation.episodes import Episode, Evaluation
 from rlightning_aio.evaluation.estimates import Estimate
 from rlightning_aio.evaluation.evaluate import evaluate
-from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
+from rlightning_aio.evaluation.records import EpisodeRecord, QueueEvaluation
 from rlightning_aio.evaluation.results_file import ResultsFile
 
 __all__ = [

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable
 
+    from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.collecting.procedure import Procedure
-    from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec
+    from rlightning_aio.evaluation.records import EpisodeRecord
 
 __all__ = ["EpisodeVideo", "Filming"]
 

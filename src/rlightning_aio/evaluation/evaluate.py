@@ -35,9 +35,10 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
+    from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.evaluation.episode_video import EpisodeVideo
-    from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
+    from rlightning_aio.evaluation.records import EpisodeRecord, QueueEvaluation
     from rlightning_aio.evaluation.results_file import ResultsFile
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvMeta

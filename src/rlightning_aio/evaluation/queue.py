@@ -8,11 +8,13 @@ worker is not replaced leaves, and the others play its episodes.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
@@ -21,13 +23,13 @@ from rlightning_aio.evaluation.outcomes import (
     success_of,
     summed_rewards,
 )
-from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
-from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
+from rlightning_aio.evaluation.records import EpisodeRecord, QueueEvaluation
 from rlightning_aio.policies.answers import answers_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting.procedure import Procedure
     from rlightning_aio.evaluation.results_file import ResultsFile
@@ -46,6 +48,14 @@ class QueueRules:
     results: ResultsFile | None
     video: EpisodeVideo | None
     on_episode: Callable[[EpisodeRecord], None] | None
+
+
+@dataclass(slots=True)
+class Attempts:
+    """An episode that is waiting or playing, and why earlier attempts were lost."""
+
+    spec: EpisodeSpec
+    lost: list[str] = field(default_factory=list[str])
 
 
 class QueuePlay:
@@ -72,11 +82,8 @@ class QueuePlay:
         metas: list[EnvMeta] = group.metas
         _check_single(metas)
         self._metas = {meta.env_id: meta for meta in metas}
-        self._entry_of: dict[str, str] = {
-            env_id: worker["entry"]
-            for worker in group.get_workers()
-            for env_id in worker["env_ids"]
-        }
+        self._players = Players(group)
+        self._entry_of = self._players.entry_of
         # Multi-agent envs with different agents don't stack.
         self._separate = len({meta.agents for meta in metas}) > 1
         self._places = {meta.env_id: place for place, meta in enumerate(metas)}
@@ -84,16 +91,13 @@ class QueuePlay:
         self._length = np.zeros(len(metas), np.int64)
         self._endless = EndlessEpisodes()
         self._found = QueueEvaluation()
-        self._task_of = {meta.env_id: meta.task for meta in metas}
-        """The task that each env has, or has begun to switch to."""
-        self._waiting = {entry: WaitingEpisodes() for entry in self._entry_of.values()}
+        self._waiting = {entry: WaitingEpisodes[Attempts]() for entry in self._entry_of.values()}
         self._playing: dict[str, Attempts] = {}
         self._idle = dict.fromkeys(self._metas)
         """Envs that may begin an episode, in order."""
         self._pending: set[str] = set()
         """Envs with a request in flight."""
-        self._gone: set[str] = set()
-        """Envs whose worker is not replaced."""
+        self._gone = self._players.gone
         self._fault: EnvFault | None = None
         """The last one."""
         self._ended = deque[EpisodeRecord]()
@@ -105,7 +109,7 @@ class QueuePlay:
 
     def _fill(self, episodes: Iterable[EpisodeSpec]) -> None:
         """Queue the episodes that were not played, and add the records of the others."""
-        specs = [self._assigned(spec) for spec in episodes]
+        specs = [self._players.assigned(spec) for spec in episodes]
         by_key = {spec.key: spec for spec in specs}
         if len(by_key) < len(specs):
             twice = next(spec for spec in specs if by_key[spec.key] is not spec)
@@ -121,37 +125,6 @@ class QueuePlay:
                     self._waiting[spec.entry].add(attempts)
                 else:
                     self._fail("", attempts)
-
-    def _assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
-        """Return an episode with the entry that plays it."""
-        if not isinstance(cast("Any", spec), EpisodeSpec):
-            raise TypeError(f"episodes should be EpisodeSpec, not {spec!r}")
-        if spec.entry not in ("", *self._waiting):
-            raise ValueError(
-                f"there is no entry {spec.entry!r}; entries are {', '.join(self._waiting)}"
-            )
-        able = {
-            entry: self._metas[env_id]
-            for env_id, entry in self._entry_of.items()
-            if spec.entry in ("", entry) and self._can_play(env_id, spec.task)
-        }
-        exact = {entry: meta for entry, meta in able.items() if meta.task == spec.task}
-        found = exact if len(exact) == 1 else able
-        if not found:
-            raise ValueError(
-                f"no entry{spec.entry and f' {spec.entry!r}'} of this group can play {spec}; its "
-                "env has another task, and doesn't switch tasks"
-            )
-        if len(found) > 1:
-            raise ValueError(f"entries {', '.join(found)} can play {spec}; name one as its entry")
-        ((entry, meta),) = found.items()
-        if meta.switches_task and "task" in (spec.options or {}):
-            raise ValueError(f"the options of an episode must not name a task: {spec}")
-        return replace(spec, entry=entry, task=spec.task or meta.task)
-
-    def _can_play(self, env_id: str, task: str) -> bool:
-        meta = self._metas[env_id]
-        return not task or meta.switches_task or task == meta.task
 
     # -- the loop ---------------------------------------------------------------------
 
@@ -181,31 +154,19 @@ class QueuePlay:
             if env_id is None:
                 return
             del self._idle[env_id]
-            attempts = self._next_for(env_id)
+            attempts = self._players.take(env_id, self._waiting[self._entry_of[env_id]])
             self._playing[env_id] = attempts
-            self._task_of[env_id] = attempts.spec.task
             try:
                 yield from self._begin(env_id, attempts.spec)
             except WorkerDied as fault:
                 self._note_fault(fault)
-
-    def _next_for(self, env_id: str) -> Attempts:
-        entry = self._entry_of[env_id]
-        others = (
-            task
-            for other, task in self._task_of.items()
-            if other not in (env_id, *self._gone) and self._entry_of[other] == entry
-        )
-        return self._waiting[entry].take(self._task_of[env_id], others)
 
     def _begin(self, env_id: str, spec: EpisodeSpec) -> Procedure[None]:
         if self._filming is not None:
             yield from self._filming.begin(env_id, spec)
         place = self._places[env_id]
         self._reward[place] = self._length[place] = 0
-        options = None if spec.options is None else {**spec.options}
-        if self._metas[env_id].switches_task:
-            options = {"task": spec.task, **(options or {})}
+        options = self._players.options(env_id, spec)
         self._group.reset_async(seed={env_id: spec.seed}, options=options, env_ids=[env_id])
         self._pending.add(env_id)
 
@@ -328,8 +289,7 @@ class QueuePlay:
             blamed.update(fault.suspects)
             # The env at fault may be another one, whose own request a replacement answers.
             struck = {*fault.env_ids}
-            for worker in self._group.get_workers():
-                self._gone.update(worker["given_up"])
+            self._players.refresh()
         self._pending -= struck
         # A ready result of an env that is gone can still be collected.
         for env_id in (struck | self._gone) - self._pending:
@@ -341,9 +301,8 @@ class QueuePlay:
 
     def _check_players(self) -> None:
         """Raise the last fault if no env is left for an entry's episodes."""
-        left = {entry for env_id, entry in self._entry_of.items() if env_id not in self._gone}
-        unplayable = any(w and entry not in left for entry, w in self._waiting.items())
-        if unplayable and self._fault is not None:
+        waiting = [entry for entry, episodes in self._waiting.items() if episodes]
+        if self._fault is not None and not self._players.can_play(waiting):
             raise self._fault
 
 

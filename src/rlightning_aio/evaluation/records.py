@@ -1,80 +1,20 @@
-"""`EpisodeSpec`, `EpisodeRecord` and `QueueEvaluation`: an episode to play, its outcome, and all of
-them.
-
-Rule: an episode is identified by its entry, task, seed and options; the env that plays it doesn't
-matter.
-"""
+"""`EpisodeRecord` and `QueueEvaluation`: what became of an episode of a queue, and all of them."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.group.episodes.seeds import checked_seed
+from rlightning_aio.attempts.spec import EpisodeSpec, written
 from rlightning_aio.evaluation.episodes import Figures
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-__all__ = ["EpisodeKey", "EpisodeRecord", "EpisodeSpec", "QueueEvaluation"]
+    from rlightning_aio.attempts.spec import EpisodeKey
 
-EpisodeKey = tuple[str, str, int, str]
-"""Entry, task, seed and options of an episode, the last as JSON."""
-
-
-@dataclass(frozen=True, slots=True)
-class EpisodeSpec:
-    """An episode to play.
-
-    Attributes:
-        task: name of the task; empty for the task of the config entry.
-        seed: of the reset.
-        options: further options of the reset, such as the number of an initial state.
-        entry: name of the config entry; empty for the one whose envs can play the task.
-
-    Raises:
-        ValueError: `seed` is no int from 0 to 2**62 - 1, a name is no str, or `options` are no dict
-            or can't be written as JSON. Numbers and arrays of NumPy can.
-    """
-
-    task: str
-    seed: int
-    options: Mapping[str, Any] | None = None
-    entry: str = ""
-
-    def __post_init__(self) -> None:
-        """Check the fields, and convert the seed, which may be a number of NumPy."""
-        object.__setattr__(self, "seed", checked_seed(self.seed))
-        names: dict[str, Any] = {"task": self.task, "entry": self.entry}
-        for what, name in names.items():
-            if not isinstance(name, str):
-                raise ValueError(f"the {what} of an episode should be a str, not {name!r}")
-        options: Any = self.options
-        if not isinstance(options, Mapping | None):
-            raise ValueError(f"the options of an episode should be a dict, not {options!r}")
-        try:
-            _written(self.options)
-        except (TypeError, ValueError) as error:
-            raise ValueError(
-                f"the options of an episode can't be written as JSON: {error}"
-            ) from error
-
-    @property
-    def key(self) -> EpisodeKey:
-        """Identity of the episode."""
-        return self.entry, self.task, self.seed, _written(self.options)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the episode as a row of JSON."""
-        return {
-            "entry": self.entry,
-            "task": self.task,
-            "seed": self.seed,
-            "options": None if self.options is None else json.loads(_written(self.options)),
-        }
+__all__ = ["EpisodeRecord", "QueueEvaluation"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +45,7 @@ class EpisodeRecord:
     @property
     def key(self) -> EpisodeKey:
         """Identity of the episode; equal to that of its `EpisodeSpec`."""
-        return self.entry, self.task, self.seed, _written(self.options)
+        return self.entry, self.task, self.seed, written(self.options)
 
     def to_json(self) -> dict[str, Any]:
         """Return the record as a row of JSON, with ``return`` for the total reward.
@@ -135,18 +75,6 @@ class EpisodeRecord:
         if total is None and fields["cause"] is None:
             total = math.nan
         return cls(total_reward=total, lost=tuple(lost), **fields)
-
-
-def _written(options: Mapping[str, Any] | None) -> str:
-    if options is None:
-        return ""
-    return json.dumps(options, sort_keys=True, default=_plain, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if not hasattr(value, "tolist"):
-        raise TypeError(f"{value!r} is neither a number, a text, a list nor an array")
-    return value.tolist()
 
 
 @dataclass(slots=True)

@@ -7,8 +7,8 @@ import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio.attempts.file import EpisodeFile
 from rlightning_aio.evaluation.episodes import Episode, check_numbers
-from rlightning_aio.evaluation.results_file import EpisodeFile
 from rlightning_aio.json_text import finite
 
 if TYPE_CHECKING:

@@ -41,11 +41,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.attempts.spec import EpisodeKey
     from rlightning_aio.cli.playing.queue_options import QueueOptions
     from rlightning_aio.cli.policies.policies import Policy
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
-    from rlightning_aio.evaluation.records import EpisodeKey
 
 __all__ = ["QueueOrder", "evaluate_queue"]
 

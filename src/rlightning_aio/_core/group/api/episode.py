@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.aio_driver import AioDriver
     from rlightning_aio._core.group.engine.agent_steps import AgentSteps, StepEnd
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["Agents", "EnvEpisode"]
@@ -63,7 +64,7 @@ class EnvEpisode:
             step was lost.
         is_over: the newest result has ended the episode, of all agents and sub-environments; a
             step limit of `auto_reset` ends it, too, and so does a loss.
-        lost: why the env was replaced or its client is gone, if it was: the episode has no end.
+        lost: the outcome, if the env was replaced or its client is gone: the episode has no end.
     """
 
     last: EnvRet | MultiAgentEnvRet
@@ -79,7 +80,7 @@ class EnvEpisode:
     ) -> None:
         self._group, self._agents, self.env = group, agents, env
         self._seed, self._options = seed, options
-        self.lost: str | None = None
+        self.lost: Outcome | None = None
         self._reset: asyncio.Future[tuple[BatchedData, Any]] | None = None
         # Steps that were cancelled after they had been sent.
         self._given_up: list[AgentStep] = []
@@ -134,11 +135,13 @@ class EnvEpisode:
             if loss is None:
                 self.last, self.is_over = ret, is_over
                 return ret
-            self.lost = str(ret.info.get("worker_restarted") or ret.info.get("client_lost"))
+            outcomes: list[Outcome] = loss.outcome.ravel().tolist()
+            self.lost = outcomes[0]
             self.is_over = True
+        assert self.lost is not None
         lost = EpisodeLost(
-            f"the episode of env {self.env.env_id!r} is lost: its env {self.lost}",
+            f"the episode of env {self.env.env_id!r} is lost: its env {self.lost.cause}",
             env_id=self.env.env_id,
         )
-        lost.results = loss
+        lost.results, lost.outcome = loss, self.lost
         raise lost

@@ -1,0 +1,117 @@
+"""`Players`: which envs of a group can play which episodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+
+from rlightning_aio.attempts.spec import EpisodeSpec
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from rlightning_aio.attempts.waiting import WaitingEpisodes, Waits
+
+__all__ = ["Players"]
+
+W = TypeVar("W", bound="Waits")
+
+
+class _Player(NamedTuple):
+    entry: str
+    task: str = ""
+    switches_task: bool = False
+
+
+class Players:
+    """The envs of an initialised group, and clients that are connected.
+
+    Attributes:
+        entry_of: the name of the config entry of each env.
+        gone: envs whose worker is not replaced.
+    """
+
+    def __init__(self, group: Any) -> None:
+        self._group = group
+        self._metas = {meta.env_id: meta for meta in group.metas}
+        self._players: dict[str, _Player] = {}
+        self._task_of: dict[str, str] = {}  # That each env has, or has begun to switch to.
+        self.entry_of: dict[str, str] = {}
+        self.gone: set[str] = set()
+        self.refresh()
+
+    def refresh(self) -> set[str]:
+        """Look which envs are there now, clients included; return those that are."""
+        present: set[str] = set()
+        for worker in self._group.get_workers():
+            for env_id in worker["env_ids"]:
+                present.add(env_id)
+                if env_id in self._players:
+                    continue
+                meta = self._metas.get(env_id)
+                player = _Player(worker["entry"])
+                if meta is not None:
+                    player = _Player(worker["entry"], meta.task, meta.switches_task)
+                self._players[env_id], self._task_of[env_id] = player, player.task
+                self.entry_of[env_id] = player.entry
+            self.gone.update(worker["given_up"])
+        return present - self.gone
+
+    def assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
+        """Return an episode with the entry that plays it.
+
+        Raises:
+            TypeError: it is no `EpisodeSpec`.
+            ValueError: no entry can play it, or more than one can.
+        """
+        if not isinstance(cast("Any", spec), EpisodeSpec):
+            raise TypeError(f"episodes should be EpisodeSpec, not {spec!r}")
+        entries = dict.fromkeys(self.entry_of.values())
+        if spec.entry not in ("", *entries):
+            raise ValueError(f"there is no entry {spec.entry!r}; entries are {', '.join(entries)}")
+        able = {
+            player.entry: player
+            for player in self._players.values()
+            if spec.entry in ("", player.entry) and _can_play(player, spec.task)
+        }
+        exact = {entry: player for entry, player in able.items() if player.task == spec.task}
+        found = exact if len(exact) == 1 else able
+        if not found:
+            raise ValueError(
+                f"no entry{spec.entry and f' {spec.entry!r}'} of this group can play {spec}; its "
+                "env has another task, and doesn't switch tasks"
+            )
+        if len(found) > 1:
+            raise ValueError(f"entries {', '.join(found)} can play {spec}; name one as its entry")
+        ((entry, player),) = found.items()
+        if player.switches_task and "task" in (spec.options or {}):
+            raise ValueError(f"the options of an episode must not name a task: {spec}")
+        return replace(spec, entry=entry, task=spec.task or player.task)
+
+    def take(self, env_id: str, waiting: WaitingEpisodes[W]) -> W:
+        """Remove the episode of its entry that an env is to play, which it has begun then."""
+        entry = self.entry_of[env_id]
+        others = (
+            task
+            for other, task in self._task_of.items()
+            if other not in (env_id, *self.gone) and self.entry_of[other] == entry
+        )
+        episode = waiting.take(self._task_of[env_id], others)
+        self._task_of[env_id] = episode.spec.task
+        return episode
+
+    def options(self, env_id: str, spec: EpisodeSpec) -> dict[str, Any] | None:
+        """The options of the reset with which an env begins an episode."""
+        options = None if spec.options is None else {**spec.options}
+        if self._players[env_id].switches_task:
+            return {"task": spec.task, **(options or {})}
+        return options
+
+    def can_play(self, entries: Iterable[str]) -> bool:
+        """Return True unless all envs of one of these entries are gone."""
+        left = {entry for env_id, entry in self.entry_of.items() if env_id not in self.gone}
+        return left.issuperset(entries)
+
+
+def _can_play(player: _Player, task: str) -> bool:
+    return not task or player.switches_task or task == player.task

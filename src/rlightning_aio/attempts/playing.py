@@ -1,0 +1,337 @@
+"""`play`: groups of attempts at tasks, by agents that are coroutines.
+
+Rule: an engine of its own task keeps the envs busy, however long its caller takes for a group of
+attempts; no more tasks are begun while as many attempts wait for the caller as may play at once.
+Every try of an attempt is a task. It ends within a second of its cancellation, whatever the agent
+does, and its env is idle or replaced then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio.attempts.episode import AttemptEpisode
+from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.records import Attempt, AttemptGroup
+from rlightning_aio.attempts.rules import Rules
+from rlightning_aio.attempts.tasks import TaskSource
+from rlightning_aio.attempts.tries import Try
+from rlightning_aio.attempts.waiting import WaitingEpisodes
+from rlightning_aio.errors import EnvBusy, WorkerDied
+from rlightning_aio.outcomes import Outcome
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterable, Iterable
+
+    from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.attempts.records import AttemptsFile
+    from rlightning_aio.attempts.spec import EpisodeSpec
+    from rlightning_aio.attempts.tries import Agent
+
+__all__ = ["play"]
+
+_LOOK_SECONDS: Final = 0.2
+"""Between looks for clients of env_servers that have come."""
+_SURPLUS: Final = "enough other attempts at its task have ended"
+
+
+async def play(
+    group: EnvGroup,
+    tasks: Iterable[Any] | AsyncIterable[Any],
+    agent: Agent,
+    size: int = 1,
+    rules: Rules | None = None,
+    results: AttemptsFile | None = None,
+) -> AsyncGenerator[AttemptGroup]:
+    """Have an agent attempt each task several times; yield the attempts at a task when it is done.
+
+    ::
+
+        async def agent(episode):
+            while not episode.is_over:
+                reply = await model(episode.last.observation)
+                await episode.step(reply.message, tokens=reply.token_ids)
+
+        async for attempts in play(group, tasks, agent, size=8):
+            rewards = attempts.rewards
+
+    Args:
+        group: initialised, with nothing `pending`; of any placement. Each env plays one attempt at
+            a time, also one with sub-environments.
+        tasks: `EpisodeSpec`, or tuples (task, seed) or (task, seed, options); an iterable or an
+            async iterable, read only as envs become free.
+        agent: a coroutine function, which gets an `AttemptEpisode`.
+        size: number of attempts at each task.
+        rules: see `Rules`.
+        results: a file to which attempts are added. Those that it has are not played again: tasks
+            that are done there are left out, others come with attempts from the file, without
+            their observations.
+
+    Groups come as they are done. When the iterator ends, is closed (`contextlib.aclosing`) or is
+    cancelled, every env is idle or is being replaced, and no task is left.
+
+    Raises:
+        EnvBusy: an env has a request in flight, or a result that was not collected.
+        ValueError: `size` is below 1, or no entry can play a task, or more than one can.
+        WorkerDied, EnvHung: all envs that could play a task are gone for good.
+    """
+    if size < 1:
+        raise ValueError(f"size must be at least 1, not {size!r}")
+    if busy := group.pending:
+        raise EnvBusy(f"{busy[0]!r} has a request whose result was not collected; collect it")
+    engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
+    running = asyncio.create_task(engine.run())
+    try:
+        while True:
+            while engine.done:
+                yield engine.take()
+            if running.done():
+                running.result()  # Raises its error, if it has one.
+                return
+            await engine.news.wait()
+            engine.news.clear()
+    finally:
+        running.cancel()
+        # However often this is cancelled, the envs are idle in the end.
+        await asyncio.wait({running})
+        _ = running.cancelled() or running.exception()
+
+
+@dataclass(eq=False, slots=True)
+class _Task:
+    """A task in progress.
+
+    Attributes:
+        attempts: that have ended, by index.
+        is_settled: its group was handed over.
+    """
+
+    spec: EpisodeSpec
+    attempts: dict[int, Attempt] = field(default_factory=dict[int, Attempt])
+    is_settled: bool = False
+
+
+@dataclass(eq=False, slots=True)
+class _Job:
+    """An attempt that waits or plays.
+
+    Attributes:
+        since: when it began to wait, in monotonic seconds.
+        failures: outcomes of its tries so far; counted: how many of them use up a retry.
+    """
+
+    task: _Task
+    index: int
+    since: float = field(default_factory=time.monotonic)
+    failures: list[Outcome] = field(default_factory=list[Outcome])
+    counted: int = 0
+
+    @property
+    def spec(self) -> EpisodeSpec:
+        return self.task.spec
+
+
+class _Engine:
+    """The attempts in progress.
+
+    Attributes:
+        done: groups that the caller has not taken.
+        news: is set when there is one, or nothing more will come.
+    """
+
+    def __init__(
+        self,
+        group: EnvGroup,
+        source: TaskSource,
+        agent: Agent,
+        size: int,
+        rules: Rules,
+        results: AttemptsFile | None,
+    ) -> None:
+        self._group, self._source, self._agent = group, source, agent
+        self._size, self._rules, self._results = size, rules, results
+        self._players = Players(group)
+        self._free = dict.fromkeys(self._players.entry_of)
+        """Idle envs, the one that has been idle for longest first."""
+        self._waiting: dict[str, WaitingEpisodes[_Job]] = {}
+        self._playing: dict[asyncio.Task[Attempt], tuple[_Job, Try]] = {}
+        self._ended = deque[asyncio.Task[Attempt]]()
+        self._before = {} if results is None else results.by_task()
+        self._repeats = Counter[Any]()
+        self._fault: WorkerDied | None = None
+        self._wake = asyncio.Event()
+        self.done = deque[AttemptGroup]()
+        self.news = asyncio.Event()
+
+    def take(self) -> AttemptGroup:
+        """Hand over a group of attempts; others may take its place."""
+        self._wake.set()
+        return self.done.popleft()
+
+    async def run(self) -> None:
+        """Play all tasks."""
+        try:
+            while True:
+                self._wake.clear()
+                while self._ended:
+                    self._end(self._ended.popleft())
+                self._begin()
+                lacking = self._entries_without_env()
+                if not self._playing and not lacking and self._source.is_at_end:
+                    return
+                try:
+                    async with asyncio.timeout(_LOOK_SECONDS if lacking else None):
+                        await self._wake.wait()
+                except TimeoutError:
+                    self._look()
+        finally:
+            self._source.close()
+            for _, one in self._playing.values():
+                one.stop("the iterator of play() was closed")
+            while left := {task for task in self._playing if not task.done()}:
+                # The tries end by themselves, also if this is cancelled once more.
+                with contextlib.suppress(asyncio.CancelledError):
+                    await asyncio.wait(left)
+            self.news.set()
+
+    # -- what begins ------------------------------------------------------------------
+
+    @property
+    def _most(self) -> int:
+        """Number of attempts that may play at once."""
+        envs = len(self._free) + len(self._playing)
+        return min(envs, self._rules.max_concurrency or envs)
+
+    def _begin(self) -> None:
+        """Begin attempts on idle envs, and read more tasks while envs are idle."""
+        while True:
+            while len(self._playing) < self._most and (env_id := self._next_env()):
+                self._start(env_id)
+            waiting = sum(map(len, self._waiting.values()))
+            room = max(self._most, 1)
+            is_full = len(self.done) * self._size >= room or waiting >= room
+            if is_full or len(self._playing) >= room or not self._free:
+                return
+            spec = self._source.next(self._wake)
+            if spec is None:
+                return
+            self._add(self._players.assigned(spec))
+
+    def _next_env(self) -> str | None:
+        entry_of = self._players.entry_of
+        return next((id_ for id_ in self._free if self._waiting.get(entry_of[id_])), None)
+
+    def _add(self, spec: EpisodeSpec) -> None:
+        """Queue the attempts at a task that are not in the file."""
+        repeat = self._repeats[spec.key]
+        self._repeats[spec.key] += 1
+        task = _Task(spec)
+        for index, found in self._before.get(spec.key, {}).items():
+            if index < self._size and repeat < len(found):
+                task.attempts[index] = found[repeat]
+        if self._is_done(task):
+            return
+        waiting = self._waiting.setdefault(spec.entry, WaitingEpisodes[_Job]())
+        for index in range(self._size):
+            if index not in task.attempts:
+                waiting.add(_Job(task, index))
+
+    def _start(self, env_id: str) -> None:
+        del self._free[env_id]
+        job = self._players.take(env_id, self._waiting[self._players.entry_of[env_id]])
+        options = self._players.options(env_id, job.spec)
+        seed = self._rules.seed(job.spec, job.index)
+        view = AttemptEpisode(self._group.episode(env_id, seed, options), job.spec, job.index)
+        one = Try(view, self._agent, self._rules, time.monotonic() - job.since)
+        task = asyncio.create_task(one.run())
+        self._playing[task] = job, one
+        task.add_done_callback(self._note_end)
+
+    def _note_end(self, task: asyncio.Task[Attempt]) -> None:
+        self._ended.append(task)
+        self._wake.set()
+
+    # -- what ends --------------------------------------------------------------------
+
+    def _end(self, ended: asyncio.Task[Attempt]) -> None:
+        """Note the end of a try; its env is idle."""
+        job, one = self._playing.pop(ended)
+        attempt = ended.result()
+        outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
+        if isinstance(one.error, WorkerDied):
+            self._fault = one.error
+        if outcome.is_failure:
+            present = self._players.refresh()
+            if one.env_id in present:
+                self._free[one.env_id] = None
+        else:
+            self._free[one.env_id] = None
+        if job.task.is_settled:
+            return
+        is_bystander = outcome.kind == "env_died" and outcome.blame == "infrastructure"
+        if self._rules.retried(outcome) and (is_bystander or job.counted < self._rules.retries):
+            job.failures.append(outcome)
+            job.counted += not is_bystander
+            job.since = time.monotonic()
+            self._waiting[job.spec.entry].add(job)
+            return
+        attempt.failures = tuple(job.failures)
+        job.task.attempts[job.index] = attempt
+        if self._results is not None:
+            self._results.add(attempt)
+        if self._is_done(job.task):
+            self._settle(job.task)
+
+    def _is_done(self, task: _Task) -> bool:
+        if len(task.attempts) == self._size:
+            return True
+        first = self._rules.first
+        return first is not None and _whole(task) >= first
+
+    def _settle(self, task: _Task) -> None:
+        """Hand over the attempts at a task, and cancel those that are left of it."""
+        task.is_settled = True
+        left: list[_Job] = []
+        for job, one in self._playing.values():
+            if job.task is task:
+                one.stop(_SURPLUS)
+                left.append(job)
+        waiting = self._waiting[task.spec.entry]
+        left += waiting.remove(lambda job: job.task is task)
+        for job in left:
+            cancelled = Outcome("cancelled", "caller", _SURPLUS, attempt=len(job.failures))
+            task.attempts[job.index] = Attempt(
+                task.spec, job.index, cancelled, failures=tuple(job.failures)
+            )
+        attempts = [task.attempts[index] for index in sorted(task.attempts)]
+        is_complete = _whole(task) >= self._rules.needed(self._size)
+        self.done.append(AttemptGroup(task.spec, attempts, is_complete))
+        self.news.set()
+
+    # -- envs that are not there ------------------------------------------------------
+
+    def _entries_without_env(self) -> list[str]:
+        """Entries whose attempts wait although nothing plays; raise if that is for good."""
+        waiting = [entry for entry, jobs in self._waiting.items() if jobs]
+        if self._fault is not None and not self._players.can_play(waiting):
+            raise self._fault
+        entry_of = self._players.entry_of
+        there = {entry_of[id_] for id_ in self._free}
+        there |= {job.spec.entry for job, _ in self._playing.values()} if waiting else set[str]()
+        return [entry for entry in waiting if entry not in there]
+
+    def _look(self) -> None:
+        """Look for clients that have come, or come back."""
+        busy = {one.env_id for _, one in self._playing.values()}
+        for env_id in self._players.refresh() - busy:
+            self._free.setdefault(env_id)
+
+
+def _whole(task: _Task) -> int:
+    """Number of attempts that have not failed."""
+    return sum(not attempt.outcome.is_failure for attempt in task.attempts.values())

@@ -1,0 +1,206 @@
+"""`Try`: one try of an attempt on one env, to an outcome, whatever agent and env do."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+
+import numpy as np
+
+from rlightning_aio.attempts.records import Attempt
+from rlightning_aio.errors import EnvFault
+from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from rlightning_aio.attempts.episode import AttemptEpisode
+    from rlightning_aio.attempts.rules import Rules
+
+__all__ = ["Agent", "Try"]
+
+Agent: TypeAlias = "Callable[[AttemptEpisode], Awaitable[Any]]"
+"""Plays one attempt."""
+
+_PATIENCE_SECONDS: Final = 0.5
+"""How long a cancelled agent may take to end, before its env goes on without it."""
+_log = logging.getLogger("rlightning_aio")
+
+
+class Try:
+    """See the module.
+
+    Args:
+        view: what the agent gets, on an idle env.
+        agent: plays it.
+        rules: of the attempts.
+        waited: seconds until an env was free.
+
+    Attributes:
+        error: what the agent or the reset has raised, if they have.
+    """
+
+    def __init__(self, view: AttemptEpisode, agent: Agent, rules: Rules, waited: float) -> None:
+        self._view, self._agent, self._rules, self._waited = view, agent, rules, waited
+        self._stopped: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self.error: BaseException | None = None
+
+    @property
+    def env_id(self) -> str:
+        """Id of its env."""
+        return self._view.env_id
+
+    def stop(self, why: str) -> None:
+        """End it soon, as cancelled."""
+        if not self._stopped.done():
+            self._stopped.set_result(why)
+
+    async def run(self) -> Attempt:
+        """Play; the env is idle after that.
+
+        Raises:
+            RLightningError, TypeError, ValueError: the env can't be reset like this at all.
+        """
+        began = time.monotonic()
+        limit = self._rules.attempt_timeout
+        view, result = self._view, None
+        begin = asyncio.ensure_future(view.begin())
+        await self._either(begin, limit)
+        if not begin.done():
+            begin.cancel()
+            await _surely({begin})
+            ended = self._cut_short(has_begun=False)
+        elif (error := begin.exception()) is not None:
+            self.error = error
+            if not isinstance(error, EnvFault):
+                raise error
+            ended = error.outcome
+        elif view.fault is not None:
+            ended = view.fault
+            await self._leave()
+        else:
+            playing = asyncio.ensure_future(_awaited(self._agent(view)))
+            await self._either(playing, limit and limit - (time.monotonic() - began))
+            ended = self._end_of(playing)
+            if not playing.done():
+                playing.cancel()
+                await _surely({playing}, _PATIENCE_SECONDS)
+                self._abandon(playing)
+            elif not ended.is_failure:
+                result = playing.result()
+            await self._leave()
+        return self._record(ended, result, time.monotonic() - began)
+
+    async def _either(self, task: asyncio.Task[Any], limit: float | None) -> None:
+        """Wait for a task, until this try is stopped, or for `limit` seconds."""
+        deadline = None if limit is None else time.monotonic() + limit
+        while True:
+            left = None if deadline is None else max(deadline - time.monotonic(), 0)
+            waits = asyncio.FIRST_COMPLETED
+            try:
+                await asyncio.wait({task, self._stopped}, timeout=left, return_when=waits)
+            except asyncio.CancelledError:
+                self.stop("the program is ending")
+            else:
+                return
+
+    async def _leave(self) -> None:
+        self._view.end("is over")
+        await _surely({asyncio.ensure_future(self._view.leave())})
+
+    def _abandon(self, playing: asyncio.Task[Any]) -> None:
+        if playing.done():
+            _ = playing.cancelled() or playing.exception()
+            return
+        _log.warning(
+            "the agent of env %r goes on although it was cancelled; its env is given to others: "
+            "let CancelledError through",
+            self.env_id,
+        )
+        playing.add_done_callback(lambda task: task.cancelled() or task.exception())
+
+    # -- outcomes ---------------------------------------------------------------------
+
+    def _cut_short(self, *, has_begun: bool) -> Outcome:
+        """The outcome of a try that did not end by itself."""
+        if self._stopped.done():
+            return Outcome("cancelled", "caller", self._stopped.result(), self.env_id)
+        cause = f"its {self._rules.attempt_timeout:g} s were over"
+        if not has_begun:
+            return Outcome("timed_out", "env", f"{cause} before its reset was done", self.env_id)
+        if self._rules.on_timeout == "end":
+            return Outcome("truncated", "policy", cause, self.env_id)
+        return Outcome("timed_out", "either", cause, self.env_id)
+
+    def _end_of(self, playing: asyncio.Task[Any]) -> Outcome:
+        if not playing.done():
+            return self._cut_short(has_begun=True)
+        if playing.cancelled():
+            self.error = asyncio.CancelledError("the agent was cancelled by something else")
+        else:
+            self.error = playing.exception()
+        if self._view.fault is not None:
+            return self._view.fault
+        if self.error is not None:
+            return self._raised(self.error)
+        last, env_id = self._view.last, self.env_id
+        reported: Any = last.info.get("outcome")
+        if isinstance(reported, Outcome):
+            return reported
+        if not self._view.is_over:
+            return Outcome("truncated", "policy", "the agent stopped before its end", env_id)
+        ends: Any = last.last_terminated
+        if isinstance(ends, dict):
+            ends = [*cast("dict[str, Any]", ends).values()]
+        if np.all(ends):
+            return Outcome("terminated", "policy", "its env ended it", env_id)
+        return Outcome("truncated", "policy", "its env or the step limit cut it", env_id)
+
+    def _raised(self, error: BaseException) -> Outcome:
+        """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
+        blame: Any = getattr(error, "blame", None)
+        if blame not in BLAMES:
+            blame = "infrastructure" if isinstance(error, OSError | TimeoutError) else "caller"
+        if blame == "caller":
+            _log.warning("the agent of env %r has raised", self.env_id, exc_info=error)
+        return Outcome("agent_raised", blame, repr(error), self.env_id)
+
+    def _record(self, ended: Outcome, result: Any, seconds: float) -> Attempt:
+        view = self._view
+        agent = max(seconds - view.seconds, 0.0)
+        spent = TimeSpent(env=view.seconds, agent=agent, waiting=self._waited)
+        last = None if view.first is None else view.last.observation
+        return Attempt(
+            view.spec,
+            view.index,
+            _with_time(ended, spent),
+            reward=None if ended.is_failure else sum(view.rewards),
+            rewards=view.rewards,
+            columns=view.columns,
+            first=view.first,
+            last=last,
+            result=result,
+        )
+
+
+def _with_time(ended: Outcome, spent: TimeSpent) -> Outcome:
+    return Outcome(ended.kind, ended.blame, ended.cause, ended.env_id, seconds=spent)
+
+
+async def _awaited(answer: Awaitable[Any]) -> Any:
+    return await answer
+
+
+async def _surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:
+    """Wait for tasks, also if the caller is cancelled meanwhile."""
+    deadline = None if seconds is None else time.monotonic() + seconds
+    while left := {task for task in tasks if not task.done()}:
+        limit = None if deadline is None else deadline - time.monotonic()
+        if limit is not None and limit <= 0:
+            return
+        try:
+            await asyncio.wait(left, timeout=limit)
+        except asyncio.CancelledError:
+            continue  # It is on its way to the end already.

@@ -1,0 +1,388 @@
+"""Groups of attempts: retries, completeness, time limits, cancellation, resumption."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import json
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from attempts.rooms import AwaitedRoom, Room
+
+import rlightning_aio as rl
+from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, Rules, play
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from rlightning_aio.attempts import AttemptEpisode, AttemptGroup
+
+PLACES: dict[str, dict[str, Any]] = {
+    "loop": {"task": AwaitedRoom, "placement": "loop"},
+    "awaitable in workers": {"task": AwaitedRoom, "envs_per_process": 2},
+    "workers": {"task": Room, "envs_per_process": 1},
+    "shared workers": {"task": Room, "envs_per_process": 2},
+    "inline": {"task": Room, "placement": "inline"},
+}
+
+
+@pytest.fixture(params=PLACES)
+def place(request: pytest.FixtureRequest) -> dict[str, Any]:
+    return PLACES[request.param]
+
+
+def rooms(place: dict[str, Any], num_workers: int = 4, **fields: Any) -> rl.EnvGroup:
+    return rl.build_env_group(name="room", num_workers=num_workers, **place, **fields)
+
+
+def tasks(count: int, **options: Any) -> list[EpisodeSpec]:
+    return [EpisodeSpec("", seed, options or None) for seed in range(count)]
+
+
+async def earner(episode: AttemptEpisode) -> str:
+    """Earn the seed in each step."""
+    while not episode.is_over:
+        await episode.step(episode.last.observation["seed"], tokens=[episode.index])
+    return f"room {episode.spec.seed}"
+
+
+async def played(*args: Any, **kwargs: Any) -> list[AttemptGroup]:
+    return [found async for found in play(*args, **kwargs)]
+
+
+async def test_each_task_is_attempted_as_often_as_asked(place: dict[str, Any]) -> None:
+    async with rooms(place) as group:
+        found = await played(group, tasks(6), earner, size=3)
+        assert group.pending == []
+    assert sorted(attempts.spec.seed for attempts in found) == [*range(6)]
+    for attempts in found:
+        seed = attempts.spec.seed
+        assert attempts.is_complete
+        assert [attempt.index for attempt in attempts] == [0, 1, 2]
+        assert attempts.rewards == [5.0 * seed] * 3
+        for attempt in attempts:
+            assert (attempt.outcome.kind, attempt.outcome.blame) == ("terminated", "policy")
+            assert attempt.columns == {"action": [seed] * 5, "tokens": [[attempt.index]] * 5}
+            assert (attempt.length, attempt.result) == (5, f"room {seed}")
+            assert (attempt.first["steps"], attempt.last["steps"]) == (0, 5)
+            assert attempt.env_id in group.env_ids
+
+
+async def test_distinct_seeds_differ_and_repeat() -> None:
+    async def seen(episode: AttemptEpisode) -> int:
+        return episode.last.observation["seed"]
+
+    async with rooms(PLACES["loop"]) as group:
+        rules = Rules(seeds="distinct")
+        first, second = [await played(group, tasks(2), seen, 4, rules) for _ in range(2)]
+    seeds = {spec: [a.result for a in g] for g in first for spec in [g.spec.seed]}
+    assert seeds == {g.spec.seed: [a.result for a in g] for g in second}
+    assert len({*itertools.chain(*seeds.values())}) == 8
+
+
+@pytest.mark.parametrize(
+    ("deed", "kind", "blame"),
+    [("raise", "env_raised", "either"), ("hang", "env_hung", "either"), ("die", "env_died", "env")],
+)
+async def test_a_failed_attempt_is_tried_again(
+    place: dict[str, Any], deed: str, kind: str, blame: str
+) -> None:
+    """In the end the group is complete, and the record says what failed before."""
+    here = place.get("placement") in ("loop", "inline")
+    if (deed == "die" and here) or (deed == "hang" and place.get("placement") == "inline"):
+        pytest.skip("it would be the end of the test")
+    tries = Counter[tuple[int, int]]()
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(1)
+        which = episode.spec.seed, episode.index
+        tries[which] += 1
+        if tries[which] == 1 and episode.index == 0:
+            await episode.step(deed)
+        await earner(episode)
+
+    limit: dict[str, Any] = {} if deed == "raise" else {"step_timeout": 0.5}
+    async with rooms(place, **limit) as group:
+        found = await played(group, tasks(3), agent, size=2)
+    assert len(found) == 3
+    for attempts in found:
+        assert attempts.is_complete
+        assert attempts.rewards == [1 + 4.0 * attempts.spec.seed] * 2
+        failed = [outcome for outcome in attempts[0].failures if outcome.kind == kind]
+        assert (failed[0].blame, failed[0].env_id[:4]) == (blame, "room")
+        bystanders = {*attempts[0].failures, *attempts[1].failures} - {*failed}
+        assert all(one.blame == "infrastructure" for one in bystanders)
+        assert attempts[0].outcome.attempt == len(attempts[0].failures)
+
+
+async def test_a_failure_has_no_reward(place: dict[str, Any]) -> None:
+    """However much it has earned, and whatever its agent returns."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        await episode.step(7)
+        with contextlib.suppress(rl.EnvRaised):
+            await episode.step("raise")
+        return "I have won"
+
+    async with rooms(place) as group:
+        (attempts,) = await played(group, tasks(1), agent, 2, Rules(retries=1))
+    assert not attempts.is_complete
+    for attempt in attempts:
+        assert (attempt.reward, attempt.result) == (None, None)
+        assert attempt.rewards == [7.0]
+        assert attempt.outcome.kind == "env_raised"
+        assert [one.kind for one in attempt.failures] == ["env_raised"]
+    assert attempts.rewards == []
+
+
+async def test_what_the_policy_is_to_blame_for_is_not_tried_again(place: dict[str, Any]) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step("blame")
+
+    async with rooms(place) as group:
+        ((attempt,),) = await played(group, tasks(1), agent)
+    assert (attempt.outcome.kind, attempt.outcome.blame) == ("env_raised", "policy")
+    assert attempt.failures == ()
+
+
+async def test_a_reset_that_fails_has_not_started(place: dict[str, Any]) -> None:
+    async with rooms(place) as group:
+        ((attempt,),) = await played(group, tasks(1, reset="raise"), earner)
+    assert (attempt.outcome.kind, attempt.outcome.blame) == ("not_started", "env")
+    assert (attempt.reward, attempt.first, len(attempt.failures)) == (None, None, 2)
+
+
+@pytest.mark.parametrize(
+    ("error", "blame"),
+    [
+        (ConnectionError("the model is away"), "infrastructure"),
+        (KeyError("a bug"), "caller"),
+        (rl.EnvError("its reply can't be read", blame="policy"), "policy"),
+    ],
+)
+async def test_an_agent_that_raises(error: Exception, blame: str) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(1)
+        raise error
+
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent, 1, Rules(retries=1))
+    assert (attempt.outcome.kind, attempt.outcome.blame) == ("agent_raised", blame)
+    assert len(attempt.failures) == (blame == "infrastructure")
+
+
+@pytest.mark.parametrize("on_timeout", ["fail", "end"])
+async def test_an_agent_that_takes_too_long(place: dict[str, Any], on_timeout: Any) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(3)
+        await asyncio.sleep(3600)
+
+    async with rooms(place) as group:
+        rules = Rules(attempt_timeout=1.5, on_timeout=on_timeout, retries=0)
+        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+    if on_timeout == "end":
+        assert (attempt.outcome.kind, attempt.reward) == ("truncated", 3.0)
+    else:
+        assert (attempt.outcome.kind, attempt.outcome.blame) == ("timed_out", "either")
+        assert attempt.reward is None
+    assert attempt.outcome.seconds.agent > 0.5
+
+
+async def test_an_agent_that_ignores_its_end_does_not_keep_its_env() -> None:
+    """It can't step it any more; the next attempt has it."""
+    go_on, refused = asyncio.Event(), asyncio.Event()
+
+    async def agent(episode: AttemptEpisode) -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.Event().wait()
+        await go_on.wait()
+        with pytest.raises(rl.RLightningError, match="is over"):
+            await episode.step(1)
+        refused.set()
+
+    async with rooms(PLACES["loop"], num_workers=1) as group:
+        rules = Rules(attempt_timeout=0.2, retries=0)
+        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+        assert attempt.outcome.kind == "timed_out"
+        ((attempt,),) = await played(group, tasks(1), earner)
+        assert attempt.outcome.kind == "terminated"
+        go_on.set()
+        await refused.wait()
+
+
+async def test_the_surplus_is_cancelled_into_the_env(place: dict[str, Any]) -> None:
+    """The first two of four make a group; the others' steps end with it."""
+    if place is PLACES["inline"] or place is PLACES["shared workers"]:
+        pytest.skip("a step that hangs keeps its neighbours waiting")
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if episode.index % 2:
+            await episode.step("hang")
+        await earner(episode)
+
+    async with rooms(place) as group:
+        found = await asyncio.wait_for(played(group, tasks(4), agent, 4, Rules(first=2)), 60)
+        assert group.pending == []
+    for attempts in found:
+        assert attempts.is_complete
+        kinds = [attempt.outcome.kind for attempt in attempts]
+        assert kinds == ["terminated", "cancelled"] * 2
+        assert [attempt.reward is None for attempt in attempts] == [False, True] * 2
+
+
+async def test_at_least_as_many(place: dict[str, Any]) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        if episode.index < episode.spec.seed:
+            await episode.step("blame")
+        await earner(episode)
+
+    async with rooms(place) as group:
+        found = await played(group, tasks(4), agent, 3, Rules(at_least=2))
+    complete = {attempts.spec.seed: attempts.is_complete for attempts in found}
+    assert complete == {0: True, 1: True, 2: False, 3: False}
+    assert all(len(attempts) == 3 for attempts in found)
+
+
+async def test_tasks_are_read_as_envs_become_free() -> None:
+    """Not many more than can play, however long the caller takes."""
+    read = 0
+
+    async def endless() -> AsyncIterator[Any]:
+        nonlocal read
+        for seed in itertools.count():
+            read += 1
+            yield "", seed
+
+    async with rooms(PLACES["loop"], num_workers=4) as group:
+        async with contextlib.aclosing(play(group, endless(), earner, size=2)) as groups:
+            async for _ in groups:
+                await asyncio.sleep(0.2)
+                break
+            assert 1 <= read <= 8
+        assert group.pending == []
+    assert len(asyncio.all_tasks()) == 1
+
+
+async def test_no_more_play_at_once_than_allowed() -> None:
+    playing = most = 0
+
+    async def agent(episode: AttemptEpisode) -> None:
+        nonlocal playing, most
+        playing += 1
+        most = max(most, playing)
+        await earner(episode)
+        playing -= 1
+
+    async with rooms(PLACES["loop"], num_workers=8) as group:
+        await played(group, tasks(5), agent, 4, Rules(max_concurrency=3))
+    assert most == 3
+
+
+@pytest.mark.parametrize("how", ["close", "cancel"])
+async def test_nothing_is_left_of_an_iterator_that_is_left(place: dict[str, Any], how: str) -> None:
+    if place.get("placement") == "inline":
+        pytest.skip("a step that hangs here is the end of the test")
+    hanging = asyncio.Event()
+
+    async def agent(episode: AttemptEpisode) -> None:
+        asyncio.get_running_loop().call_later(0.05, hanging.set)
+        await episode.step("hang")
+
+    async with rooms(place) as group:
+        groups = play(group, tasks(9), agent, size=2)
+        waiting = asyncio.ensure_future(anext(groups))
+        await hanging.wait()
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        if how == "close":
+            await groups.aclose()
+        assert group.pending == []
+        assert len(await played(group, tasks(3), earner)) == 3
+
+
+async def test_a_group_without_envs_that_are_left_raises() -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step("die")
+
+    async with rooms(PLACES["workers"], num_workers=2, on_worker_death="raise") as group:
+        with pytest.raises(rl.WorkerDied):
+            await played(group, tasks(3), agent, 2)
+
+
+async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
+    async def agent(episode: AttemptEpisode) -> int:
+        return await episode.call("tool", 21)
+
+    async with rooms(place) as group:
+        ((attempt,),) = await played(group, tasks(1), agent)
+    assert attempt.result == 42
+    assert attempt.outcome.kind == "truncated"
+    assert "stopped" in attempt.outcome.cause
+
+
+async def test_it_continues_from_a_file(tmp_path: Path) -> None:
+    """Each attempt is in the file once, and is played once."""
+    path = tmp_path / "attempts.jsonl"
+    count = 0
+
+    async def agent(episode: AttemptEpisode) -> None:
+        nonlocal count
+        count += 1
+        await earner(episode)
+
+    async with rooms(PLACES["loop"], num_workers=2) as group:
+        with AttemptsFile(path, {"model": "m"}) as results:
+            groups = play(group, tasks(6), agent, size=2, results=results)
+            async with contextlib.aclosing(groups):
+                async for _ in groups:
+                    if len(results.played) >= 5:
+                        break
+        before = count
+        with AttemptsFile(path, {"model": "m"}) as results:
+            known = len(results.played)
+            left = await played(group, tasks(6), agent, 2, results=results)
+    assert before >= known >= 5
+    assert count - before == 12 - known
+    lines = [json.loads(line) for line in path.read_text().splitlines()][1:]
+    assert sorted((line["seed"], line["index"]) for line in lines) == [
+        (seed, index) for seed in range(6) for index in range(2)
+    ]
+    assert all(line["reward"] == 5.0 * line["seed"] for line in lines)
+    assert {attempts.spec.seed for attempts in left} <= {*range(6)}
+    assert all(attempts.is_complete and len(attempts) == 2 for attempts in left)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"size": 0}, "size must be at least 1"),
+        ({"tasks": [EpisodeSpec("other", 0)]}, "no entry of this group can play"),
+        ({"tasks": [7]}, "episodes should be EpisodeSpec"),
+    ],
+)
+async def test_bad_arguments(wrong: dict[str, Any], message: str) -> None:
+    async with rooms(PLACES["loop"], num_workers=2) as group:
+        arguments: dict[str, Any] = {"tasks": tasks(1), "agent": earner, **wrong}
+        with pytest.raises((ValueError, TypeError), match=message):
+            await played(group, **arguments)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"retries": -1},
+        {"attempt_timeout": 0},
+        {"first": 0},
+        {"first": 1, "at_least": 1},
+        {"seeds": "random"},
+        {"on_timeout": "retry"},
+    ],
+)
+def test_bad_rules(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"must be|exclude"):
+        Rules(**wrong)
