@@ -21,13 +21,14 @@ def check_running(env: Any) -> None:
 
 def check_free(env: Any, pending: str | None, what: str) -> None:
     """Check that the call `what` may begin while the call `pending`, if any, is to be awaited."""
+    if pending is None and not env.closed:
+        return  # As in every step.
     check_running(env)
-    if pending is not None:
-        raise AlreadyPendingCallError(
-            f"Calling `{what}` while waiting for a pending call to `{pending}` to "
-            f"complete; call `{pending}_wait` first.",
-            pending,
-        )
+    raise AlreadyPendingCallError(
+        f"Calling `{what}` while waiting for a pending call to `{pending}` to "
+        f"complete; call `{pending}_wait` first.",
+        str(pending),
+    )
 
 
 def check_sent(env: Any, pending: str | None, what: str) -> None:
