@@ -182,8 +182,6 @@ class EnvThread(threading.Thread):
     def build(self, order: StartOrder) -> None:
         """Build the envs, and post their descriptions, or which of them can't be built."""
         try:
-            if order.core is not None:
-                os.sched_setaffinity(0, {order.core})  # Of this thread only.
             for runner in built_envs(order, inline=True):
                 self._runners.append(runner)
             started = [runner.started() for runner in self._runners]
