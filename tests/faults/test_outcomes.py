@@ -212,3 +212,20 @@ def test_it_survives_json_and_pickle() -> None:
     for wrong in ({"kind": "lost"}, {"blame": "you"}, {"more": math.pi}):
         with pytest.raises((ValueError, TypeError)):
             rl.Outcome.from_json({**outcome.to_json(), **wrong})
+
+
+class Particular(Deeds, gym.Env[Any, Any]):
+    """Can't be reset without options, as a replacement does."""
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return super().reset(seed=seed, options={"deed": options["deed"]})
+
+
+def test_a_replacement_that_raises_hides_no_death(build: Any) -> None:
+    """The episode has ended by the death, not by the reset that was to tell of it."""
+    group = build(entry(task=Particular, num_workers=1))
+    group.init()
+    group.reset(options={"deed": GO})
+    with pytest.raises(rl.EnvRaised, match="its worker exited with code 3") as caught:
+        step(group, DIE)
+    assert said(caught.value.outcome) == ("env_died", "env", "f-0")

@@ -131,8 +131,8 @@ class Intake:
 
     def raised(self, slot: int, error: ErrorText) -> EnvRaised:
         """Make the error for the current request of `slot`, which ended in `error`."""
-        cause = self._continuity.raised(slot)
-        after = f" (its worker {cause}, and was replaced)" if cause else ""
+        lost = self._continuity.raised(slot)
+        after = f" (its worker {lost.cause}, and was replaced)" if lost is not None else ""
         after += without_terminal(error, self._supervisor.hosts[self._requests.hosts.item(slot)])
         op = self._requests.numbering.op(slot)
         doing = Operation(op).name.lower()
@@ -152,6 +152,9 @@ class Intake:
         )
         begins = op in (Operation.RESET, Operation.RESTORE)
         known = raised.outcome
+        if lost is not None:  # That is how the episode of the request has ended.
+            raised.outcome = lost.outcome(known.env_id)
+            return raised
         raised.outcome = replace(
             known,
             kind="not_started" if begins else known.kind,

@@ -389,17 +389,17 @@ class Continuity:
             self._move(slot, LossEvent.ANSWERED)
         return reports
 
-    def raised(self, slot: int) -> str | None:
-        """Record that the request of `slot` ended without a result; return the cause of a loss that
-        it would have reported.
+    def raised(self, slot: int) -> Loss | None:
+        """Record that the request of `slot` ended without a result; return the loss that it would
+        have reported.
         """
         loss = self._losses.get(slot)
         if loss is None or loss.phase is LossPhase.LOST:
             return None
         reports = loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING)
-        cause = loss.why.cause if reports else None
+        why = loss.why if reports else None
         self._move(slot, LossEvent.RAISED).from_checkpoint = False
-        return cause
+        return why
 
     def give_up(self, slots: Iterable[int]) -> None:
         """Forget losses and checkpoints of `slots`, whose host will not be replaced."""

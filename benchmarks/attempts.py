@@ -1,0 +1,240 @@
+"""Attempts of agents while envs, agents and a model's server fail: `play`, and `asyncio.gather`.
+
+64 tasks are attempted 8 times each, on 256 awaitable envs, and on 16 envs in worker processes. Of
+the attempts, 5 % each meet an env that raises, one that hangs, one whose process dies (in workers),
+a reset that fails, an agent that is stuck, and a model's server that is away. `play` tries those
+again. The table counts outcomes against what was injected; `gather` is the same program without it:
+a loop over the tasks, an env for each attempt, no time limits.
+
+    python benchmarks/attempts.py [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import os
+import random
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any, Final
+
+import gymnasium as gym
+from harness import machine_facts, machine_text
+
+import rlightning_aio as rl
+from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
+from rlightning_aio.spaces import Anything
+
+TASKS, SIZE, STEPS, STEP_SECONDS = 64, 8, 4, 0.002
+SHARE: Final = 0.05
+FAULTS: Final = {
+    "raises": ("env_raised", "either"),
+    "hangs": ("env_hung", "either"),
+    "dies": ("env_died", "env"),
+    "fails to reset": ("not_started", "env"),
+    "agent is stuck": ("timed_out", "either"),
+    "server is away": ("agent_raised", "infrastructure"),
+}
+"""What goes wrong, and the outcome that is to say so."""
+GIVE_UP_SECONDS: Final = 20.0
+
+
+def fault_of(seed: int, index: int, faults: list[str]) -> str:
+    """What goes wrong in the first try of an attempt; empty for nothing."""
+    rng = random.Random(f"{seed}-{index}")
+    number = int(rng.random() / SHARE)
+    return faults[number] if number < len(faults) else ""
+
+
+class Tool(gym.Env[Any, Any]):
+    """Ends after some steps, each of which earns 1; an action may be a fault.
+
+    A reset fails once if a file of the folder in its options has the seed as its name.
+    """
+
+    observation_space = action_space = Anything()
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.steps = 0
+        with contextlib.suppress(FileNotFoundError):
+            Path(options["folder"], str(seed)).unlink()
+            raise RuntimeError("the tool could not be prepared")
+        return {}, {}
+
+    def step(self, action: Any) -> Any:
+        if action == "raises":
+            raise RuntimeError("the tool has failed")
+        if action == "hangs":
+            time.sleep(3600)
+        if action == "dies":
+            os._exit(3)
+        self.steps += 1
+        return {}, 1.0, self.steps == STEPS, False, {}
+
+
+class AwaitedTool:
+    """The same on an event loop."""
+
+    observation_space = action_space = Anything()
+
+    def __init__(self) -> None:
+        self.tool = Tool()
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return self.tool.reset(seed=seed, options=options)
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(3600 if action == "hangs" else STEP_SECONDS)
+        return self.tool.step(action)
+
+
+class Agent:
+    """Steps to the end; the first try of some attempts goes wrong."""
+
+    def __init__(self, faults: dict[tuple[int, int], str]) -> None:
+        self.faults = dict(faults)
+
+    async def __call__(self, episode: Any) -> None:
+        await self.play(episode, self.faults.pop((episode.spec.seed, episode.index), ""))
+
+    async def play(self, episode: Any, fault: str) -> None:
+        """Play one try."""
+        await episode.step("go")
+        if fault == "agent is stuck":
+            await asyncio.Event().wait()
+        if fault == "server is away":
+            raise ConnectionError("the model's server is away")
+        if fault in ("raises", "hangs", "dies"):
+            await episode.step(fault)
+        while not episode.is_over:
+            await episode.step("go")
+
+
+def entry(place: str) -> dict[str, Any]:
+    """256 envs on the event loop, or 16 in workers of their own."""
+    if place == "loop":
+        return {"task": AwaitedTool, "placement": "loop", "num_workers": 256}
+    return {"task": Tool, "envs_per_process": 1, "num_workers": 16}
+
+
+async def ours(
+    place: str, tasks: list[EpisodeSpec], faults: dict[tuple[int, int], str]
+) -> dict[str, Any]:
+    """Play all attempts by `play`; return what was found."""
+    found = Counter[str]()
+    groups: list[AttemptGroup] = []
+    lags: list[float] = []
+    began = time.monotonic()
+    rules = Rules(attempt_timeout=8, seeds="distinct", max_concurrency=256)
+    agent = Agent({key: fault for key, fault in faults.items() if fault != "fails to reset"})
+    limits: dict[str, Any] = {"step_timeout": 2.0, "max_restarts": 100}
+    async with rl.build_env_group(name="tool", **entry(place), **limits) as group:
+        watching = asyncio.create_task(watch(lags))
+        async for attempts in play(group, tasks, agent, SIZE, rules):
+            groups.append(attempts)
+            for attempt in attempts:
+                for outcome in attempt.failures:
+                    found[f"{outcome.kind} ({outcome.blame})"] += 1
+        watching.cancel()
+        left = len(group.pending)
+    left += len(asyncio.all_tasks() - {asyncio.current_task(), watching})
+    rewards = Counter(attempt.reward for attempts in groups for attempt in attempts)
+    return {
+        "groups": len(groups),
+        "complete": sum(attempts.is_complete for attempts in groups),
+        "rewards": {str(reward): count for reward, count in rewards.items()},
+        "failures": dict(sorted(found.items())),
+        "left": left,
+        "seconds": time.monotonic() - began,
+        "lag_p99_ms": 1e3 * sorted(lags)[int(0.99 * len(lags))],
+    }
+
+
+async def watch(lags: list[float]) -> None:
+    """Note how late the event loop is."""
+    while True:
+        began = time.monotonic()
+        await asyncio.sleep(0.005)
+        lags.append(time.monotonic() - began - 0.005)
+
+
+async def gathered(
+    place: str, tasks: list[EpisodeSpec], faults: dict[tuple[int, int], str]
+) -> dict[str, Any]:
+    """Play them by a coroutine for each env, which `asyncio.gather` waits for."""
+    jobs = [(spec, index) for spec in tasks for index in range(SIZE)]
+    agent, ended = Agent({}), 0
+
+    async def player(group: rl.EnvGroup, env_id: str) -> None:
+        nonlocal ended
+        while jobs:
+            spec, index = jobs.pop()
+            seed = Rules(seeds="distinct").seed(spec, index)
+            async with group.episode(env_id, seed, dict(spec.options or {})) as episode:
+                await agent.play(episode, faults.get((spec.seed, index), ""))
+            ended += 1
+
+    end = "ended"
+    async with rl.build_env_group(name="tool", **entry(place)) as group:
+        try:
+            async with asyncio.timeout(GIVE_UP_SECONDS):
+                await asyncio.gather(*(player(group, env_id) for env_id in group.env_ids))
+        except TimeoutError:
+            end = f"hung: given up after {GIVE_UP_SECONDS:g} s"
+        except Exception as error:  # noqa: BLE001  # Whatever it is, it ends the run.
+            end = f"ended by {type(error).__name__}"
+    return {"end": end, "attempts": ended}
+
+
+def compared(place: str, number: int) -> dict[str, Any]:
+    """Inject faults into a run of each program."""
+    possible = [name for name in FAULTS if place == "workers" or name != "dies"]
+    found: dict[str, Any] = {}
+    for name, program in (("play", ours), ("gather", gathered)):
+        with tempfile.TemporaryDirectory() as folder:
+            tasks = [EpisodeSpec("", seed, {"folder": folder}) for seed in range(number)]
+            faults = {
+                (spec.seed, index): fault
+                for spec in tasks
+                for index in range(SIZE)
+                if (fault := fault_of(spec.seed, index, possible))
+            }
+            for spec in tasks:
+                for index in range(SIZE):
+                    if faults.get((spec.seed, index)) == "fails to reset":
+                        seed = Rules(seeds="distinct").seed(spec, index)
+                        Path(folder, str(seed)).touch()
+            found[name] = rl.run(program(place, tasks, faults))
+    kinds = Counter("{} ({})".format(*FAULTS[fault]) for fault in faults.values())
+    found["injected"] = dict(sorted(kinds.items()))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tasks", type=int, default=TASKS)
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+    args = parser.parse_args()
+    report = {place: compared(place, args.tasks) for place in ("loop", "workers")}
+    if args.json:
+        print(json.dumps(report))
+        return
+    print(machine_text(machine_facts(("rlightning_aio", "uvloop"))))
+    for place, found in report.items():
+        mine = found["play"]
+        line = f"{place}: {mine['complete']} of {mine['groups']} groups complete"
+        line += f", rewards {mine['rewards']}, {mine['left']} requests and tasks left"
+        line += f", {mine['seconds']:.1f} s, event-loop lag {mine['lag_p99_ms']:.1f} ms (p99)"
+        print(f"\n{line}")
+        for kind, count in found["injected"].items():
+            print(f"  {kind}: {count} injected, {mine['failures'].get(kind, 0)} found")
+        print(f"  by gather: {found['gather']['end']}, {found['gather']['attempts']} attempts done")
+
+
+if __name__ == "__main__":
+    main()

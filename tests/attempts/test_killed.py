@@ -1,0 +1,69 @@
+"""A run that is killed goes on from its file: each attempt is there once, as if nothing was."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from attempts.rooms import Room
+
+import rlightning_aio as rl
+from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, play
+
+KILLS, TASKS, SIZE = 3, 12, 3
+
+
+async def agent(episode: Any) -> int:
+    while not episode.is_over:
+        await asyncio.sleep(0.005)
+        await episode.step(episode.last.observation["seed"] + episode.index)
+    return episode.index
+
+
+async def run(path: str) -> None:
+    tasks = [EpisodeSpec("", seed) for seed in range(TASKS)]
+    async with rl.build_env_group(Room, name="room", num_workers=2) as group:
+        with AttemptsFile(path, {"agent": "adds its index"}) as results:
+            async for _ in play(group, tasks, agent, SIZE, results=results):
+                pass
+
+
+def rows(path: Path) -> list[tuple[Any, ...]]:
+    lines = [json.loads(line) for line in path.read_text().splitlines()[1:]]
+    return sorted(
+        (line["seed"], line["index"], line["reward"], line["outcome"]["kind"], line["result"])
+        for line in lines
+    )
+
+
+def lines_in(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def test_a_run_that_is_killed_goes_on(tmp_path: Path) -> None:
+    """Three times by SIGKILL, at any moment after some more attempts have ended."""
+    path, whole = tmp_path / "killed.jsonl", tmp_path / "whole.jsonl"
+    command = [sys.executable, "-m", "attempts.test_killed", str(path)]
+    surroundings = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    for _ in range(KILLS):
+        before = lines_in(path)
+        process = subprocess.Popen(command, env=surroundings)
+        while lines_in(path) < before + 5 and process.poll() is None:
+            pass
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert process.returncode == -signal.SIGKILL
+    subprocess.run(command, check=True, env=surroundings)
+    rl.run(run(str(whole)))
+    assert rows(path) == rows(whole)
+    assert len(rows(path)) == TASKS * SIZE
+
+
+if __name__ == "__main__":
+    rl.run(run(sys.argv[1]))

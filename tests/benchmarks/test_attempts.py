@@ -1,0 +1,25 @@
+"""benchmarks/attempts.py: what was injected is what is found, and nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "attempts.py"
+
+
+def test_outcomes_equal_the_faults_that_were_injected() -> None:
+    """Every group is complete, and no failure has a reward."""
+    command = [sys.executable, str(SCRIPT), "--json", "--tasks", "6"]
+    ended = subprocess.run(command, capture_output=True, check=True, text=True)
+    report = json.loads(ended.stdout.splitlines()[-1])
+    for found in report.values():
+        assert found["injected"]
+        mine = found["play"]
+        assert (mine["groups"], mine["complete"], mine["left"]) == (6, 6, 0)
+        assert mine["failures"] == found["injected"]
+        assert mine["rewards"] == {"4.0": 48}
+        assert found["gather"]["end"] != "ended"
+        assert found["gather"]["attempts"] < 48
