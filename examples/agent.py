@@ -1,19 +1,17 @@
-"""64 concurrent episodes of an LLM agent with tools, against any OpenAI-compatible server.
+"""64 concurrent attempts of an LLM agent with tools, against any OpenAI-compatible server.
 
     pip install . -r requirements/agents.txt
     python examples/agent.py --base-url http://127.0.0.1:8000/v1 --model Qwen/Qwen3-4B
 
 The environment (shop.py) asks questions and runs tools; observations and actions are messages.
-Results are collected in batches of whatever is ready, and each environment steps as soon as its
-own reply is there. Each task is played 8 times with the same seed; GRPO compares their rewards.
-A rollout that fails has no reward, and is counted. The rollouts are written as JSON lines, which
-docs/agents.md describes.
+Each task is played 8 times with the same seed; GRPO compares the rewards. An attempt that fails is
+tried again. If that fails, too, it has no reward, but an outcome, which says who can be to blame.
+The rollouts are written as JSON lines, which docs/agents.md describes.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
 import os
 from functools import partial
@@ -26,76 +24,47 @@ from openai import AsyncOpenAI
 from shop import TASKS, TOOLS
 
 import rlightning_aio as rl
+from rlightning_aio.attempts import Attempt, AttemptEpisode, EpisodeSpec, Rules, play
 
 SEEDS, GROUP_SIZE = 4, 8
-BLANK = {"prompt": [], "completion": [], "messages": [], "is_truncated": False}
-SCORE = {"reward": 0.0, "advantage": None, "error": None}
 TOKENS = ("prompt_tokens", "completion_tokens", "token_ids", "logprobs")
-LOST = ("worker_restarted", "session_lost", "client_lost")
-"""Keys of the info of an episode that did not end by itself; the values say why."""
 
 
-async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, Any]]) -> None:
-    """Add to the rollouts, until every environment is at the end of its episode."""
-    thinking: set[asyncio.Task[None]] = set()
-
-    async def answer(row: rl.BatchedData) -> None:
-        try:
-            reply = await policy(row.observation[0])
-            group.step_async(row.respond(**{name: [value] for name, value in reply.items()}))
-        except Exception as error:  # noqa: BLE001  # Whatever a server does ends one episode.
-            fail(rollouts[row.ids()[0]], repr(error))
-
-    async with asyncio.TaskGroup() as tasks:
-        while True:
-            try:
-                batch, _ = await group.collect_async()
-            except rl.NothingPending:  # All environments that are left wait for the model.
-                if not thinking:
-                    return
-                await asyncio.wait(thinking, return_when=asyncio.FIRST_COMPLETED)
-                continue
-            except rl.EnvFault as error:
-                for env_id in getattr(error, "env_ids", (error.env_id,)):
-                    fail(rollouts[env_id], str(error))
-                continue
-            infos = batch.info()
-            for k, env_id in enumerate(batch.ids()):
-                causes = [infos[k][key] for key in LOST if key in infos[k]]
-                if causes:
-                    fail(rollouts[env_id], causes[0])
-                else:
-                    add(rollouts[env_id], batch, k)
-                if not batch.done[k]:
-                    thinking.add(task := tasks.create_task(answer(batch.take([k]))))
-                    task.add_done_callback(thinking.discard)
+async def converse(model: Any, episode: AttemptEpisode) -> None:
+    """The agent: answer every message until the episode is over."""
+    while not episode.is_over:
+        reply = await model(episode.last.observation)
+        await episode.step(**reply)
 
 
-def add(rollout: dict[str, Any], batch: rl.BatchedData, k: int) -> None:
-    """Add a row to its rollout."""
-    rollout["messages"] = messages_of(batch.observation[k])
-    if batch.is_reset[k]:
-        rollout["prompt"] = rollout["messages"]
-        return
-    rollout["completion"] = rollout["messages"][len(rollout["prompt"]) :]
-    rollout["reward"] += float(batch.reward[k])
-    rollout["is_truncated"] = bool(batch.truncated[k])
-    for name in TOKENS:
-        rollout[name].append(batch.sent[name][k])
-
-
-def fail(rollout: dict[str, Any], cause: str) -> None:
-    """End a rollout without a reward: what it earned so far says nothing about the model."""
-    rollout["error"], rollout["reward"] = cause, None
+def rollout_of(attempt: Attempt) -> dict[str, Any]:
+    """A line of the file."""
+    prompt, messages = messages_of(attempt.first), messages_of(attempt.last)
+    outcome = attempt.outcome
+    return {
+        "prompt": prompt,
+        "completion": messages[len(prompt) :],
+        "messages": messages,
+        "task": (attempt.spec.options or {})["task"],
+        "seed": attempt.spec.seed,
+        "reward": attempt.reward,
+        "advantage": None,
+        "tools": TOOLS,
+        "is_truncated": outcome.kind == "truncated",
+        "outcome": outcome.to_json(),
+        "error": outcome.cause if outcome.is_failure else None,
+        **{name: attempt.columns.get(name, []) for name in TOKENS},
+    }
 
 
 def messages_of(observation: Any) -> Any:
-    """An OpenEnv server sends them as a field."""
-    return observation["observation"] if isinstance(observation, dict) else observation
+    """An OpenEnv server sends them as a field; an attempt that did not start has none."""
+    found = observation["observation"] if isinstance(observation, dict) else observation
+    return found or []
 
 
 async def over_openenv(model: Model, observation: Any) -> dict[str, Any]:
-    """The columns of a row whose action is a field, too."""
+    """The columns of a step whose action is a field, too."""
     reply = await model(messages_of(observation))
     return {**reply, "action": {"action": reply["action"]}}
 
@@ -105,7 +74,7 @@ def compare(group: list[dict[str, Any]]) -> None:
 
     Rollouts that failed have none, and count neither for the mean nor for the deviation.
     """
-    whole = [rollout for rollout in group if rollout["error"] is None]
+    whole = [rollout for rollout in group if rollout["reward"] is not None]
     rewards = np.array([rollout["reward"] for rollout in whole])
     for rollout in whole:
         rollout["advantage"] = (rollout["reward"] - rewards.mean()) / (rewards.std() + 1e-4)
@@ -119,6 +88,7 @@ async def main() -> None:
     parser.add_argument("--body", type=json.loads, help="further fields of requests, as JSON")
     parser.add_argument("--out", type=Path, default=Path("rollouts.jsonl"))
     parser.add_argument("--patience", type=float, default=600.0, help="seconds for a server away")
+    parser.add_argument("--retries", type=int, default=2, help="of an attempt that failed")
     parser.add_argument("--openenv", metavar="URL", help="OpenEnv server of the environment")
     args = parser.parse_args()
     key = os.environ.get("OPENAI_API_KEY", "none")
@@ -127,25 +97,22 @@ async def main() -> None:
     if args.stream:
         request["stream_options"] = {"include_usage": True}
     model: Any = Model(client, args.patience, **request)
-    jobs = [(task, seed) for task in TASKS for seed in range(SEEDS) for _ in range(GROUP_SIZE)]
-    entry = {"name": "shop", "backend": "shop", "task": "-", "num_workers": len(jobs)}
-    entry |= {"placement": "loop", "step_timeout": 60}
+    tasks = [EpisodeSpec("", seed, {"task": task}) for task in TASKS for seed in range(SEEDS)]
+    entry = {"name": "shop", "backend": "shop", "task": "-", "placement": "loop"}
+    entry |= {"num_workers": len(tasks) * GROUP_SIZE, "step_timeout": 60}
     if args.openenv is not None:
         entry |= {"backend": "openenv", "task": args.openenv}
         entry |= {"env_kwargs": {"truncated_field": "truncated"}}
         model = partial(over_openenv, model)
+    groups: list[list[dict[str, Any]]] = []
     async with client, rl.build_env_group(entry) as group:
-        rollouts: dict[str, dict[str, Any]] = {}
-        for env_id, (task, seed) in zip(group.env_ids, jobs, strict=True):
-            tokens: dict[str, Any] = {name: [] for name in TOKENS}
-            rollouts[env_id] = {"task": task, "seed": seed, **BLANK, **SCORE, **tokens}
-            group.reset_async({env_id: seed}, {"task": task}, [env_id])
-        await play(group, model, rollouts)
-    lines = list(rollouts.values())
-    for first in range(0, len(lines), GROUP_SIZE):
-        compare(lines[first : first + GROUP_SIZE])
+        rules, agent = Rules(retries=args.retries), partial(converse, model)
+        async for attempts in play(group, tasks, agent, GROUP_SIZE, rules):
+            groups.append([rollout_of(attempt) for attempt in attempts])
+            compare(groups[-1])
+    lines = [line for found in groups for line in found]
     with args.out.open("w") as file:
-        file.writelines(json.dumps(line | {"tools": TOOLS}) + "\n" for line in lines)
+        file.writelines(json.dumps(line) + "\n" for line in lines)
     failed = [line["error"] for line in lines if line["error"]]
     right = sum(line["reward"] or 0.0 for line in lines)
     print(f"{len(lines)} episodes, {right:.0f} right, {len(failed)} failed", *failed[:1], sep=": ")

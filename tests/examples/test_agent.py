@@ -11,6 +11,7 @@ import sys
 from collections import Counter
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from examples.chat_server import KEY, ChatServer
 from run_python import output_of
 
 import rlightning_aio as rl
+from rlightning_aio.attempts import EpisodeSpec, Rules, play
 from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
@@ -36,7 +38,7 @@ ERRORS = {
     "AttributeError": "no JSON",
     "AssertionError": "no JSON",
     "TypeError": "no choices",
-    "env ": "no id",
+    "KeyError": "no id",
 }
 """What the server did, by the beginning of what the program reports."""
 
@@ -52,7 +54,9 @@ async def run_agent(url: str, *options: str | Path) -> str:
     )
     printed, written = await process.communicate()
     assert process.returncode == 0, written.decode()
-    complaints = [line for line in written.decode().splitlines() if not line.startswith("http")]
+    # Errors of the agent are logged once for each type, with their tracebacks.
+    logged = written.decode().partition("the agent of env ")[0]
+    complaints = [line for line in logged.splitlines() if not line.startswith("http")]
     assert not complaints, written.decode()
     return printed.decode()
 
@@ -97,7 +101,7 @@ def test_64_concurrent_episodes_become_groups_of_rollouts(stream: bool, tmp_path
     """Of eight each; whatever the server does ends one episode at most."""
     out = tmp_path / "rollouts.jsonl"
     options = ["--body", '{"logprobs": true, "return_token_ids": true}', "--out", out]
-    options += ["--patience", "1"]
+    options += ["--patience", "1", "--retries", "0"]
 
     async def played() -> ChatServer:
         async with ChatServer(gate=64) as server:
@@ -112,6 +116,7 @@ def test_64_concurrent_episodes_become_groups_of_rollouts(stream: bool, tmp_path
     assert {bool(body["stream"]) for body in server.requests} == {stream}
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     groups = [list(g) for _, g in groupby(lines, lambda line: (line["task"], line["seed"]))]
+    groups.sort(key=lambda group: group[0]["task"], reverse=True)
     assert [len(group) for group in groups] == [8] * 8
     assert len({json.dumps(group[0]["prompt"]) for group in groups}) == 8
     for line in lines:
@@ -155,7 +160,7 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
     """Its rollout says so; that the model fails for another one is said there."""
     actions = iter(["hang", "end", None])
 
-    async def policy(messages: Any) -> dict[str, Any]:
+    async def model(messages: Any) -> dict[str, Any]:
         action = next(actions)
         if action is None:
             raise RuntimeError("no model")
@@ -164,19 +169,18 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
     config = rl.EnvConfig(
         name="h", task=Hanging, num_workers=3, placement="loop", step_timeout=0.05
     )
+    tasks = [EpisodeSpec("", 0, {"task": "any"})]
     async with rl.build_env_group(config) as group:
-        rollouts = {
-            env_id: {**agent.BLANK, **agent.SCORE, **{name: [] for name in agent.TOKENS}}
-            for env_id in group.env_ids
-        }
-        group.reset_async()
-        await agent.play(group, policy, rollouts)
-    ends = {rollout["error"]: rollout["reward"] for rollout in rollouts.values()}
+        playing = play(group, tasks, partial(agent.converse, model), 3, Rules(retries=0))
+        rollouts = [agent.rollout_of(one) async for attempts in playing for one in attempts]
+    ends = {rollout["error"]: rollout["reward"] for rollout in rollouts}
     assert ends == {
         "RuntimeError('no model')": None,
         "hung in a step and was cancelled": None,
         None: 1.0,
     }
+    blames = {rollout["error"]: rollout["outcome"]["blame"] for rollout in rollouts}
+    assert set(blames.values()) == {"caller", "either", "policy"}
 
 
 def test_a_lost_server_of_environments_is_no_reward(tmp_path: Path) -> None:
@@ -191,7 +195,7 @@ def test_a_lost_server_of_environments_is_no_reward(tmp_path: Path) -> None:
         ):
             async with OpenEnvServer(group, "shop", "127.0.0.1", 0) as server:
                 printing = asyncio.create_task(
-                    run_agent(chat.url, "--openenv", server.url, "--out", out)
+                    run_agent(chat.url, "--openenv", server.url, "--out", out, "--retries", "0")
                 )
                 while chat.most < 64 and not printing.done():  # noqa: ASYNC110
                     await asyncio.sleep(0.01)
@@ -216,7 +220,7 @@ def test_environments_of_a_server_are_played_as_those_here(tmp_path: Path) -> No
             rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
             OpenEnvServer(group, "shop", "127.0.0.1", 0) as server,
         ):
-            options = ["--openenv", server.url, "--patience", "1", "--out", out]
+            options = ["--openenv", server.url, "--patience", "1", "--retries", "0", "--out", out]
             return await run_agent(chat.url, *options)
 
     assert asyncio.run(played(), debug=False).startswith("64 episodes, 32 right, 16 failed: ")

@@ -164,6 +164,7 @@ class _Engine:
         self._before = {} if results is None else results.by_task()
         self._repeats = Counter[Any]()
         self._fault: WorkerDied | None = None
+        self._logged = set[type[BaseException]]()
         self._wake = asyncio.Event()
         self.done = deque[AttemptGroup]()
         self.news = asyncio.Event()
@@ -247,7 +248,7 @@ class _Engine:
         options = self._players.options(env_id, job.spec)
         seed = self._rules.seed(job.spec, job.index)
         view = AttemptEpisode(self._group.episode(env_id, seed, options), job.spec, job.index)
-        one = Try(view, self._agent, self._rules, time.monotonic() - job.since)
+        one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         task = asyncio.create_task(one.run())
         self._playing[task] = job, one
         task.add_done_callback(self._note_end)

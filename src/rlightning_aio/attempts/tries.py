@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+import traceback
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
@@ -37,13 +38,22 @@ class Try:
         agent: plays it.
         rules: of the attempts.
         waited: seconds until an env was free.
+        logged: types of agents' errors that are in the log; more are added.
 
     Attributes:
         error: what the agent or the reset has raised, if they have.
     """
 
-    def __init__(self, view: AttemptEpisode, agent: Agent, rules: Rules, waited: float) -> None:
+    def __init__(
+        self,
+        view: AttemptEpisode,
+        agent: Agent,
+        rules: Rules,
+        waited: float,
+        logged: set[type[BaseException]],
+    ) -> None:
         self._view, self._agent, self._rules, self._waited = view, agent, rules, waited
+        self._logged = logged
         self._stopped: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self.error: BaseException | None = None
 
@@ -163,8 +173,14 @@ class Try:
         blame: Any = getattr(error, "blame", None)
         if blame not in BLAMES:
             blame = "infrastructure" if isinstance(error, OSError | TimeoutError) else "caller"
-        if blame == "caller":
-            _log.warning("the agent of env %r has raised", self.env_id, exc_info=error)
+        if blame == "caller" and type(error) not in self._logged:
+            self._logged.add(type(error))
+            _log.warning(
+                "the agent of env %r has raised; it isn't said again of this type of error:\n%s",
+                self.env_id,
+                # As text, because a kept record would keep the agent's frames, and so the group.
+                "".join(traceback.format_exception(error)),
+            )
         return Outcome("agent_raised", blame, repr(error), self.env_id)
 
     def _record(self, ended: Outcome, result: Any, seconds: float) -> Attempt:
