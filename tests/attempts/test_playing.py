@@ -6,11 +6,14 @@ import asyncio
 import contextlib
 import itertools
 import json
+import math
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from attempts.rooms import AwaitedRoom, Room
+from patience import HANG
+from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, Rules, play
@@ -305,13 +308,14 @@ async def test_nothing_is_left_of_an_iterator_that_is_left(place: dict[str, Any]
         assert len(await played(group, tasks(3), earner)) == 3
 
 
-async def test_a_group_without_envs_that_are_left_raises() -> None:
+@pytest.mark.parametrize("retries", [0, 2])
+async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
     async def agent(episode: AttemptEpisode) -> None:
         await episode.step("die")
 
     async with rooms(PLACES["workers"], num_workers=2, on_worker_death="raise") as group:
         with pytest.raises(rl.WorkerDied):
-            await played(group, tasks(3), agent, 2)
+            await played(group, tasks(9), agent, 2, Rules(retries=retries))
 
 
 async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
@@ -323,6 +327,53 @@ async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
     assert attempt.result == 42
     assert attempt.outcome.kind == "truncated"
     assert "stopped" in attempt.outcome.cause
+
+
+async def test_clients_of_an_env_server_play() -> None:
+    """Also one that comes while others play."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        for _ in range(3):
+            await episode.step([0.0, 0.0])
+        playing.add(episode.env_id)
+        return episode.env_id
+
+    playing = set[str]()
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    async with rl.build_env_group(server) as group:
+        handle: Any = group["robots-0"]
+        address: str = handle.address
+        clients = [ClientThread(address, "c0", CountingEnv(0))]
+        endless = (("", seed) for seed in itertools.count())
+        async with contextlib.aclosing(play(group, endless, agent)) as groups:
+            async for (attempt,) in groups:
+                assert attempt.rewards == [1.0, 2.0, 3.0]
+                if len(clients) < 3 and len(playing) == len(clients):
+                    name = f"c{len(clients)}"
+                    clients.append(ClientThread(address, name, CountingEnv(len(clients))))
+                if len(playing) == 3:
+                    break
+        assert playing == {"robots-0/c0", "robots-0/c1", "robots-0/c2"}
+    for client in clients:
+        await asyncio.to_thread(client.join)
+
+
+async def test_numbers_that_are_not_finite_are_in_the_file(tmp_path: Path) -> None:
+    """As null, which is read as NaN; a failure's reward is None."""
+    path = tmp_path / "attempts.jsonl"
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(float("nan"))
+        await episode.step("blame" if episode.index else 1)
+
+    async with rooms(PLACES["loop"], num_workers=2) as group:
+        with AttemptsFile(path) as results:
+            await played(group, tasks(1), agent, 2, results=results)
+    with AttemptsFile(path) as results:
+        whole, failed = sorted(results.played, key=lambda attempt: attempt.index)
+    assert whole.reward is not None
+    assert math.isnan(whole.reward)
+    assert failed.reward is None
 
 
 async def test_it_continues_from_a_file(tmp_path: Path) -> None:

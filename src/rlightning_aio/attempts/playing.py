@@ -22,7 +22,7 @@ from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.tasks import TaskSource
 from rlightning_aio.attempts.tries import Try
 from rlightning_aio.attempts.waiting import WaitingEpisodes
-from rlightning_aio.errors import EnvBusy, WorkerDied
+from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
@@ -156,6 +156,7 @@ class _Engine:
         self._group, self._source, self._agent = group, source, agent
         self._size, self._rules, self._results = size, rules, results
         self._players = Players(group)
+        self._has_clients = len(group) > group.size()
         self._free = dict.fromkeys(self._players.entry_of)
         """Idle envs, the one that has been idle for longest first."""
         self._waiting: dict[str, WaitingEpisodes[_Job]] = {}
@@ -164,6 +165,7 @@ class _Engine:
         self._before = {} if results is None else results.by_task()
         self._repeats = Counter[Any]()
         self._fault: WorkerDied | None = None
+        self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._wake = asyncio.Event()
         self.done = deque[AttemptGroup]()
@@ -185,11 +187,13 @@ class _Engine:
                 lacking = self._entries_without_env()
                 if not self._playing and not lacking and self._source.is_at_end:
                     return
-                try:
-                    async with asyncio.timeout(_LOOK_SECONDS if lacking else None):
+                if not lacking and not self._has_clients:
+                    await self._wake.wait()
+                    continue
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(_LOOK_SECONDS):
                         await self._wake.wait()
-                except TimeoutError:
-                    self._look()
+                self._look()
         finally:
             self._source.close()
             for _, one in self._playing.values():
@@ -198,6 +202,9 @@ class _Engine:
                 # The tries end by themselves, also if this is cancelled once more.
                 with contextlib.suppress(asyncio.CancelledError):
                     await asyncio.wait(left)
+            for task in self._playing:
+                # Read, so that asyncio doesn't log an error that nobody asks for.
+                _ = task.cancelled() or task.exception()
             self.news.set()
 
     # -- what begins ------------------------------------------------------------------
@@ -319,15 +326,19 @@ class _Engine:
     def _entries_without_env(self) -> list[str]:
         """Entries whose attempts wait although nothing plays; raise if that is for good."""
         waiting = [entry for entry, jobs in self._waiting.items() if jobs]
-        if self._fault is not None and not self._players.can_play(waiting):
-            raise self._fault
+        left = self._free or self._playing or self._has_clients or self._source.is_at_end
+        if not left or (self._fault is not None and not self._players.can_play(waiting)):
+            raise self._fault or RLightningError("no env of this group is left that could play")
         entry_of = self._players.entry_of
         there = {entry_of[id_] for id_ in self._free}
         there |= {job.spec.entry for job, _ in self._playing.values()} if waiting else set[str]()
         return [entry for entry in waiting if entry not in there]
 
     def _look(self) -> None:
-        """Look for clients that have come, or come back."""
+        """Look for clients that have come, or come back, a few times in a second."""
+        if time.monotonic() < self._look_at:
+            return
+        self._look_at = time.monotonic() + _LOOK_SECONDS
         busy = {one.env_id for _, one in self._playing.values()}
         for env_id in self._players.refresh() - busy:
             self._free.setdefault(env_id)

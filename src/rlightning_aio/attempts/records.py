@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
 
 from rlightning_aio.attempts.file import EpisodeFile
 from rlightning_aio.attempts.spec import EpisodeSpec, plain
+from rlightning_aio.json_text import finite
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
@@ -61,9 +63,9 @@ class Attempt:
     def to_json(self) -> dict[str, Any]:
         """Return the attempt as a row of JSON, without observations.
 
-        Columns and a result that JSON can't hold are null.
+        Columns and a result that JSON can't hold are null, and so are numbers that are not finite.
         """
-        return {
+        row = {
             **self.spec.to_json(),
             "index": self.index,
             "reward": self.reward,
@@ -73,6 +75,7 @@ class Attempt:
             "columns": {name: _json_or_none(column) for name, column in self.columns.items()},
             "result": _json_or_none(self.result),
         }
+        return finite(row)
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> Attempt:
@@ -86,7 +89,12 @@ class Attempt:
         spec = EpisodeSpec(**{name: fields.pop(name) for name in names})
         outcome = Outcome.from_json(fields.pop("outcome"))
         failures = tuple(map(Outcome.from_json, fields.pop("failures")))
-        return cls(spec, outcome=outcome, failures=failures, **fields)
+        rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
+        reward = None if outcome.is_failure else sum(rewards)
+        del fields["reward"]  # Null, too, where it is not finite.
+        return cls(
+            spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
+        )
 
 
 def _json_or_none(value: Any) -> Any:
