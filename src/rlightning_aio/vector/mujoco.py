@@ -9,6 +9,7 @@ import copy
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["MujocoVectorEnv"]
 
 
-class MujocoVectorEnv(MujocoBatch):
+# skrl looks for Gymnasium among the bases themselves.
+class MujocoVectorEnv(MujocoBatch, gym.vector.VectorEnv[Any, Any, Any]):
     """Simulations of one of Gymnasium's MuJoCo tasks behind Gymnasium's vector interface.
 
     MuJoCo steps and resets them in threads of this process. Returned arrays are fresh: no later

@@ -357,7 +357,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         causes = {k: {FAILED: cause} for k, cause in failures.items()}
         infos = partial(of_step, columns, count, causes, begun, finished, self._add_info)
         self._is_whole = True
-        return observations, rewards, terminated, truncated, self._infos(infos)
+        # PyTorch takes a subclass of dict for a leaf, and TorchRL looks for `final_obs` there.
+        made = self._infos(infos) if finished is None else infos()
+        return observations, rewards, terminated, truncated, made
 
     def _simulate(self, stepped: NDArray[np.bool_] | None) -> dict[int, str]:
         """Step the simulations `stepped`, or all. Return failures with their reasons."""
