@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, ge
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["BLAMES", "Blame", "Loss", "Outcome", "OutcomeKind", "TimeSpent"]
+__all__ = [
+    "BLAMES",
+    "Blame",
+    "Loss",
+    "Outcome",
+    "OutcomeKind",
+    "TimeSpent",
+    "is_bystanders",
+    "own_end",
+]
 
 OutcomeKind: TypeAlias = Literal[
     "terminated",
@@ -97,6 +106,30 @@ class Outcome:
         return found
 
 
+def is_bystanders(outcome: Outcome) -> bool:
+    """Return True if another env of the worker is to blame, so it says nothing about this one."""
+    return outcome.kind == "env_died" and outcome.blame == "infrastructure"
+
+
+def own_end(
+    env_id: str, info: Mapping[str, Any], *, terminated: bool, cut: str = "its env cut it"
+) -> Outcome:
+    """The outcome of an episode that its last result has ended.
+
+    Args:
+        env_id: of the env.
+        info: of the result; an `Outcome` in it, as ``outcome``, says more than the flags do.
+        terminated: by its env.
+        cut: the cause, if it was truncated.
+    """
+    reported: Any = info.get("outcome")
+    if isinstance(reported, Outcome):
+        return reported
+    if terminated:
+        return Outcome("terminated", "policy", "its env ended it", env_id)
+    return Outcome("truncated", "policy", cut, env_id)
+
+
 class Loss(NamedTuple):
     """Why envs have lost their episodes.
 
@@ -119,7 +152,7 @@ class Loss(NamedTuple):
         return env_id in self.suspects if self.suspects else self.at_fault in (None, env_id)
 
     def outcome(self, env_id: str) -> Outcome:
-        """The outcome of the episode that an env has lost."""
+        """The outcome of the episode that an env has lost; see `is_bystanders`."""
         if self.concerns(env_id):
             return Outcome(self.kind, self.blame, self.cause, env_id)
         cause = f"{self.cause} (while it executed {self.at_fault})"

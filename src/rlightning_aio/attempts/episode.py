@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, RLightningError
 from rlightning_aio.outcomes import Outcome
 from rlightning_aio.types import PolicyResponse
@@ -93,7 +92,7 @@ class AttemptEpisode:
             column = self.columns.setdefault(name, [])
             column += [None] * (steps - len(column))
             column.append(value)
-        self.rewards.append(_total(result.last_reward))
+        self.rewards.append(float(summed_rewards(result.last_reward).sum()))
         return result
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
@@ -129,9 +128,3 @@ class AttemptEpisode:
             self.seconds += time.monotonic() - began
         self.fault = None
         return found
-
-
-def _total(reward: Any) -> float:
-    if isinstance(reward, dict):
-        reward = [*cast("dict[str, Any]", reward).values()]
-    return float(np.sum(reward))

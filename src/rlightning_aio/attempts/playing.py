@@ -20,10 +20,10 @@ from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.tasks import TaskSource
-from rlightning_aio.attempts.tries import Try
+from rlightning_aio.attempts.tries import Try, surely
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
-from rlightning_aio.outcomes import Outcome
+from rlightning_aio.outcomes import Outcome, is_bystanders
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable
@@ -97,8 +97,7 @@ async def play(
             engine.news.clear()
     finally:
         running.cancel()
-        # However often this is cancelled, the envs are idle in the end.
-        await asyncio.wait({running})
+        await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
 
 
@@ -198,10 +197,7 @@ class _Engine:
             self._source.close()
             for _, one in self._playing.values():
                 one.stop("the iterator of play() was closed")
-            while left := {task for task in self._playing if not task.done()}:
-                # The tries end by themselves, also if this is cancelled once more.
-                with contextlib.suppress(asyncio.CancelledError):
-                    await asyncio.wait(left)
+            await surely({*self._playing})
             for task in self._playing:
                 # Read, so that asyncio doesn't log an error that nobody asks for.
                 _ = task.cancelled() or task.exception()
@@ -273,18 +269,14 @@ class _Engine:
         outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
         if isinstance(one.error, WorkerDied):
             self._fault = one.error
-        if outcome.is_failure:
-            present = self._players.refresh()
-            if one.env_id in present:
-                self._free[one.env_id] = None
-        else:
+        if not outcome.is_failure or one.env_id in self._players.refresh():
             self._free[one.env_id] = None
         if job.task.is_settled:
             return
-        is_bystander = outcome.kind == "env_died" and outcome.blame == "infrastructure"
-        if self._rules.retried(outcome) and (is_bystander or job.counted < self._rules.retries):
+        has_tries = is_bystanders(outcome) or job.counted < self._rules.retries
+        if self._rules.retried(outcome) and has_tries:
             job.failures.append(outcome)
-            job.counted += not is_bystander
+            job.counted += not is_bystanders(outcome)
             job.since = time.monotonic()
             self._waiting[job.spec.entry].add(job)
             return

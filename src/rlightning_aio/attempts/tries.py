@@ -6,13 +6,15 @@ import asyncio
 import logging
 import time
 import traceback
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
 from rlightning_aio.attempts.records import Attempt
+from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
-from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent
+from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.episode import AttemptEpisode
     from rlightning_aio.attempts.rules import Rules
 
-__all__ = ["Agent", "Try"]
+__all__ = ["Agent", "Try", "surely"]
 
 Agent: TypeAlias = "Callable[[AttemptEpisode], Awaitable[Any]]"
 """Plays one attempt."""
@@ -80,7 +82,7 @@ class Try:
         await self._either(begin, limit)
         if not begin.done():
             begin.cancel()
-            await _surely({begin})
+            await surely({begin})
             ended = self._cut_short(has_begun=False)
         elif (error := begin.exception()) is not None:
             self.error = error
@@ -96,7 +98,7 @@ class Try:
             ended = self._end_of(playing)
             if not playing.done():
                 playing.cancel()
-                await _surely({playing}, _PATIENCE_SECONDS)
+                await surely({playing}, _PATIENCE_SECONDS)
                 self._abandon(playing)
             elif not ended.is_failure:
                 result = playing.result()
@@ -118,7 +120,7 @@ class Try:
 
     async def _leave(self) -> None:
         self._view.end("is over")
-        await _surely({asyncio.ensure_future(self._view.leave())})
+        await surely({asyncio.ensure_future(self._view.leave())})
 
     def _abandon(self, playing: asyncio.Task[Any]) -> None:
         if playing.done():
@@ -155,18 +157,10 @@ class Try:
             return self._view.fault
         if self.error is not None:
             return self._raised(self.error)
-        last, env_id = self._view.last, self.env_id
-        reported: Any = last.info.get("outcome")
-        if isinstance(reported, Outcome):
-            return reported
-        if not self._view.is_over:
-            return Outcome("truncated", "policy", "the agent stopped before its end", env_id)
-        ends: Any = last.last_terminated
-        if isinstance(ends, dict):
-            ends = [*cast("dict[str, Any]", ends).values()]
-        if np.all(ends):
-            return Outcome("terminated", "policy", "its env ended it", env_id)
-        return Outcome("truncated", "policy", "its env or the step limit cut it", env_id)
+        last, is_over = self._view.last, self._view.is_over
+        terminated = is_over and bool(np.all(all_agents(last.last_terminated)))
+        cut = "its env or the step limit cut it" if is_over else "the agent stopped before its end"
+        return own_end(self.env_id, last.info, terminated=terminated, cut=cut)
 
     def _raised(self, error: BaseException) -> Outcome:
         """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
@@ -191,7 +185,7 @@ class Try:
         return Attempt(
             view.spec,
             view.index,
-            _with_time(ended, spent),
+            replace(ended, seconds=spent),
             reward=None if ended.is_failure else sum(view.rewards),
             rewards=view.rewards,
             columns=view.columns,
@@ -201,15 +195,11 @@ class Try:
         )
 
 
-def _with_time(ended: Outcome, spent: TimeSpent) -> Outcome:
-    return Outcome(ended.kind, ended.blame, ended.cause, ended.env_id, seconds=spent)
-
-
 async def _awaited(answer: Awaitable[Any]) -> Any:
     return await answer
 
 
-async def _surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:
+async def surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:
     """Wait for tasks, also if the caller is cancelled meanwhile."""
     deadline = None if seconds is None else time.monotonic() + seconds
     while left := {task for task in tasks if not task.done()}:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.batch.endings import all_agents
+from rlightning_aio.batch.endings import all_agents, summed_rewards
 from rlightning_aio.batch.infos import joined_infos, sub_env_infos_of_rows
 from rlightning_aio.batch.parts import (
     column_of_parts,
@@ -49,6 +49,7 @@ __all__ = [
     "slots_of",
     "slots_of_results",
     "sources_of",
+    "summed_rewards",
 ]
 
 

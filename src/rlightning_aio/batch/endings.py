@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
-from rlightning_aio.outcomes import Outcome
+from rlightning_aio.outcomes import own_end
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-__all__ = ["outcomes_of"]
+__all__ = ["all_agents", "outcomes_of", "summed_rewards"]
 
 
 class Endings(Protocol):
@@ -41,17 +41,19 @@ def outcomes_of(
         return found
     terminated, cut, env_ids = all_agents(batch.terminated), batch.limit_reached, batch.env_ids()
     for row, info in zip(rows, infos_of(rows), strict=True):
-        reported = info.get("outcome")
         for place in np.argwhere(over[row]).tolist():  # One, and empty, without sub-environments.
             where = (row, *place)
-            if isinstance(reported, Outcome):
-                found[where] = reported
-            elif terminated[where]:
-                found[where] = Outcome("terminated", "policy", "its env ended it", env_ids[row])
-            else:
-                cause = "it reached the step limit" if cut[where] else "its env cut it"
-                found[where] = Outcome("truncated", "policy", cause, env_ids[row])
+            cause = "it reached the step limit" if cut[where] else "its env cut it"
+            ended = bool(terminated[where])
+            found[where] = own_end(env_ids[row], info, terminated=ended, cut=cause)
     return found
+
+
+def summed_rewards(reward: Any) -> NDArray[np.float64]:
+    """Sum rewards over agents."""
+    if isinstance(reward, dict):
+        reward = np.sum(list(cast("dict[str, Any]", reward).values()), axis=0)
+    return np.asarray(reward, np.float64)
 
 
 def all_agents(done: Any) -> NDArray[np.bool_]:

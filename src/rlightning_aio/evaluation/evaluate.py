@@ -16,16 +16,16 @@ import numpy as np
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
-from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_numbers
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
     success_of,
-    summed_rewards,
 )
 from rlightning_aio.evaluation.queue import QueuePlay, QueueRules
+from rlightning_aio.outcomes import is_bystanders
 from rlightning_aio.policies.answers import answers_of
 from rlightning_aio.policies.random_actions import RandomPolicy
 
@@ -396,7 +396,7 @@ class _Play:
             self._found.lost += int(self._open[self._places(env_id)].sum())
             self._lost.add(env_id)
             lost: Outcome = info["outcome"]
-            if lost.blame == "infrastructure":
+            if is_bystanders(lost):
                 continue  # Another env of its worker is at fault, and reports so.
             self._losses[env_id] += 1
             if self._losses[env_id] == _LOSSES_IN_A_ROW:

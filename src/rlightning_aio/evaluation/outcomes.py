@@ -1,4 +1,4 @@
-"""Parts of both kinds of evaluation: rewards, success and length of an episode."""
+"""Parts of both kinds of evaluation: success and length of an episode."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["EndlessEpisodes", "success_of", "summed_rewards"]
+__all__ = ["EndlessEpisodes", "success_of"]
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -39,13 +39,6 @@ class EndlessEpisodes:
             env_ids[row],
             _LONG,
         )
-
-
-def summed_rewards(reward: Any) -> NDArray[np.float64]:
-    """Sum rewards over agents."""
-    if isinstance(reward, dict):
-        reward = np.sum(list(cast("dict[str, Any]", reward).values()), axis=0)
-    return np.asarray(reward, np.float64)
 
 
 def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:

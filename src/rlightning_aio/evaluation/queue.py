@@ -15,15 +15,15 @@ import numpy as np
 
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.waiting import WaitingEpisodes
-from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import (
     EndlessEpisodes,
     success_of,
-    summed_rewards,
 )
 from rlightning_aio.evaluation.records import EpisodeRecord, QueueEvaluation
+from rlightning_aio.outcomes import is_bystanders
 from rlightning_aio.policies.answers import answers_of
 
 if TYPE_CHECKING:
@@ -234,7 +234,7 @@ class QueuePlay:
                 env_id = env_ids[row]
                 if restarted[row]:
                     lost: Outcome = info["outcome"]
-                    self._lose(env_id, lost.cause, is_blamed=lost.blame != "infrastructure")
+                    self._lose(env_id, lost.cause, is_blamed=not is_bystanders(lost))
                 else:
                     self._end(env_id, info)
                 if env_id not in self._gone:

@@ -152,6 +152,11 @@ def _begun_at(xy: NDArray[np.float64]) -> Columns:
     }
 
 
+def _moved(xy: NDArray[np.float64], velocity: NDArray[np.float64]) -> dict[str, Any]:
+    """Infos of robots that move in the plane, in the order of Gymnasium's."""
+    return {**_begun_at(xy)(), "x_velocity": velocity[:, 0], "y_velocity": velocity[:, 1]}
+
+
 def _lengths(vectors: NDArray[np.float64]) -> Any:
     # Like `np.linalg.norm`, which uses a dot product.
     return np.sqrt(np.vecdot(vectors, vectors))
@@ -201,11 +206,7 @@ class Swimmer(Task):
 
         def infos() -> dict[str, Any]:
             return {
-                "x_position": xy[:, 0],
-                "y_position": xy[:, 1],
-                "distance_from_origin": _lengths(xy),
-                "x_velocity": velocity[:, 0],
-                "y_velocity": velocity[:, 1],
+                **_moved(xy, velocity),
                 "reward_forward": forward,
                 "reward_ctrl": -control,
             }
@@ -315,11 +316,7 @@ class Ant(Task):
 
         def infos() -> dict[str, Any]:
             return {
-                "x_position": xy[:, 0],
-                "y_position": xy[:, 1],
-                "distance_from_origin": _lengths(xy),
-                "x_velocity": velocity[:, 0],
-                "y_velocity": velocity[:, 1],
+                **_moved(xy, velocity),
                 "reward_forward": forward,
                 "reward_ctrl": -control,
                 "reward_contact": -contact,
