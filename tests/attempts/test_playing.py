@@ -10,6 +10,8 @@ import math
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from attempts.rooms import AwaitedRoom, Room
 from patience import HANG
@@ -437,3 +439,51 @@ async def test_bad_arguments(wrong: dict[str, Any], message: str) -> None:
 def test_bad_rules(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"must be|exclude"):
         Rules(**wrong)
+
+
+class Counter2D(gym.Env[Any, Any]):
+    """Its observation is the seed, and the number of steps; three steps end it."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.state = np.array([seed, 0.0])
+        return self.state.copy(), {}
+
+    def step(self, action: Any) -> Any:
+        self.state[1] += 1
+        return self.state.copy(), 1.0, bool(self.state[1] == 3), False, {}
+
+
+@pytest.mark.parametrize(
+    ("fields", "options"),
+    [
+        ({"envs_per_process": 1}, {"zero_copy": True}),
+        ({"envs_per_process": 2}, {"zero_copy": True}),
+        ({"placement": "inline"}, {"zero_copy": True}),
+        ({"snapshot_every": 1, "on_worker_death": "resume"}, {}),
+        ({"max_episode_steps": 3}, {}),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("traced", [False, True])
+async def test_with_other_options(
+    fields: dict[str, Any], options: dict[str, Any], traced: bool, tmp_path: Path
+) -> None:
+    """Observations are those of the attempt, also after others have played on its env."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        while not episode.is_over:
+            await episode.step(1)
+
+    group = rl.build_env_group(Counter2D, name="c", num_workers=2, **fields, **options)
+    async with group:
+        trace = group.trace(tmp_path / "t.json") if traced else contextlib.nullcontext()
+        with trace, group.auto_reset(fields.get("max_episode_steps", math.inf)):
+            found = await played(group, tasks(6), agent, size=2)
+    for attempts in found:
+        for attempt in attempts:
+            assert attempt.outcome.kind == "terminated"
+            assert attempt.first.tolist() == [attempts.spec.seed, 0]
+            assert attempt.last.tolist() == [attempts.spec.seed, 3]

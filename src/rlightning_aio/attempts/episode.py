@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, RLightningError
 from rlightning_aio.outcomes import Outcome
@@ -67,7 +68,7 @@ class AttemptEpisode:
         lost: Any = self.last.info.get("outcome")
         if isinstance(lost, Outcome):  # Its worker died in the reset, and was replaced.
             self.fault = lost
-        self.first = self.last.observation
+        self.first = copied(self.last.observation)  # Its env may change it, and its row will.
 
     async def step(self, action: Any, **columns: Any) -> EnvRet | MultiAgentEnvRet:
         """Step the env, and wait for the result.

@@ -34,7 +34,9 @@ class Attempt:
         rewards: of each step, in order.
         columns: what the agent gave to `step` with each action, and ``action`` itself: lists with
             an element for each step, None where a step had no such column.
-        first, last: the observations after the reset and after the newest step; None without.
+        first, last: copies of the observations after the reset and after the newest step; None
+            without. If `zero_copy` views are in use, an attempt that was cut during a step may have
+            the observation of that step as its last one.
         result: what the agent returned.
         failures: outcomes of earlier tries, in order.
     """

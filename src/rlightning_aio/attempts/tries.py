@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
@@ -181,7 +182,7 @@ class Try:
         view = self._view
         agent = max(seconds - view.seconds, 0.0)
         spent = TimeSpent(env=view.seconds, agent=agent, waiting=self._waited)
-        last = None if view.first is None else view.last.observation
+        last = None if view.first is None else copied(view.last.observation)
         return Attempt(
             view.spec,
             view.index,
