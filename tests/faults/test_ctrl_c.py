@@ -18,6 +18,7 @@ from patience import HANG
 import rlightning_aio.sync
 from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvBusy, GroupClosed
+from rlightning_aio.protocol import kernel
 from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
@@ -81,6 +82,31 @@ def test_a_group_goes_on_wherever_a_call_was_interrupted(
         else:
             pytest.fail(f"a call executes more than {NUM_LINES} lines")
     alone.close()
+
+
+def test_a_result_that_comes_with_ctrl_c_while_the_group_is_looked_at_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`get_workers` reads results, too: the one that it reads is collected later."""
+    complete = kernel.complete
+
+    def pressing(*args: Any) -> Any:
+        slots = complete(*args)
+        if slots is not None and len(slots):
+            press()
+        return slots
+
+    with rlightning_aio.sync.build_env_group({**ENTRY, "num_workers": 2}) as group:
+        batch, _ = group.reset(seed=0)
+        group.step_async(batch.respond(action=np.ones(2, int)))
+        monkeypatch.setattr(kernel, "complete", pressing)
+        with pytest.raises(KeyboardInterrupt):
+            while any(worker["owed"] for worker in group.get_workers()):
+                pass
+            group.collect_async()
+        monkeypatch.setattr(kernel, "complete", complete)
+        batch, _ = group.collect_async(wait_all=True, deadline=HANG)
+        assert len(batch) == 2
 
 
 # A step executes some 500 lines; these are a sample, and the last ones come after its end.

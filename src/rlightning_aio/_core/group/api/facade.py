@@ -192,9 +192,7 @@ class Facade:
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        self._driver.check_caller()
-        self._core.lifetime.check_open()
-        return self._core.pending()
+        return self._driver.call(self._core.pending)
 
     def step_async(self, batch: BatchedData) -> None:
         """Send a step to each env of `batch`; `collect_async` returns the results. Never blocks.
@@ -371,8 +369,7 @@ class Facade:
         Raises:
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        self._driver.check_caller()
-        return self._core.describe_workers(time.monotonic_ns())
+        return self._driver.call(self._core.describe_workers, time.monotonic_ns())
 
     def print_timing_summary(self) -> None:
         """Print the figures of `get_stats` as a table."""

@@ -87,10 +87,10 @@ class AioDriver:
         if running is not ours and (running or ours.is_running() or ours.is_closed()):
             raise self._elsewhere(ours)
 
-    def call(self, function: Callable[..., None], *args: Any) -> None:
+    def call(self, function: Callable[..., T], *args: Any) -> T:
         """Call a function that doesn't wait, after `check_caller`."""
         self.check_caller()
-        function(*args)
+        return function(*args)
 
     def interruptible(self, execute: Callable[[], T]) -> T:
         """Call a function that runs an env; asyncio handles Ctrl-C."""

@@ -125,7 +125,7 @@ class Driver(Watcher, Protocol):
         """Raise `RLightningError` if another thread uses the group, or another loop owns it."""
         ...
 
-    def call(self, function: Callable[..., None], *args: Any) -> None:
+    def call(self, function: Callable[..., T], *args: Any) -> T:
         """Call a function of the group that doesn't wait, after `check_caller`."""
         ...
 

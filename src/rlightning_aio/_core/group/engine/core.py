@@ -221,6 +221,7 @@ class Core:
 
     def pending(self) -> list[str]:
         """Return the ids of envs whose result, value or error was not returned yet."""
+        self.lifetime.check_open()
         self.intake.drain()
         state, owner = self.requests.state, self.requests.owner
         return self.envs.names.ids(np.flatnonzero((state != State.IDLE) & (owner != NOBODY)))
