@@ -26,7 +26,11 @@ def num_cores(cgroups: Path = _CGROUPS) -> int:
         cgroups: folder with the kernel's limits on processor time, as set by Docker and Kubernetes
             (https://docs.kernel.org/admin-guide/cgroup-v2.html, ``cpu.max``).
     """
-    cores, limit = len(os.sched_getaffinity(0)), _time_limit(cgroups)
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    limit = _time_limit(cgroups)
     return cores if limit is None else max(1, min(cores, math.ceil(limit)))
 
 

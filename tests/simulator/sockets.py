@@ -90,28 +90,11 @@ class Sockets:
         made.number = self.adopt(made)
         return made
 
-    def event_descriptor(self, count: int, flags: int = 0) -> int:
-        """See `os.eventfd`."""
-        del flags
-        return self.adopt(_Events(count))
-
     def adopt(self, source: Any) -> int:
         """Give something that can be waited for a descriptor."""
         number = next(self._numbers)
         self.by_number[number] = source
         return number
-
-    def write_event(self, descriptor: int, count: int) -> None:
-        """See `os.eventfd_write`."""
-        self.by_number[descriptor].count += count
-
-    def read_event(self, descriptor: int) -> int:
-        """See `os.eventfd_read`."""
-        events = self.by_number[descriptor]
-        if not events.count:
-            raise BlockingIOError(errno.EAGAIN, "it would block")
-        count, events.count = events.count, 0
-        return count
 
     def duplicate(self, descriptor: int) -> int:
         """See `os.dup`."""
@@ -145,16 +128,29 @@ class Sockets:
         self._real.clear()
 
 
-class _Events:
-    """A descriptor of `os.eventfd`."""
+class WakeUp:
+    """See `descriptors.WakeUp`. Nothing happens in between, as its owner holds a lock."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
+    def __init__(self, sockets: Sockets) -> None:
+        self._sockets = sockets
+        self._is_set = False
+        self._number = sockets.adopt(self)
 
-    def close(self) -> None: ...
+    def fileno(self) -> int:
+        return self._number
+
+    def set(self) -> None:
+        self._is_set = True
+
+    def clear(self) -> None:
+        assert self._is_set
+        self._is_set = False
+
+    def close(self) -> None:
+        self._sockets.by_number.pop(self._number)
 
     def is_readable(self) -> bool:
-        return self.count > 0
+        return self._is_set
 
     def is_writable(self) -> bool:
         return True

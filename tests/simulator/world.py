@@ -48,12 +48,13 @@ from simulator import rays
 from simulator.fork_server import ForkServer
 from simulator.network import Network
 from simulator.processes import NOBODY, Killed, Process
-from simulator.sockets import Epoll, Loop, Sockets, run_in_process
+from simulator.sockets import Epoll, Loop, Sockets, WakeUp, run_in_process
 
 from rlightning_aio import sharing
 from rlightning_aio._core.group.engine import first_observations
 from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import overdue
+from rlightning_aio._core.hosts import inbox
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
@@ -195,12 +196,10 @@ class World:
             (time, "sleep", self.sleep),
             (select, "epoll", lambda: Epoll(self)),
             (socket, "socketpair", self.sockets.pair),
+            (inbox, "WakeUp", partial(WakeUp, self.sockets)),
             (subprocess, "Popen", partial(ForkServer, self)),
             (spares, "_spares", {}),
             (os, "close", self.sockets.close_descriptor),
-            (os, "eventfd", self.sockets.event_descriptor),
-            (os, "eventfd_read", self.sockets.read_event),
-            (os, "eventfd_write", self.sockets.write_event),
             (os, "set_inheritable", self.sockets.set_inheritable),
             (os, "sched_yield", self.give_way),
             (os, "sched_getaffinity", lambda _: cores),

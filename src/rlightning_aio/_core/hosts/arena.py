@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+import tempfile
 from typing import Final
 
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
@@ -45,12 +46,19 @@ def make_private(memory: memoryview) -> None:
     memory[:] = held
 
 
+def _nameless_file() -> int:
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("rlightning_aio", os.MFD_CLOEXEC)
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
 class Arena:
     """The trainer's end: owns the descriptor and appends parts."""
 
     def __init__(self) -> None:
         occupy_standard_streams()  # The arena is the first descriptor of a group.
-        self.descriptor = os.memfd_create("rlightning_aio", os.MFD_CLOEXEC)
+        self.descriptor = _nameless_file()
         self._size = 0
 
     def append(self, size: int) -> int:

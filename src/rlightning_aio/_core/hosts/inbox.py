@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections import deque
 from typing import TYPE_CHECKING
+
+from rlightning_aio._core.hosts.descriptors import WakeUp
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -14,24 +15,24 @@ __all__ = ["Inbox"]
 
 
 class Inbox:
-    """A queue of tasks with a descriptor.
-
-    Attributes:
-        descriptor: readable while there are tasks; level-triggered.
-    """
+    """A queue of tasks with a descriptor."""
 
     def __init__(self) -> None:
-        self.descriptor = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._wake_up = WakeUp()
         self._tasks: deque[Callable[[], None]] = deque()
         self._lock = threading.Lock()
         self._is_open = True
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while there are tasks; level-triggered."""
+        return self._wake_up.fileno()
 
     def put(self, task: Callable[[], None]) -> None:
         """Add a task, from any thread; it is dropped if the inbox is closed."""
         with self._lock:
             if self._is_open:
                 if not self._tasks:
-                    os.eventfd_write(self.descriptor, 1)
+                    self._wake_up.set()
                 self._tasks.append(task)
 
     def take(self) -> list[Callable[[], None]]:
@@ -39,7 +40,7 @@ class Inbox:
         with self._lock:
             if not self._tasks:
                 return []
-            os.eventfd_read(self.descriptor)
+            self._wake_up.clear()
             tasks = list(self._tasks)
             self._tasks.clear()
             return tasks
@@ -50,4 +51,4 @@ class Inbox:
             if self._is_open:
                 self._is_open = False
                 self._tasks.clear()
-                os.close(self.descriptor)
+                self._wake_up.close()

@@ -1,4 +1,4 @@
-"""`SyncDriver`: waits for a synchronous group, in `epoll`, and holds Ctrl-C back.
+"""`SyncDriver`: waits for a synchronous group, and holds Ctrl-C back.
 
 Rule: Ctrl-C never stops a call between two changes of the group's state, nor takes its result. It
 is raised where the call waits or runs an env in this process, or once the call has done what it can
@@ -9,7 +9,6 @@ one raises it. A second one is raised at once.
 from __future__ import annotations
 
 import os
-import select
 import signal
 import threading
 import time
@@ -18,9 +17,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
 from rlightning_aio._core.group.drivers.wait import TURN, CallTime, forked_from, this_process
+from rlightning_aio._core.hosts.descriptors import READABLE, WRITABLE, new_descriptor_set
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
+    import select
     from collections.abc import Callable, Sized
     from types import FrameType
 
@@ -39,7 +40,7 @@ _MAIN_THREAD: Final = threading.main_thread().ident
 
 
 class SyncDriver:
-    """Watches sources with one persistent epoll, and runs procedures until they return."""
+    """Watches sources with one set of descriptors, and runs procedures until they return."""
 
     def __init__(self) -> None:
         # The queue of completions, the function that applies them, and the one that names the envs
@@ -71,9 +72,9 @@ class SyncDriver:
         )
 
     def watch(self, source: Source) -> None:
-        epoll = self._epoll or select.epoll()
+        epoll = self._epoll or new_descriptor_set()
         descriptor = source.fileno()
-        epoll.register(descriptor, select.EPOLLIN)
+        epoll.register(descriptor, READABLE)
         self._epoll = epoll
         self._sources[descriptor] = source
         self._descriptors[source] = descriptor
@@ -91,7 +92,7 @@ class SyncDriver:
     def watch_writable(self, source: Source, wanted: bool) -> None:
         descriptor = self._descriptors.get(source)
         if descriptor is not None and self._epoll is not None:
-            events = select.EPOLLIN | select.EPOLLOUT if wanted else select.EPOLLIN
+            events = READABLE | WRITABLE if wanted else READABLE
             self._epoll.modify(descriptor, events)
 
     def wake(self) -> None:
@@ -254,7 +255,7 @@ class SyncDriver:
             return  # A signal handler closed the group.
         for descriptor, events in found:
             source = self._sources.get(descriptor)
-            if source is not None and events & select.EPOLLOUT:
+            if source is not None and events & WRITABLE:
                 source.on_writable()
-            if source is not None and events & ~select.EPOLLOUT:
+            if source is not None and events & ~WRITABLE:
                 source.on_readable()

@@ -57,9 +57,9 @@ def plan_group(
     fns = _preprocess_fns(configs, preprocess_fn)
     for config, own in zip(configs, fns, strict=True):
         place = place_of(config)
-        host_class(config)
         if place.check:
             load(place.check)(config)
+        host_class(config)
         if place.max_members and own[0] not in (None, default_env_preprocess_fn):
             warnings.warn(
                 f"entry {config.name!r}: preprocess_fn is ignored for an {config.backend}; it "

@@ -252,5 +252,5 @@ def _make_room() -> int:
     soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     if soft == resource.RLIM_INFINITY:
         return _MAX_CONNECTIONS
-    free = soft - sum(1 for _ in Path("/proc/self/fd").iterdir())
+    free = soft - sum(1 for _ in Path("/dev/fd").iterdir())
     return max(8, min(_MAX_CONNECTIONS, free // 2))

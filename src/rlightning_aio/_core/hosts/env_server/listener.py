@@ -1,18 +1,17 @@
 """`Listener`: the sockets of an env_server, a ZMQ ROUTER without a thread.
 
 Rule: one descriptor wakes the driver, which then calls `Listener.pump`. `ServerSessions` decides
-what messages mean. The descriptor is an epoll over those of ZMQ, which only report changes, and
-an eventfd that is set whenever there is work without a change.
+what messages mean. The descriptor is that of a set: those of ZMQ, which only report changes, and a
+`WakeUp`, which is set whenever there is work without a change.
 """
 
 from __future__ import annotations
 
-import os
-import select
 from typing import TYPE_CHECKING, Final, cast
 
 import zmq
 
+from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descriptor_set
 from rlightning_aio._core.hosts.env_server.authenticator import Authenticator
 from rlightning_aio._core.hosts.env_server.connection_limiter import ConnectionLimiter
 from rlightning_aio._core.hosts.env_server.rate_limiter import (
@@ -27,6 +26,8 @@ from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS, PINGS_P
 from rlightning_aio.remote.zmq_messages import is_readable, next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
+    import select
+
     from rlightning_aio._core.hosts.env_server.settings import ServerSettings
     from rlightning_aio.protocol.net.server_session import ServerSessions
     from rlightning_aio.protocol.net.wire import Part
@@ -76,8 +77,8 @@ class Listener:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._router: zmq.Socket[bytes]
         self.connections: ConnectionLimiter
-        self._epoll: select.epoll
-        self._wake_up = -1
+        self._descriptors: select.epoll
+        self._wake_up: WakeUp
         self._is_woken = False
 
     @property
@@ -96,9 +97,9 @@ class Listener:
             StartFailed: the address is not available.
         """
         self._context = zmq.Context[zmq.Socket[bytes]]()
-        self._epoll = select.epoll()
-        self._wake_up = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._epoll.register(self._wake_up, select.EPOLLIN)
+        self._descriptors = new_descriptor_set()
+        self._wake_up = WakeUp()
+        self._descriptors.register(self._wake_up.fileno(), READABLE)
         try:
             self._listen(self._context)
         except zmq.ZMQError as error:
@@ -142,9 +143,9 @@ class Listener:
             raise
         self._address = router.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
         connections.watch_port(int(self._address.rpartition(":")[2]))
-        self._epoll.register(_descriptor(router), select.EPOLLIN)
-        self._epoll.register(connections.fileno(), select.EPOLLIN)
-        self._epoll.register(self._authenticator.fileno(), select.EPOLLIN)
+        self._descriptors.register(_descriptor(router), READABLE)
+        self._descriptors.register(connections.fileno(), READABLE)
+        self._descriptors.register(self._authenticator.fileno(), READABLE)
 
     def close(self) -> None:
         """Send all clients a goodbye and stop listening; idempotent, takes at most 0.2 s."""
@@ -155,15 +156,15 @@ class Listener:
             self._sessions.close("the trainer closed its group")
             self._send(0.0)
             self.connections.close()
-        self._epoll.close()
-        os.close(self._wake_up)
+        self._descriptors.close()
+        self._wake_up.close()
         context.destroy(linger=_LINGER_MS)
 
     # -- waiting --------------------------------------------------------------------
 
     def fileno(self) -> int:
         """Return a descriptor that is readable while `pump` has something to do."""
-        return self._epoll.fileno()
+        return self._descriptors.fileno()
 
     def is_readable(self) -> bool:
         """Return True if `pump` has something to do. Asking may clear the descriptor."""
@@ -178,7 +179,7 @@ class Listener:
         """Make the driver pump once more, though no change will wake it."""
         if not self._is_woken:
             self._is_woken = True
-            os.eventfd_write(self._wake_up, 1)
+            self._wake_up.set()
 
     # -- messages -------------------------------------------------------------------
 
@@ -186,7 +187,7 @@ class Listener:
         """Read all messages and send all that wait; never blocks."""
         if self._is_woken:
             self._is_woken = False
-            os.eventfd_read(self._wake_up)
+            self._wake_up.clear()
         # This question is what clears ZMQ's descriptor.
         has_message = is_readable(self._router)
         if not has_message or now >= self._updated_at + _MIN_UPDATE_SECONDS:
@@ -216,7 +217,7 @@ class Listener:
         if is_busy != self._ignores_connections:
             self._ignores_connections = is_busy
             for source in (self.connections, self._authenticator):
-                self._epoll.modify(source.fileno(), 0 if is_busy else select.EPOLLIN)
+                self._descriptors.modify(source.fileno(), 0 if is_busy else READABLE)
 
     def _receive(self, now: float) -> bool:
         """Read one message, or some parts of a dropped one. Return False if there is none."""

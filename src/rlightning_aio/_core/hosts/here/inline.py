@@ -187,7 +187,7 @@ class _Threads:
         self._queue.append(self.unfinished.pop(index))
 
     def fileno(self) -> int:
-        return self._inbox.descriptor
+        return self._inbox.fileno()
 
     def on_readable(self) -> None:
         for task in self._inbox.take():

@@ -277,7 +277,7 @@ class RayHost:
 
     def fileno(self) -> int:
         assert self._life is not None
-        return self._life.inbox.descriptor
+        return self._life.inbox.fileno()
 
     def on_readable(self) -> None:
         life = self._life
