@@ -108,7 +108,7 @@ test-sanitized: export PYTHONMALLOC := malloc
 test-sanitized: export ASAN_OPTIONS := detect_leaks=0
 test-sanitized: $(VENV)/installed-test ## the compiled modules under AddressSanitizer and UBSan
 	rm -rf build/sanitized && mkdir -p build && cp -r src build/sanitized
-	for module in protocol/_kernel envs/mujoco/_mujoco_forces; do \
+	for module in protocol/_kernel envs/mujoco/_advance; do \
 	    $(CC) -std=c11 -g -O1 -Wall -Wextra -Wno-missing-field-initializers -Wno-cast-function-type -Werror \
 	        -fsanitize=address,undefined -fno-sanitize-recover=all -fPIC -shared \
 	        -I$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))') \

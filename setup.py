@@ -19,7 +19,7 @@ setup(
             py_limited_api=stable,
             optional=True,
         )
-        for package, name in [("protocol", "_kernel"), ("envs/mujoco", "_mujoco_forces")]
+        for package, name in [("protocol", "_kernel"), ("envs/mujoco", "_advance")]
     ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}} if stable else {},
 )

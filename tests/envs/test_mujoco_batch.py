@@ -20,7 +20,7 @@ from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.mujoco import threads as mujoco_threads
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
-from rlightning_aio.envs.mujoco.forces import compiled
+from rlightning_aio.envs.mujoco.outputs import compiled, offset_of
 from rlightning_aio.envs.mujoco.threads import Simulations
 from rlightning_aio.envs.simulators.gymnasium import MujocoEnv, outdated_assets_accepted
 from rlightning_aio.errors import ConfigError, EnvRaised
@@ -170,6 +170,21 @@ def test_all_data_of_a_simulation_equal_gymnasiums(task: str) -> None:
 def test_contact_forces_are_compiled_where_the_kernel_is(implementation: str) -> None:
     """So the tests of both implementations compare two ways to contact forces."""
     assert (compiled() is None) == (implementation == "python")
+
+
+def test_a_field_that_is_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The offset of a field is MuJoCo's own word, but it is checked with real data."""
+    env: Any = make("HalfCheetah-v5", {})().unwrapped
+    for name in ("qpos", "qvel", "ctrl", "cfrc_ext", "xipos", "ten_length"):
+        assert offset_of(name, env.data) > 0
+
+    class Moved(ctypes.Structure):
+        _fields_ = (("time", ctypes.c_double), ("qpos", ctypes.c_void_p))
+
+    monkeypatch.setattr("rlightning_aio.envs.mujoco.outputs._struct", lambda _: Moved)
+    with pytest.raises(RuntimeError, match=r"mjData\.qpos is not where"):
+        offset_of("qpos", env.data)
+    env.close()
 
 
 SMALL = "a simulation that runs out of memory"

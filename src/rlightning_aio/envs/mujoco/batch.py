@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 
 from rlightning_aio.envs.mujoco.infos import Begun, Finished, of_resets, of_step
 from rlightning_aio.envs.mujoco.randomize import Randomizer
-from rlightning_aio.envs.mujoco.resets import Some, can_draw, drawn
+from rlightning_aio.envs.mujoco.resets import can_draw, drawn
 from rlightning_aio.envs.mujoco.tasks import task_of
 from rlightning_aio.envs.mujoco.threads import Simulations, state_of
 from rlightning_aio.envs.state import load_state, save_state
@@ -49,8 +49,10 @@ _FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
 _NEXT_STEP: Final = AutoresetMode.NEXT_STEP
 _SAME_STEP: Final = AutoresetMode.SAME_STEP
 _BRIEF_NS: Final = 500_000
-_STATE: Final = ("_num_steps", "_before", "_substeps", "_last", "_ended")
+_STATE: Final = ("_num_steps", "_last", "_ended")
 """Attributes that are part of the state, in addition to the simulations."""
+_OF_SIMULATIONS: Final = ("rows", "before", "num_steps")
+"""Their arrays that are part of the state."""
 
 
 def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
@@ -131,12 +133,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._take_back(k)
         self._mode = autoreset_mode
         self._read_step_limit()
-        self._read_first_row()
         self._num_steps = np.zeros(num_envs, np.int64)
-        # All data of a simulation follow from this state and a number of MuJoCo's steps; 0 means a
-        # reset.
-        self._before = self._simulations.moving.copy()
-        self._substeps = np.zeros(num_envs, np.int64)
         # The observations that were returned last; never written to.
         self._last = np.zeros((num_envs, *self.env.observation_space.shape))
         self._ended: NDArray[np.bool_] | None = None
@@ -149,12 +146,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             if isinstance(wrapper, gym.wrappers.TimeLimit):
                 self._limiter = wrapper
                 self._limit = self._limiter._max_episode_steps  # noqa: SLF001
-
-    def _read_first_row(self) -> None:
-        """Note the state of a simulation at the beginning of a reset."""
-        self._first_row = np.empty_like(self._simulations.rows[0])
-        mujoco.mj_resetData(self.env.model, self._data)
-        state_of(self.env.model, self._data, self._first_row)
 
     # -- resets -------------------------------------------------------------------------
 
@@ -225,40 +216,43 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             seeds: of the simulations `ids`.
             options: passed to the task.
         """
-        given = [None] * len(ids) if seeds is None else seeds
         self._num_steps[ids] = 0
         if not self._resets_together:
+            given = [None] * len(ids) if seeds is None else seeds
             each = [
                 self._reset(k, observations, seed, options)
                 for k, seed in zip(ids.tolist(), given, strict=True)
             ]
             return Begun(ids, None, each)
-        begun = self._draw(ids, given)
-        self._task.moved(ids, Some(self._simulations, ids))
-        observations[ids] = self._task.observation(ids)
-        return begun
+        task = self._task
+        each = self._draw(ids, seeds)
+        task.renew(observations)
+        self._simulations.advance(ids.astype(np.int32))
+        task.finish(ids)
+        task.settle(ids)
+        return Begun(ids, task.begun(ids), each)
 
-    def _draw(self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None) -> Begun:
-        """Draw first states of the simulations `ids`, and have MuJoCo compute what follows."""
-        env, task, simulations = self.env, self._task, self._simulations
-        each: list[dict[str, Any]] = []
-        seeds = [None] * len(ids) if seeds is None else seeds
-        generators = [self._generator(k, seed) for k, seed in zip(ids.tolist(), seeds, strict=True)]
-        places = ids.astype(np.int32)
+    def _draw(
+        self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None
+    ) -> list[dict[str, Any]]:
+        """Draw first states of the simulations `ids`, for MuJoCo to begin with. Return infos."""
+        env, simulations, each = self.env, self._simulations, list[dict[str, Any]]()
+        given = [None] * len(ids) if seeds is None else seeds
+        own, chosen = self._own, list[int](ids.tolist())
+        generators: list[Any] = [own[k].get("_np_random") for k in chosen]
+        if seeds is not None or None in generators:
+            generators = [self._generator(k, seed) for k, seed in zip(chosen, given, strict=True)]
         if self._randomizer is not None:
             each = [
                 {"randomized": self._randomizer.draw(k, seed)}
-                for k, seed in zip(ids.tolist(), seeds, strict=True)
+                for k, seed in zip(chosen, given, strict=True)
             ]
-            simulations.set_const(places)
-        model, scale = env.model, env._reset_noise_scale  # noqa: SLF001
-        positions, velocities = drawn(generators, task.noise, scale, model.nq, model.nv)
-        simulations.rows[ids] = self._first_row
-        simulations.qpos[ids] = env.init_qpos + positions
-        simulations.qvel[ids] = env.init_qvel + velocities
-        simulations.forward(places)
-        self._before[ids], self._substeps[ids] = simulations.moving[ids], 0
-        return Begun(ids, task.begun(Some(simulations, ids)), each)
+            simulations.set_const(ids.astype(np.int32))
+        scale: Any = env._reset_noise_scale  # noqa: SLF001
+        noise = drawn(generators, self._task.noise, scale, env.model.nq, env.model.nv)
+        simulations.starts[ids] = np.concatenate([env.init_qpos, env.init_qvel]) + noise
+        simulations.num_steps[ids] = 0
+        return each
 
     def _generator(self, k: int, seed: int | None) -> np.random.Generator:
         """The generator of simulation `k`, seeded like that of a Gymnasium env."""
@@ -280,8 +274,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         observations[k], info = self.env.reset(seed=seed, options=options)
         _ = self.env.np_random  # Without a seed, this makes a randomly seeded generator.
         self._take_back(k)
-        self._put(k, self._data)
-        self._before[k] = self._simulations.moving[k]
+        self._task.put(k, self._data)
         return info if factors is None else {**info, "randomized": factors}
 
     def _lend(self, k: int) -> None:
@@ -291,12 +284,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def _take_back(self, k: int) -> None:
         now = cast("dict[str, Any]", self.env.__dict__)
         self._own[k] = {name: now[name] for name in _OWN if name in now}
-
-    def _put(self, k: int, data: Any) -> None:
-        """Continue simulation k from `data`."""
-        state_of(self.env.model, data, self._simulations.rows[k])
-        self._task.moved(k, data)
-        self._substeps[k] = 0
 
     # -- steps --------------------------------------------------------------------------
 
@@ -329,19 +316,17 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"actions must have shape {self.action_space.shape}, not {actions.shape}"
             )
-        self._is_whole, count = False, self.num_envs
+        self._is_whole, task = False, self._task
         # `any` of an array takes four times as long as `count_nonzero`.
         due = (
             np.flatnonzero(ended) if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
         )
-        self._simulations.ctrl[:] = actions
-        # Before the others step, so that the observations of all are gathered together.
-        begun = None if due is None or not self._resets_together else self._draw(due)
-        finished, failures = None, self._simulate(None if due is None else ~ended)
-        observations, (rewards, terminated, columns) = self._task.stepped(actions)
+        begun, failures = self._simulate(actions, due)
+        rewards, terminated, columns = task.stepped(actions)
+        observations = task.observations
         self._num_steps += 1
         if due is not None:
-            begun = self._begin(due, observations) if begun is None else begun
+            begun = begun or self._begin(due, observations)
             self._num_steps[due], rewards[due], terminated[due] = 0, 0.0, False
         truncated = self._num_steps >= self._limit
         if failures:
@@ -349,30 +334,44 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             observations[failed], rewards[failed] = self._last[failed], 0.0
             terminated[failed], truncated[failed] = False, True
         self._ended = ended = terminated | truncated
+        finished = None
         if self._mode == _SAME_STEP and np.count_nonzero(ended):
             ids = np.flatnonzero(ended)
             finished = Finished(ended, observations[ids])
             begun = self._begin(ids, observations)
         self._keep(observations)
         causes = {k: {FAILED: cause} for k, cause in failures.items()}
-        infos = partial(of_step, columns, count, causes, begun, finished, self._add_info)
+        infos = partial(of_step, columns, self.num_envs, causes, begun, finished, self._add_info)
         self._is_whole = True
         # PyTorch takes a subclass of dict for a leaf, and TorchRL looks for `final_obs` there.
         made = self._infos(infos) if finished is None else infos()
         return observations, rewards, terminated, truncated, made
 
-    def _simulate(self, stepped: NDArray[np.bool_] | None) -> dict[int, str]:
-        """Step the simulations `stepped`, or all. Return failures with their reasons."""
-        simulations, ids = self._simulations, None
-        self._before[:] = simulations.moving
-        self._substeps[:] = self.env.frame_skip
-        if stepped is not None:
-            ids = np.flatnonzero(stepped).astype(np.int32)
-            self._substeps[~stepped] = 0
-        failures = simulations.step(self.env.frame_skip, ids)
-        for k in failures:
-            self._before[k], self._substeps[k] = simulations.moving[k], 0
-        return failures
+    def _simulate(
+        self, actions: NDArray[Any], due: NDArray[np.intp] | None
+    ) -> tuple[Begun | None, dict[int, str]]:
+        """Step all simulations but those that are due for a reset, and reset these if possible.
+
+        Returns:
+            Those that were reset, and failures with their reasons.
+        """
+        simulations, task = self._simulations, self._task
+        simulations.controls[:] = actions
+        simulations.num_steps[:] = self.env.frame_skip
+        begun = ids = None
+        if due is not None and not self._resets_together:
+            ids = np.setdiff1d(np.arange(self.num_envs, dtype=np.int32), due)
+            task.renew(self._last.copy())
+        else:
+            each = None if due is None else self._draw(due)
+            task.renew()
+            if due is not None and each is not None:
+                begun = Begun(due, task.begun(due), each)
+        failures = simulations.advance(ids)
+        if failures:
+            # What was not computed may be anything.
+            task.keep(list(failures), self._last)
+        return begun, failures
 
     # -- calls --------------------------------------------------------------------------
 
@@ -397,7 +396,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         if name == "render":
             return self.render_one(k)
         self._lend(k)
-        self.env.data = data = self._data_of(k)
+        self.env.data = data = self._simulations.data_of(k)
         if self._limiter is not None and self._ended is not None:
             self._limiter._elapsed_steps = int(self._num_steps[k])  # noqa: SLF001
         try:
@@ -409,14 +408,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             state = np.empty_like(self._simulations.rows[k])
             state_of(self.env.model, data, state)
             if not np.array_equal(state, self._simulations.rows[k], equal_nan=True):
-                self._put(k, data)
-                self._before[k] = self._simulations.moving[k]
+                self._task.put(k, data)
             if self._limiter is not None and self._limiter._elapsed_steps is not None:  # noqa: SLF001
                 self._num_steps[k] = self._limiter._elapsed_steps  # noqa: SLF001
-
-    def _data_of(self, k: int) -> Any:
-        """All data of simulation k, bit-identical to those of a Gymnasium env."""
-        return self._simulations.data_of(k, self._before[k], int(self._substeps[k]))
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value.
@@ -434,14 +428,13 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         if name in _FIXED or any(different):
             raise _shared(name)
         self._made.set_wrapper_attr(name, values)
-        self._note_options(self._task.positions)
+        self._note_options(self._task.place)
 
-    def _note_options(self, positions: Any) -> None:
-        """Read the options of the env, which may have changed; the positions are the last ones."""
+    def _note_options(self, place: Any) -> None:
+        """Read the options of the env, which may have changed; the bodies stay where they are."""
         self._read_step_limit()
-        self._read_first_row()
         self._task = type(self._task)(self.env, self._simulations)
-        self._task.positions = positions
+        self._task.place = place
 
     def is_wrapped(self, name: ClassName) -> bool:
         """Return True if the env has a wrapper of the class `name`."""
@@ -454,8 +447,8 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         return {
             # With the model and all options.
             "env": save_state(self._made),
-            "rows": self._simulations.rows.copy(),
-            "positions": self._task.positions,
+            "simulations": [getattr(self._simulations, name).copy() for name in _OF_SIMULATIONS],
+            "place": self._task.place,
             "own": self._own,
             "randomizer": None if self._randomizer is None else self._randomizer.save_state(),
             **{name: getattr(self, name) for name in _STATE},
@@ -474,13 +467,14 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         elif drawn is not None:
             raise ValueError("the snapshot's simulations are randomized, and this env's are not")
         load_state(self._made, state["env"])
-        self._simulations.rows[:] = state["rows"]
+        for name, values in zip(_OF_SIMULATIONS, state["simulations"], strict=True):
+            getattr(self._simulations, name)[:] = values
         self._own = [dict(own) for own in state["own"]]
         if self._randomizer is not None:
             self._randomizer.load_state(drawn)
         for name in _STATE:
             setattr(self, name, state[name])
-        self._note_options(state["positions"])
+        self._note_options(state["place"])
         self._is_whole = True
 
     def render(self) -> tuple[Any, ...]:
@@ -495,7 +489,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         """
         if self._ended is None:
             raise ResetNeeded("Cannot call env.render() before calling env.reset()")
-        mujoco.mj_copyData(self._data, self.env.model, self._data_of(k))
+        mujoco.mj_copyData(self._data, self.env.model, self._simulations.data_of(k))
         return self.env.render()
 
     def close_extras(self, **kwargs: Any) -> None:

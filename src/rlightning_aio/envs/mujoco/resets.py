@@ -16,21 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Some", "can_draw", "drawn"]
-
-
-class Some:
-    """The fields of some simulations, by MuJoCo's names: copies ``[len(ids), ...]``."""
-
-    def __init__(self, simulations: Any, ids: NDArray[np.intp]) -> None:
-        self._simulations, self._ids = simulations, ids
-
-    def __getattr__(self, name: str) -> NDArray[Any]:
-        return getattr(self._simulations, name)[self._ids]
-
-    def model_field(self, name: str) -> NDArray[Any]:
-        """A field of the model: ``[len(ids), ...]`` if simulations differ in it."""
-        return self._simulations.model_field(name, self._ids)
+__all__ = ["can_draw", "drawn"]
 
 
 def can_draw(scale: Any) -> bool:
@@ -40,8 +26,8 @@ def can_draw(scale: Any) -> bool:
 
 def drawn(
     generators: Sequence[np.random.Generator], kind: str, scale: float, nq: int, nv: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Draw noise of positions and velocities, ``[len(generators), nq]`` and ``[..., nv]``.
+) -> NDArray[np.float64]:
+    """Draw noise of positions and velocities, ``[len(generators), nq + nv]``.
 
     Args:
         generators: of the simulations.
@@ -50,22 +36,24 @@ def drawn(
         nq: number of positions.
         nv: number of velocities.
     """
-    count, is_normal = len(generators), kind == "normal"
-    uniform = np.empty((count, nq if is_normal else nq + nv))
-    normal = np.empty((count, nv))
-    is_product = _uniform_is_product()
-    for k, generator in enumerate(generators):
+    width, is_product = nq if kind == "normal" else nq + nv, _uniform_is_product()
+    noise = np.empty((len(generators), nq + nv))
+    uniform, normal = noise[:, :width], noise[:, width:]
+    if kind != "normal":
+        normal = [None] * len(noise)
+    for generator, first, second in zip(generators, uniform, normal, strict=True):
         if is_product:
-            generator.random(out=uniform[k])
+            generator.random(out=first)
         else:
-            uniform[k] = generator.uniform(-scale, scale, uniform.shape[1])
-        if is_normal:
-            generator.standard_normal(out=normal[k])
+            first[:] = generator.uniform(-scale, scale, width)
+        if second is not None:
+            generator.standard_normal(out=second)
     if is_product:
-        uniform = -scale + (scale - -scale) * uniform
-    if is_normal:
-        return uniform, scale * normal
-    return uniform[:, :nq], uniform[:, nq:]
+        uniform *= scale - -scale
+        uniform += -scale
+    if kind == "normal":
+        noise[:, width:] *= scale
+    return noise
 
 
 @cache

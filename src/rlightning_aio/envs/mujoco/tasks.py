@@ -3,8 +3,8 @@
 
 Rule: each formula is Gymnasium's (gymnasium/envs/mujoco/*_v5.py), with the same order of operations
 and dtypes, so results are bit-identical; options are read from the Gymnasium env. Comments say
-where NumPy computes arrays differently from numbers. Actions are ``[n, *action]``; values gathered
-from n simulations are ``[n, ...]`` float64.
+where NumPy computes arrays differently from numbers. Actions and observations are ``[n, ...]``;
+what rewards are made of is ``[..., n]`` where NumPy is faster so.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.envs.mujoco.views import flat, joined
+from rlightning_aio.envs.mujoco.outputs import FieldPart
 from rlightning_aio.envs.wrappers import wrappers_of
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
     from numpy.typing import NDArray
+
+    from rlightning_aio.envs.mujoco.threads import Simulations
 
 __all__ = ["Task", "is_batched", "task_of"]
 
@@ -36,13 +38,14 @@ class Task:
 
     Args:
         env: the unwrapped Gymnasium env.
-        fields: of n simulations, by MuJoCo's names: `mujoco_threads.Simulations`.
+        simulations: n of them; their outputs become those of the task.
 
     Attributes:
         needs_forces: True if the task reads contact forces.
         noise: how a reset draws velocities around the first ones, after positions that it draws
             uniformly; or more than that.
-        positions: ``[n, ...]``, last position of the body, for its velocity.
+        columns: what rewards and infos are made of, ``[..., n]``: a new array in each step.
+        place: position of the body, for its velocity: ``[n]`` or ``[2, n]``.
         actions: of the step.
         observations: after the step.
     """
@@ -50,111 +53,133 @@ class Task:
     needs_forces: ClassVar[bool] = False
     noise: ClassVar[Literal["uniform", "normal", "more"]] = "uniform"
 
-    def __init__(self, env: Any, fields: Any) -> None:
+    def __init__(self, env: Any, simulations: Simulations) -> None:
+        simulations.forget_outputs()
         self.env = env
-        self.fields = fields
+        self.simulations = simulations
         self._options: Any = env.model.opt
-        self._num: int = fields.count
-        self._observed = self.gathered(*self.observed())
-        self.positions: Any = self.position(fields)
+        self._num: int = simulations.count
+        self._observed = simulations.output(*self.observed())
+        self._watched = simulations.output(*self.watched(), by_columns=True)
+        self._columns_before = self.columns
+        self.place: Any = None
         self.actions: Any = None
-        self.observations: Any = None
 
-    def gathered(self, *parts: Callable[[Any], Any]) -> Callable[..., NDArray[np.float64]]:
-        """Make a function that copies parts of all simulations, flattened and concatenated.
+    @property
+    def columns(self) -> NDArray[np.float64]:
+        return self._watched.values
 
-        With ids, it copies those of the simulations `ids`.
-        """
-        views = joined([flat(part(self.fields)) for part in parts])
-
-        def gather(ids: Any = None) -> NDArray[np.float64]:
-            chosen = views if ids is None else [view[ids] for view in views]
-            return chosen[0].copy() if len(chosen) == 1 else np.concatenate(chosen, axis=1)
-
-        return gather
+    @property
+    def observations(self) -> NDArray[np.float64]:
+        return self._observed.values
 
     # -- the differences between tasks ----------------------------------------------------
 
-    def observed(self) -> list[Callable[[Any], Any]]:
+    def observed(self) -> list[FieldPart]:
         """Parts of a simulation that form an observation."""
         raise NotImplementedError
 
-    def finish(self, observations: NDArray[np.float64]) -> None:
-        """Complete observations in place."""
+    def watched(self) -> list[FieldPart]:
+        return []
 
-    def position(self, fields: Any) -> Any:
-        """Position of the body in `fields` of all simulations or of one; None if unused."""
+    def finish(self, which: Any = ...) -> None:
+        """Complete the observations of some simulations in place."""
+
+    def position(self) -> Any:
+        """Position of the body; None if unused."""
 
     def judge(self) -> Judgement:
         """Compute rewards, terminations and infos of a step."""
         raise NotImplementedError
 
-    def begun(self, fields: Any) -> Columns:
-        """Infos of a reset, from `fields` of the simulations that were reset."""
-        del fields
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        """Infos of a reset of the simulations `ids`."""
+        del ids
         return dict
 
     # -- use --------------------------------------------------------------------------------
 
-    def stepped(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], Judgement]:
-        """Return observations, rewards, terminations and infos of a step with these actions."""
+    def renew(self, observations: NDArray[np.float64] | None = None) -> None:
+        """Write the next outputs to new arrays, as somebody has the last ones.
+
+        Args:
+            observations: where to write them if some simulations stay as they are.
+        """
+        self._columns_before = self.columns
+        if observations is None:
+            self._observed.renew()
+            self._watched.renew()
+        else:
+            self._observed.put(observations)
+            self._watched.copy()
+
+    def keep(self, ids: list[int], observations: NDArray[np.float64]) -> None:
+        """Leave the outputs of the simulations `ids` as they were; observations are given."""
+        self.observations[ids] = observations[ids]
+        self.columns[:, ids] = self._columns_before[:, ids]
+
+    def put(self, k: int, data: Any) -> None:
+        """Move simulation `k` to `data`, without a step."""
+        self._watched.copy()
+        self.simulations.put(k, data, unread=self._observed)
+        self.settle([k])
+
+    def settle(self, ids: Any) -> None:
+        """Record where the simulations `ids` are after a reset."""
+        now = self.position()
+        if now is not None:
+            self.place = now.copy() if self.place is None else self.place.copy()
+            self.place[..., ids] = now[..., ids]
+
+    def stepped(self, actions: NDArray[Any]) -> Judgement:
+        """Return rewards, terminations and infos of a step with these actions."""
         self.actions = actions
-        self.observations = self._observed()
-        self.finish(self.observations)
-        return self.observations, self.judge()
+        self.finish()
+        return self.judge()
 
-    def observation(self, ids: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Observations of the simulations `ids`, from their fields."""
-        found = self._observed(ids)
-        self.finish(found)
-        return found
-
-    def moved(self, which: Any, fields: Any) -> None:
-        """Record the positions of simulations that were moved to `fields` without a step."""
-        if self.positions is not None:
-            self.positions = self.positions.copy()  # The last infos have views of it.
-            self.positions[which] = self.position(fields)
-
-    def velocity(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return current positions, and velocities since the last step."""
-        before: NDArray[np.float64] = self.positions
-        after: NDArray[np.float64] = self.position(self.fields)
-        self.positions = after
+    def velocity(self) -> NDArray[np.float64]:
+        """Record the current positions, and return velocities since the last step."""
+        before, self.place = self.place, self.position()
         # Gymnasium's `dt`, read with one call of MuJoCo's bindings in place of two.
-        velocity: NDArray[np.float64] = (after - before) / (
-            self._options.timestep * self.env.frame_skip
-        )
-        return after, velocity
+        return (self.place - before) / (self._options.timestep * self.env.frame_skip)
 
     def never(self) -> NDArray[np.bool_]:
         return np.zeros(self._num, np.bool_)
 
+    def ended(self, healthy: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Terminations of robots that end their episodes when they fall, if they do."""
+        return ~healthy if self.env._terminate_when_unhealthy else self.never()
 
-def _skipping(env: Any, count: int) -> list[Callable[[Any], Any]]:
-    """Positions, without the first `count` if the env excludes them, and velocities."""
+
+def _skipping(env: Any, count: int, low: float = -np.inf, high: float = np.inf) -> list[FieldPart]:
+    """Positions, without the first `count` if the env excludes them, and clipped velocities."""
     skipped = count if env._exclude_current_positions_from_observation else 0
-    return [lambda s: s.qpos[:, skipped:], lambda s: s.qvel]
+    return [FieldPart("qpos", skipped), FieldPart("qvel", low=low, high=high)]
 
 
 def _squares(rows: NDArray[Any]) -> Any:
     return np.add.reduce(np.square(rows), axis=1)
 
 
-_TENDONS = ("tendon_length", "tendon_velocity")
+def _all_within(low: float, values: NDArray[Any], high: float) -> Any:
+    """Return whether all values of each row are between; mostly, those of all rows are."""
+    if low < values.min() and values.max() < high:
+        return True
+    return ((low < values) & (values < high)).all(axis=1)
 
 
-def _begun_at(xy: NDArray[np.float64]) -> Columns:
-    """Infos of the reset of a body at these positions."""
-    return lambda: {
-        "x_position": xy[:, 0],
-        "y_position": xy[:, 1],
-        "distance_from_origin": _lengths(xy),
+def _at(xy: NDArray[np.float64]) -> dict[str, Any]:
+    """Infos of bodies at these positions ``[2, n]``."""
+    return {
+        "x_position": xy[0],
+        "y_position": xy[1],
+        "distance_from_origin": _lengths(np.ascontiguousarray(xy.T)),
     }
 
 
 def _moved(xy: NDArray[np.float64], velocity: NDArray[np.float64]) -> dict[str, Any]:
     """Infos of robots that move in the plane, in the order of Gymnasium's."""
-    return {**_begun_at(xy)(), "x_velocity": velocity[:, 0], "y_velocity": velocity[:, 1]}
+    return {**_at(xy), "x_velocity": velocity[0], "y_velocity": velocity[1]}
 
 
 def _lengths(vectors: NDArray[np.float64]) -> Any:
@@ -165,15 +190,17 @@ def _lengths(vectors: NDArray[np.float64]) -> Any:
 class HalfCheetah(Task):
     noise = "normal"
 
-    def observed(self) -> list[Callable[[Any], Any]]:
+    def observed(self) -> list[FieldPart]:
         return _skipping(self.env, 1)
 
-    def position(self, fields: Any) -> Any:
-        return fields.qpos[..., :1].copy()
+    def watched(self) -> list[FieldPart]:
+        return [FieldPart("qpos", 0, 1)]
+
+    def position(self) -> Any:
+        return self.columns[0]
 
     def judge(self) -> Judgement:
-        positions, velocities = self.velocity()
-        x, velocity = positions[:, 0], velocities[:, 0]
+        velocity, x = self.velocity(), self.columns[0]
         forward = self.env._forward_reward_weight * velocity
         control = self.env._ctrl_cost_weight * _squares(self.actions)
 
@@ -187,21 +214,24 @@ class HalfCheetah(Task):
 
         return forward - control, self.never(), infos
 
-    def begun(self, fields: Any) -> Columns:
-        x = fields.qpos[:, 0]
-        return lambda: {"x_position": x}
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        x = self.columns[0]
+        return lambda: {"x_position": x[ids]}
 
 
 class Swimmer(Task):
-    def observed(self) -> list[Callable[[Any], Any]]:
+    def observed(self) -> list[FieldPart]:
         return _skipping(self.env, 2)
 
-    def position(self, fields: Any) -> Any:
-        return fields.qpos[..., :2].copy()
+    def watched(self) -> list[FieldPart]:
+        return [FieldPart("qpos", 0, 2)]
+
+    def position(self) -> Any:
+        return self.columns
 
     def judge(self) -> Judgement:
-        xy, velocity = self.velocity()
-        forward = self.env._forward_reward_weight * velocity[:, 0]
+        velocity, xy = self.velocity(), self.columns
+        forward = self.env._forward_reward_weight * velocity[0]
         control = self.env._ctrl_cost_weight * _squares(self.actions)
 
         def infos() -> dict[str, Any]:
@@ -213,106 +243,98 @@ class Swimmer(Task):
 
         return forward - control, self.never(), infos
 
-    def begun(self, fields: Any) -> Columns:
-        return _begun_at(fields.qpos[:, :2])
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        xy = self.columns
+        return lambda: _at(xy[:, ids])
 
 
 class Hopper(Task):
-    def __init__(self, env: Any, fields: Any) -> None:
-        super().__init__(env, fields)
-        (self.state,) = joined([fields.qpos, fields.qvel])
-        self.velocities = env.observation_space.shape[0] - env.model.nv
+    def __init__(self, env: Any, simulations: Simulations) -> None:
+        super().__init__(env, simulations)
+        # Of the angle, and of what is not in `watched`.
+        self.rest = simulations.output(FieldPart("qpos", 2), FieldPart("qvel"))
 
-    def observed(self) -> list[Callable[[Any], Any]]:
-        return _skipping(self.env, 1)
+    def observed(self) -> list[FieldPart]:
+        return _skipping(self.env, 1, -10, 10)
 
-    def finish(self, observations: NDArray[np.float64]) -> None:
-        velocities = observations[:, self.velocities :]
-        velocities.clip(-10, 10, out=velocities)
+    def watched(self) -> list[FieldPart]:
+        return [FieldPart("qpos", 0, 3)]
 
-    def position(self, fields: Any) -> Any:
-        return fields.qpos[..., :1].copy()
+    def position(self) -> Any:
+        return self.columns[0]
 
-    def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def healthy(self) -> NDArray[np.bool_]:
         least, most = self.env._healthy_state_range
-        rest = state[:, 2:]
-        return self.upright(state) & ((least < rest) & (rest < most)).all(axis=1)
+        return self.upright() & _all_within(least, self.rest.values, most)
 
-    def upright(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def upright(self) -> NDArray[np.bool_]:
         (low, high), (least, most) = self.env._healthy_z_range, self.env._healthy_angle_range
-        z, angle = state[:, 1], state[:, 2]
+        _, z, angle = self.columns
         return (low < z) & (z < high) & (least < angle) & (angle < most)
 
     def judge(self) -> Judgement:
-        env, state = self.env, self.state
-        positions, velocities = self.velocity()
-        x, velocity = positions[:, 0], velocities[:, 0]
-        healthy = self.healthy(state)
-        height = state[:, 1] - env.init_qpos[1]
+        env, columns = self.env, self.columns
+        velocity, healthy = self.velocity(), self.healthy()
         forward = env._forward_reward_weight * velocity
         survive = healthy * env._healthy_reward
         control = env._ctrl_cost_weight * _squares(self.actions)
 
         def infos() -> dict[str, Any]:
             return {
-                "x_position": x,
-                "z_distance_from_origin": height,
+                "x_position": columns[0],
+                "z_distance_from_origin": columns[1] - env.init_qpos[1],
                 "x_velocity": velocity,
                 "reward_forward": forward,
                 "reward_ctrl": -control,
                 "reward_survive": survive,
             }
 
-        return forward + survive - control, ~healthy & bool(env._terminate_when_unhealthy), infos
+        return forward + survive - control, self.ended(healthy), infos
 
-    def begun(self, fields: Any) -> Columns:
-        positions, height = fields.qpos, self.env.init_qpos[1]
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        columns, height = self.columns, self.env.init_qpos[1]
         return lambda: {
-            "x_position": positions[:, 0],
-            "z_distance_from_origin": positions[:, 1] - height,
+            "x_position": columns[0, ids],
+            "z_distance_from_origin": columns[1, ids] - height,
         }
 
 
 class Walker2d(Hopper):
-    def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return self.upright(state)
+    def healthy(self) -> NDArray[np.bool_]:
+        return self.upright()
 
 
 class Ant(Task):
     needs_forces = True
     noise = "normal"
 
-    def __init__(self, env: Any, fields: Any) -> None:
+    def __init__(self, env: Any, simulations: Simulations) -> None:
         self.body = env.model.body(env._main_body).id
-        super().__init__(env, fields)
-        (self.state,) = joined([fields.qpos, fields.qvel])
-        self.forces = flat(fields.cfrc_ext)
-        self.first_force = env.observation_structure["qpos"] + env.observation_structure["qvel"]
+        super().__init__(env, simulations)
+        self.state = simulations.output(FieldPart("qpos"), FieldPart("qvel"))
+        self.forces = simulations.output(FieldPart("cfrc_ext", 0, None, *env._contact_force_range))
 
-    def position(self, fields: Any) -> Any:
-        return fields.xpos[..., self.body, :2].copy()
-
-    def observed(self) -> list[Callable[[Any], Any]]:
+    def observed(self) -> list[FieldPart]:
         parts = _skipping(self.env, 2)
         if self.env._include_cfrc_ext_in_observation:
-            parts.append(lambda s: s.cfrc_ext[:, 1:])
+            parts.append(FieldPart("cfrc_ext", 6, None, *self.env._contact_force_range))
         return parts
 
-    def finish(self, observations: NDArray[np.float64]) -> None:
-        forces = observations[:, self.first_force :]
-        forces.clip(*self.env._contact_force_range, out=forces)
+    def watched(self) -> list[FieldPart]:
+        first = 3 * self.body
+        return [FieldPart("xpos", first, first + 2), FieldPart("qpos", 0, 3)]
+
+    def position(self) -> Any:
+        return self.columns[:2]
 
     def judge(self) -> Judgement:
-        env, state = self.env, self.state
-        _, velocity = self.velocity()
-        xy = state[:, :2].copy()
-        low, high = env._healthy_z_range
-        healthy = np.isfinite(state).all(axis=1) & (low <= state[:, 2]) & (state[:, 2] <= high)
-        forward = velocity[:, 0] * env._forward_reward_weight
+        env, velocity = self.env, self.velocity()
+        (low, high), xy, z = env._healthy_z_range, self.columns[2:4], self.columns[4]
+        healthy = _all_within(-np.inf, self.state.values, np.inf) & (low <= z) & (z <= high)
+        forward = velocity[0] * env._forward_reward_weight
         survive = healthy * env._healthy_reward
         control = env._ctrl_cost_weight * _squares(self.actions)
-        forces = self.forces.clip(*env._contact_force_range)
-        contact = env._contact_cost_weight * _squares(forces)
+        contact = env._contact_cost_weight * _squares(self.forces.values)
 
         def infos() -> dict[str, Any]:
             return {
@@ -323,11 +345,11 @@ class Ant(Task):
                 "reward_survive": survive,
             }
 
-        rewards = forward + survive - (control + contact)
-        return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+        return forward + survive - (control + contact), self.ended(healthy), infos
 
-    def begun(self, fields: Any) -> Columns:
-        return _begun_at(fields.qpos[:, :2])
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        xy = self.columns[2:4]
+        return lambda: _at(xy[:, ids])
 
 
 class _Humanoid(Task):
@@ -335,86 +357,85 @@ class _Humanoid(Task):
 
     needs_forces = True
 
-    def __init__(self, env: Any, fields: Any) -> None:
-        super().__init__(env, fields)
-        self.start = self.gathered(lambda s: s.qpos[:, :3])
-        self.forces = flat(fields.cfrc_ext)
-        self.lengths = self.gathered(lambda s: s.ten_length)
-        self.speeds = self.gathered(lambda s: s.ten_velocity)
+    def __init__(self, env: Any, simulations: Simulations) -> None:
+        super().__init__(env, simulations)
+        self.forces = simulations.output(FieldPart("cfrc_ext"))
+        self.controls = simulations.output(FieldPart("ctrl"))
 
-    def observed(self) -> list[Callable[[Any], Any]]:
+    def observed(self) -> list[FieldPart]:
         env, parts = self.env, _skipping(self.env, 2)
         if env._include_cinert_in_observation is True:
-            parts.append(lambda s: s.cinert[:, 1:])
+            parts.append(FieldPart("cinert", 10))
         if env._include_cvel_in_observation is True:
-            parts.append(lambda s: s.cvel[:, 1:])
+            parts.append(FieldPart("cvel", 6))
         if env._include_qfrc_actuator_in_observation is True:
-            parts.append(lambda s: s.qfrc_actuator[:, 6:])
+            parts.append(FieldPart("qfrc_actuator", 6))
         if env._include_cfrc_ext_in_observation is True:
-            parts.append(lambda s: s.cfrc_ext[:, 1:])
+            parts.append(FieldPart("cfrc_ext", 6))
         return parts
+
+    def watched(self) -> list[FieldPart]:
+        return [FieldPart("qpos", 0, 3), FieldPart("ten_length"), FieldPart("ten_velocity")]
 
     def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
         """Cost of external forces."""
-        return (weight * _squares(self.forces)).clip(*limits)
+        return (weight * _squares(self.forces.values)).clip(*limits)
+
+
+def _tendons(columns: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Infos of lengths and velocities of tendons, from what humanoids watch."""
+    lengths, velocities = np.split(columns[3:], 2)
+    return {"tendon_length": lengths.T.copy(), "tendon_velocity": velocities.T.copy()}
 
 
 class Humanoid(_Humanoid):
-    def position(self, fields: Any) -> Any:
-        single = not hasattr(fields, "model_field")
-        masses = self.env.model.body_mass if single else fields.model_field("body_mass")
-        weighted = masses[..., np.newaxis] * fields.xipos
-        return (weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True))[..., :2]
+    def __init__(self, env: Any, simulations: Simulations) -> None:
+        super().__init__(env, simulations)
+        self.places = simulations.output(FieldPart("xipos"), by_columns=True)
+
+    def position(self) -> Any:
+        masses = self.simulations.model_field("body_mass")
+        places = self.places.values.reshape(-1, 3, self._num)[:, :2]
+        # Of each simulation, or of all.
+        weights = masses.T[:, np.newaxis] if masses.ndim == 2 else masses[:, np.newaxis, np.newaxis]
+        return np.add.reduce(weights * places, axis=0) / masses.sum(axis=-1)
 
     def judge(self) -> Judgement:
-        env, start = self.env, self.start()
-        _, velocity = self.velocity()
-        low, high = env._healthy_z_range
-        healthy = (low < start[:, 2]) & (start[:, 2] < high)
-        forward = env._forward_reward_weight * velocity[:, 0]
+        env, columns, velocity = self.env, self.columns, self.velocity()
+        (low, high), z = env._healthy_z_range, columns[2]
+        healthy = (low < z) & (z < high)
+        forward = env._forward_reward_weight * velocity[0]
         survive = healthy * env._healthy_reward
-        control = env._ctrl_cost_weight * _squares(self.fields.ctrl)
+        control = env._ctrl_cost_weight * _squares(self.controls.values)
         contact = self.clipped(env._contact_cost_weight, env._contact_cost_range)
-        lengths, speeds = self.lengths(), self.speeds()
 
         def infos() -> dict[str, Any]:
             return {
-                "x_position": start[:, 0],
-                "y_position": start[:, 1],
-                "tendon_length": lengths,
-                "tendon_velocity": speeds,
-                "distance_from_origin": _lengths(start[:, :2]),
-                "x_velocity": velocity[:, 0],
-                "y_velocity": velocity[:, 1],
+                **_moved(columns[:2], velocity),
+                **_tendons(columns),
                 "reward_survive": survive,
                 "reward_forward": forward,
                 "reward_ctrl": -control,
                 "reward_contact": -contact,
             }
 
-        rewards = forward + survive - (control + contact)
-        return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+        return forward + survive - (control + contact), self.ended(healthy), infos
 
-    def begun(self, fields: Any) -> Columns:
-        xy, tendons = fields.qpos[:, :2], (fields.ten_length, fields.ten_velocity)
-        return lambda: {**_begun_at(xy)(), **dict(zip(_TENDONS, tendons, strict=True))}
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        columns = self.columns
+        return lambda: {**_at(columns[:2, ids]), **_tendons(columns[:, ids])}
 
 
 class HumanoidStandup(_Humanoid):
     def judge(self) -> Judgement:
-        env, start = self.env, self.start()
-        up = (start[:, 2] - 0) / env.model.opt.timestep
-        control = env._ctrl_cost_weight * _squares(self.fields.ctrl)
+        env, columns = self.env, self.columns
+        up = (columns[2] - 0) / env.model.opt.timestep
+        control = env._ctrl_cost_weight * _squares(self.controls.values)
         impact = self.clipped(env._impact_cost_weight, env._impact_cost_range)
-        lengths, speeds, height = self.lengths(), self.speeds(), start[:, 2] - env.init_qpos[2]
 
         def infos() -> dict[str, Any]:
             return {
-                "x_position": start[:, 0],
-                "y_position": start[:, 1],
-                "z_distance_from_origin": height,
-                "tendon_length": lengths,
-                "tendon_velocity": speeds,
+                **self.stands(columns),
                 "reward_linup": up,
                 "reward_quadctrl": -control,
                 "reward_impact": -impact,
@@ -422,20 +443,22 @@ class HumanoidStandup(_Humanoid):
 
         return up - control - impact + 1, self.never(), infos
 
-    def begun(self, fields: Any) -> Columns:
-        start, tendons = fields.qpos[:, :3], (fields.ten_length, fields.ten_velocity)
-        height = start[:, 2] - self.env.init_qpos[2]
-        return lambda: {
-            "x_position": start[:, 0],
-            "y_position": start[:, 1],
-            "z_distance_from_origin": height,
-            **dict(zip(_TENDONS, tendons, strict=True)),
+    def stands(self, columns: NDArray[np.float64]) -> dict[str, Any]:
+        return {
+            "x_position": columns[0],
+            "y_position": columns[1],
+            "z_distance_from_origin": columns[2] - self.env.init_qpos[2],
+            **_tendons(columns),
         }
+
+    def begun(self, ids: NDArray[np.intp]) -> Columns:
+        columns = self.columns
+        return lambda: self.stands(columns[:, ids])
 
 
 class InvertedPendulum(Task):
-    def observed(self) -> list[Callable[[Any], Any]]:
-        return [lambda s: s.qpos, lambda s: s.qvel]
+    def observed(self) -> list[FieldPart]:
+        return [FieldPart("qpos"), FieldPart("qvel")]
 
     def judge(self) -> Judgement:
         finite = np.isfinite(self.observations).all(axis=1)
@@ -447,35 +470,27 @@ class InvertedPendulum(Task):
 class InvertedDoublePendulum(Task):
     noise = "normal"
 
-    def __init__(self, env: Any, fields: Any) -> None:
-        super().__init__(env, fields)
-        self.tip = self.gathered(lambda s: s.site_xpos[:, 0])
-        self.speeds = self.gathered(lambda s: s.qvel[:, 1:3])
+    def observed(self) -> list[FieldPart]:
+        position, angles = FieldPart("qpos", 0, 1), FieldPart("qpos", 1)
+        clipped = [FieldPart("qvel", 0, None, -10, 10), FieldPart("qfrc_constraint", 0, 1, -10, 10)]
+        return [position, angles, angles, *clipped]
 
-    def observed(self) -> list[Callable[[Any], Any]]:
-        angles: Callable[[Any], Any] = lambda s: s.qpos[:, 1:]  # noqa: E731
-        return [
-            lambda s: s.qpos[:, :1],
-            angles,
-            angles,
-            lambda s: s.qvel,
-            lambda s: s.qfrc_constraint[:, :1],
-        ]
+    def watched(self) -> list[FieldPart]:
+        return [FieldPart("site_xpos", 0, 3), FieldPart("qvel", 1, 3)]
 
-    def finish(self, observations: NDArray[np.float64]) -> None:
-        count = self.env.model.nq - 1
+    def finish(self, which: Any = ...) -> None:
+        observations, count = self.observations[which], self.env.model.nq - 1
         sines, cosines = observations[:, 1 : 1 + count], observations[:, 1 + count : 1 + 2 * count]
         np.sin(sines, out=sines)
         np.cos(cosines, out=cosines)
-        rest = observations[:, 1 + 2 * count :]
-        rest.clip(-10, 10, out=rest)
+        self.observations[which] = observations
 
     def judge(self) -> Judgement:
-        tips, speeds = self.tip().tolist(), self.speeds().tolist()
+        values = self.columns.T.tolist()
         # NumPy squares numbers by C's `pow`, but arrays by a product.
-        distances = np.array([0.01 * x**2 + (y - 2) ** 2 for x, _, y in tips])
-        velocities = np.array([1e-3 * v1**2 + 5e-3 * v2**2 for v1, v2 in speeds])
-        terminated = np.array([y <= 1 for _, _, y in tips])
+        distances = np.array([0.01 * x**2 + (y - 2) ** 2 for x, _, y, _, _ in values])
+        velocities = np.array([1e-3 * v1**2 + 5e-3 * v2**2 for _, _, _, v1, v2 in values])
+        terminated = self.columns[2] <= 1
         alive = self.env._healthy_reward * ~terminated
 
         def infos() -> dict[str, Any]:
@@ -491,15 +506,10 @@ class InvertedDoublePendulum(Task):
 class Pusher(Task):
     noise = "more"  # It draws places until one is far enough away.
 
-    def observed(self) -> list[Callable[[Any], Any]]:
-        arm, thing, goal = (self.env.model.body(name).id for name in ("tips_arm", "object", "goal"))
-        return [
-            lambda s: s.qpos[:, :7],
-            lambda s: s.qvel[:, :7],
-            lambda s: s.xpos[:, arm],
-            lambda s: s.xpos[:, thing],
-            lambda s: s.xpos[:, goal],
-        ]
+    def observed(self) -> list[FieldPart]:
+        firsts = [3 * self.env.model.body(name).id for name in ("tips_arm", "object", "goal")]
+        places = [FieldPart("xpos", first, first + 3) for first in firsts]
+        return [FieldPart("qpos", 0, 7), FieldPart("qvel", 0, 7), *places]
 
     def judge(self) -> Judgement:
         env = self.env
@@ -514,32 +524,35 @@ class Pusher(Task):
 class Reacher(Task):
     noise = "more"  # As above.
 
-    def __init__(self, env: Any, fields: Any) -> None:
-        super().__init__(env, fields)
-        tip, target = (env.model.body(name).id for name in ("fingertip", "target"))
-        self.tip = self.gathered(lambda s: s.xpos[:, tip])
-        self.target = self.gathered(lambda s: s.xpos[:, target])
+    def __init__(self, env: Any, simulations: Simulations) -> None:
+        super().__init__(env, simulations)
+        self.tip, self.target = (
+            simulations.output(FieldPart("xpos", 3 * body, 3 * body + 3))
+            for body in (env.model.body(name).id for name in ("fingertip", "target"))
+        )
 
-    def observed(self) -> list[Callable[[Any], Any]]:
-        angles: Callable[[Any], Any] = lambda s: s.qpos[:, :2]  # noqa: E731
+    def observed(self) -> list[FieldPart]:
+        angles = FieldPart("qpos", 0, 2)
         # The last one is a placeholder for the distance to the target.
         return [
             angles,
             angles,
-            lambda s: s.qpos[:, 2:],
-            lambda s: s.qvel[:, :2],
-            lambda s: s.xpos[:, 0, :2],
+            FieldPart("qpos", 2),
+            FieldPart("qvel", 0, 2),
+            FieldPart("xpos", 0, 2),
         ]
 
-    def finish(self, observations: NDArray[np.float64]) -> None:
+    def finish(self, which: Any = ...) -> None:
+        observations = self.observations[which]
         cosines, sines = observations[:, :2], observations[:, 2:4]
         np.cos(cosines, out=cosines)
         np.sin(sines, out=sines)
-        observations[:, -2:] = (self.tip() - self.target())[:, :2]
+        observations[:, -2:] = (self.tip.values - self.target.values)[which, :2]
+        self.observations[which] = observations
 
     def judge(self) -> Judgement:
         env = self.env
-        distance = -_lengths(self.tip() - self.target()) * env._reward_dist_weight
+        distance = -_lengths(self.tip.values - self.target.values) * env._reward_dist_weight
         control = -_squares(self.actions) * env._reward_control_weight
         infos = {"reward_dist": distance, "reward_ctrl": control}
         return distance + control, self.never(), infos.copy

@@ -1,10 +1,9 @@
 """Many MuJoCo simulations of one model, stepped by MuJoCo's own C++ threads.
 
 This is the C interface of `mujoco.batch` (mjbatch.h, MuJoCo 3.17 and later), called through ctypes:
-its Python class lacks `mjb_apply`, the only fast way to contact forces (`mujoco_forces`). Calls
-release the GIL.
+its Python class lacks `mjb_apply`, which `outputs` needs. Calls release the GIL.
 Rule: a simulation is a row of numbers, the integration state; everything else is an output that is
-valid after a call. Left out: which numbers a task observes (`mujoco_tasks`).
+valid after a call. Left out: which numbers a task observes (`tasks`).
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import ctypes
 import os
 import time
 import weakref
-from ctypes import POINTER, byref, c_bool, c_char_p, c_int, c_void_p
+from ctypes import POINTER, byref, c_bool, c_char_p, c_int, c_int64, c_void_p
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -21,7 +20,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.envs.mujoco.forces import StepsWithForces, compiled
+from rlightning_aio.envs.mujoco.outputs import (
+    AdvancePlan,
+    FieldPart,
+    Output,
+    address_of,
+    compiled,
+    offset_of,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,7 +39,7 @@ mujoco: Any = import_module("mujoco")
 
 _INTEGRATION: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 _ALL_STAGES: Final = int(mujoco.mjtStage.mjSTAGE_ACC)
-_STATE_FIELDS: Final = ("qpos", "qvel", "ctrl", "qacc_warmstart")
+_STATE_FIELDS: Final = ("qpos", "qvel", "ctrl")
 _UNSTABLE: Final = {
     int(warning): name
     for warning, name in (
@@ -89,9 +95,6 @@ def state_of(model: Any, data: Any, row: NDArray[np.float64]) -> None:
 class Simulations:
     """Simulations of one model.
 
-    Fields have MuJoCo's names: ``simulations.qpos`` is a live array ``[count, nq]``. Fields of the
-    state may be written; others are outputs of the last call on each simulation.
-
     Args:
         model: shared by all simulations, so changes of it take effect; copied if `own_models`.
         count: the number of simulations.
@@ -102,7 +105,11 @@ class Simulations:
     Attributes:
         rows: states of the simulations, ``[count, ...]`` float64.
         moving: the part of `rows` that a step reads and changes; controls are only read.
-        busy_ns: duration of the last call of `step`; 0 before the first.
+        num_steps: of MuJoCo, for each simulation in the next `advance`; 0 for a reset.
+        starts: positions and velocities after a reset, ``[count, nq + nv]``.
+        controls: of the steps, ``[count, nu]``.
+        before: `moving` before the last steps, or after the last reset.
+        busy_ns: duration of the last call of `advance`; 0 before the first.
 
     Raises:
         NotImplementedError: MuJoCo is older than 3.17.
@@ -120,10 +127,7 @@ class Simulations:
         self._library = library = _library()
         self.count, self._model = count, model
         self._template = mujoco.MjData(model)
-        function = compiled() if forces else None
-        self._with_forces: StepsWithForces | None = None
-        if function is not None:
-            self._with_forces = StepsWithForces(library, function, count, self._template)
+        function = compiled()
         # Without the compiled function, MuJoCo must keep what forces are computed from.
         self._keeps_data, self._has_forces = forces and function is None, forces
         config = _Config(min(num_threads, count), self._keeps_data)
@@ -145,7 +149,16 @@ class Simulations:
             library.mjb_setModels(self._batch, models)
         size = library.mjb_nstate(self._batch)
         self.rows = _array(library.mjb_state(self._batch), np.float64, (count, size))
-        self.moving = self.rows[:, : _num_moving(model, size)]
+        self._signature = _moving(model)
+        self.moving = self.rows[:, : mujoco.mj_stateSize(model, self._signature)]
+        self.num_steps = np.zeros(count, np.int64)
+        self.starts = np.zeros((count, model.nq + model.nv))
+        self.controls = np.zeros((count, model.nu))
+        self.before = self.moving.copy()
+        self._outputs: list[Output] = []
+        self._fields: dict[str, NDArray[Any]] = {}
+        self._plan = None if function is None else self._planned()
+        self._function, self._plan_at = c_void_p(function), self._plan and byref(self._plan)
         num_warnings = int(mujoco.mjtWarning.mjNWARNING)
         # Pairs of the last details and a number.
         warnings = _array(library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2))
@@ -154,25 +167,55 @@ class Simulations:
         self._expanded: dict[str, NDArray[Any]] = {}
         self.busy_ns = 0
 
-    def __getattr__(self, name: str) -> NDArray[Any]:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        found = self.__dict__[name] = self._field(name)
+    def _planned(self) -> AdvancePlan:
+        """Return what the compiled function is to do for each simulation."""
+        library, template, model = self._library, self._template, self._model
+        names = ["mj_resetData", "mj_forward", "mj_step", "mj_rnePostConstraint", "mj_getState"]
+        functions = [ctypes.cast(getattr(library, name), c_void_p) for name in names]
+        if not self._has_forces:
+            functions[3] = c_void_p()
+        fields = [offset_of(name, template) for name in ("qpos", "qvel", "ctrl")]
+        arrays = (self.num_steps, self.starts, self.controls, self.before)
+        return AdvancePlan(
+            *functions,
+            self._signature,
+            self.moving.shape[1],
+            (c_int64 * 3)(*fields),
+            (c_int64 * 3)(model.nq, model.nv, model.nu),
+            *map(address_of, arrays),
+        )
+
+    def output(self, *parts: FieldPart, by_columns: bool = False) -> Output:
+        """Copy parts of each simulation after its steps or resets; see `Output`."""
+        found = Output(parts, self._template, self.count, self._plan, by_columns=by_columns)
+        self._outputs.append(found)
+        if self._plan is None:
+            for part in parts:
+                self._field(part.field)  # MuJoCo copies it from now on.
         return found
 
+    def forget_outputs(self) -> None:
+        """Copy nothing from now on."""
+        self._outputs.clear()
+        if self._plan is not None:
+            self._plan.num_parts = 0
+
     def _field(self, name: str) -> NDArray[Any]:
+        """A field of all simulations, ``[count, ...]``, where no function was compiled."""
+        found = self._fields.get(name)
+        if found is None:
+            found = self._fields[name] = self._found(name)
+        return found
+
+    def _found(self, name: str) -> NDArray[Any]:
         shape = getattr(self._template, name).shape
         size, width = c_int(), c_int()
         if name in _STATE_FIELDS:
-            bit = getattr(mujoco.mjtState, f"mjSTATE_{name.removeprefix('qacc_').upper()}")
+            bit = getattr(mujoco.mjtState, f"mjSTATE_{name.upper()}")
             address = self._library.mjb_stateComponent(self._batch, int(bit), byref(size))
             first = (address - self.rows.ctypes.data) // self.rows.itemsize
             return self.rows[:, first : first + size.value]
-        if self._with_forces is not None:
-            return self._with_forces.output(name)
         address = self._library.mjb_output(self._batch, name.encode(), byref(size), byref(width))
-        if not address:
-            raise AttributeError(f"MuJoCo's batches have no field {name!r}")
         return _array(address, _DTYPES[width.value], (self.count, *shape))
 
     # -- models -------------------------------------------------------------------------
@@ -215,8 +258,10 @@ class Simulations:
             ValueError: MuJoCo refuses the values.
         """
         chosen, count = _chosen(ids)
-        if self._library.mjb_setConst(self._batch, chosen, count):
-            raise ValueError(f"MuJoCo refuses a model: {'; '.join(self._failures().values())}")
+        num_failed = self._library.mjb_setConst(self._batch, chosen, count)
+        if num_failed:
+            causes = "; ".join(self._failures(num_failed).values())
+            raise ValueError(f"MuJoCo refuses a model: {causes}")
 
     def show_model(self, k: int) -> None:
         """Write the model of simulation `k` to the common model, if simulations differ."""
@@ -226,49 +271,73 @@ class Simulations:
 
     # -- steps --------------------------------------------------------------------------
 
-    def step(self, num_steps: int, ids: NDArray[np.int32] | None = None) -> dict[int, str]:
-        """Take `num_steps` steps of MuJoCo in the simulations `ids`, or in all.
+    def advance(self, ids: NDArray[np.int32] | None = None) -> dict[int, str]:
+        """Step or reset the simulations `ids`, or all, each as its element of `num_steps` says.
+
+        Contact forces are 0 after a reset.
 
         Returns:
             Reasons of failures by simulation. After an error of MuJoCo the simulation is in its
             previous state; if it became unstable, MuJoCo resets it to the defaults of the model.
-        """
-        library, began = self._library, time.monotonic_ns()
-        chosen, count = _chosen(ids)
-        if self._with_forces is not None:
-            num_failed = self._with_forces.step(self._batch, chosen, count, num_steps)
-        else:
-            num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
-        failures = self._failures() if num_failed or np.count_nonzero(self._warned) else {}
-        if self._keeps_data:
-            forces = library.mj_rnePostConstraint  # It ignores the further arguments.
-            library.mjb_apply(self._batch, chosen, count, forces, None, False)
-            # Computes nothing, but copies the outputs.
-            library.mjb_forward(self._batch, chosen, count, 0)
-        self.busy_ns = time.monotonic_ns() - began
-        return failures
-
-    def forward(self, ids: NDArray[np.int32]) -> None:
-        """Compute what follows from the states of the simulations `ids`, as a reset does.
-
-        Contact forces are 0 then.
 
         Raises:
-            RuntimeError: MuJoCo can't compute it.
+            RuntimeError: MuJoCo can't reset a simulation.
         """
-        library = self._library
-        chosen, count = _chosen(ids)
-        if self._with_forces is not None:
-            num_failed = self._with_forces.forward(self._batch, chosen, count)
+        began = time.monotonic_ns()
+        if self._plan is None:
+            failures = self._advance_by_numpy(ids)
         else:
-            num_failed = library.mjb_forward(self._batch, chosen, count, _ALL_STAGES)
-        if num_failed:
-            raise RuntimeError(f"MuJoCo can't reset: {'; '.join(self._failures().values())}")
-        if self._has_forces:
-            self.cfrc_ext[ids] = 0.0
+            chosen, count = _chosen(ids)
+            failures = self._failures(
+                self._library.mjb_apply(
+                    self._batch, chosen, count, self._function, self._plan_at, True
+                )
+            )
+        self.busy_ns = time.monotonic_ns() - began
+        for k, cause in failures.items():
+            if not self.num_steps[k]:
+                raise RuntimeError(f"MuJoCo can't reset: {cause}")
+            self.before[k], self.num_steps[k] = self.moving[k], 0
+        return failures
 
-    def _failures(self) -> dict[int, str]:
+    def _advance_by_numpy(self, ids: NDArray[np.int32] | None) -> dict[int, str]:
+        """The twin of the compiled function, for several simulations. Return failures."""
+        library, batch = self._library, self._batch
+        all_ids = np.arange(self.count, dtype=np.int32) if ids is None else ids
+        is_reset = self.num_steps[all_ids] == 0
+        begun, stepped = all_ids[is_reset], all_ids[~is_reset]
         failures: dict[int, str] = {}
+        if len(begun):
+            mujoco.mj_resetData(self._model, self._template)
+            state_of(self._model, self._template, first := np.empty_like(self.rows[0]))
+            self.rows[begun], nq = first, self._model.nq
+            self._field("qpos")[begun] = self.starts[begun, :nq]
+            self._field("qvel")[begun] = self.starts[begun, nq:]
+            failures = self._failures(library.mjb_forward(batch, *_chosen(begun), _ALL_STAGES))
+            self.before[begun] = self.moving[begun]
+            if self._has_forces:
+                self._field("cfrc_ext")[begun] = 0.0
+        if len(stepped):
+            self._field("ctrl")[stepped] = self.controls[stepped]
+            self.before[stepped] = self.moving[stepped]
+            chosen, num_steps = _chosen(stepped), int(self.num_steps[stepped[0]])
+            failures |= self._failures(library.mjb_step(batch, *chosen, num_steps, 0))
+            if self._keeps_data:
+                forces = library.mj_rnePostConstraint  # It ignores the further arguments.
+                library.mjb_apply(batch, *chosen, forces, None, False)
+                # Computes nothing, but copies the outputs.
+                library.mjb_forward(batch, *chosen, 0)
+        for output in self._outputs:
+            output.read(
+                all_ids, {part.field: self._field(part.field)[all_ids] for part in output.parts}
+            )
+        return failures
+
+    def _failures(self, num_failed: int) -> dict[int, str]:
+        """Reasons of failures in a call that returned their number."""
+        failures: dict[int, str] = {}
+        if not num_failed and not np.count_nonzero(self._warned):
+            return failures
         for warning, name in _UNSTABLE.items():
             for k in np.flatnonzero(self._warnings[:, warning]).tolist():
                 failures[k] = f"NaN, infinite or huge {name}: the simulation is unstable"
@@ -277,17 +346,22 @@ class Simulations:
             failures[k] = " ".join(self._library.mjb_error(self._batch, k).decode().split())
         return failures
 
-    def data_of(self, k: int, before: NDArray[np.float64], num_steps: int) -> Any:
-        """All data of simulation `k` after its last step, by repeating that step.
+    def put(self, k: int, data: Any, unread: Output) -> None:
+        """Continue simulation `k` from `data`, and copy its parts to all outputs but one."""
+        state_of(self._model, data, self.rows[k])
+        self.before[k], self.num_steps[k] = self.moving[k], 0
+        for output in self._outputs:
+            if output is not unread:
+                output.read(
+                    [k],
+                    {part.field: getattr(data, part.field)[np.newaxis] for part in output.parts},
+                )
 
-        Args:
-            k: position of the simulation.
-            before: the moving part of its state before the step.
-            num_steps: number of MuJoCo's steps in it; 0 after a reset.
-        """
+    def data_of(self, k: int) -> Any:
+        """All data of simulation `k` after its last step, by repeating that step."""
         self.show_model(k)
-        data = mujoco.MjData(self._model)
-        state = self.rows[k].copy()
+        data, num_steps = mujoco.MjData(self._model), int(self.num_steps[k])
+        state, before = self.rows[k].copy(), self.before[k]
         state[: len(before)] = before
         mujoco.mj_setState(self._model, data, state, _INTEGRATION)
         if not num_steps:
@@ -308,14 +382,12 @@ def _chosen(ids: NDArray[np.int32] | None) -> tuple[Any, int]:
     return ids.ctypes.data_as(POINTER(c_int)), len(ids)
 
 
-def _num_moving(model: Any, size: int) -> int:
-    """Number of leading values of a state that steps change; all `size`, if others change, too."""
+def _moving(model: Any) -> int:
+    """Signature of the leading values of a state that steps change; of all, if others change."""
     states = mujoco.mjtState
     leading = int(states.mjSTATE_CTRL) - 1  # Up to the warm start.
     changing = int(states.mjSTATE_FULLPHYSICS) | int(states.mjSTATE_USERDATA)
-    if mujoco.mj_stateSize(model, changing & ~leading):
-        return size
-    return mujoco.mj_stateSize(model, leading)
+    return _INTEGRATION if mujoco.mj_stateSize(model, changing & ~leading) else leading
 
 
 def _array(address: int, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:

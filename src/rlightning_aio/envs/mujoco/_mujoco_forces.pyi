@@ -1,1 +1,0 @@
-STEP_AND_FINISH: int
