@@ -33,7 +33,7 @@ PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-chec
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
-run: $(VENV)/installed ## 32 HalfCheetahs, by AsyncVectorEnv and by make_vec: how much faster on this machine
+run: $(VENV)/installed ## three kinds of envs, by AsyncVectorEnv and here: how much faster on this machine
 	@$(PY) benchmarks/demo.py
 
 # Tests that run programs take a third of the time, so they have a target of their own.

@@ -1,6 +1,7 @@
-"""The program of `make run`: steps the envs of headline.py in turns, and shows both speeds live.
+"""The program of `make run`: three kinds of envs, stepped by AsyncVectorEnv and by this library.
 
-Ctrl-C ends it early, with the figures measured so far.
+MuJoCo's envs in one batch, a plain Python env in workers, and an env that waits, 32 of each. The
+two take turns, and the table is filled in live. Ctrl-C ends it early, with the figures so far.
 """
 
 from __future__ import annotations
@@ -9,14 +10,22 @@ import argparse
 import statistics
 import sys
 from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from harness import Stage, number_text
+import numpy as np
+from contenders import GymnasiumAsync, MakeVec, Work
+from harness import Contender, Stage, number_text, throughput
 from headline import GYMNASIUM, OURS
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from waiting import BriefAwaiting, BriefSleeping
 
-WIDTH = 32
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+NUM_ENVS = 32
 NEXT_STEPS = """\
 Next:
   examples/async_loop.py        first come, first served, in a few lines
@@ -28,43 +37,135 @@ Next:
 """
 
 
-def speeds(rates: dict[str, list[float]]) -> Table:
-    """Return a row for each contender: a bar for its median rate, and the rate."""
-    table = Table(title="32 HalfCheetah-v5, random actions", show_header=False, box=None)
-    medians = {name: statistics.median(found) for name, found in rates.items() if found}
-    fastest = max(medians.values(), default=1.0)
-    for name in rates:
-        median = medians.get(name, 0.0)
-        rate = f"{number_text(median)} env steps/s" if median else "starts"
-        table.add_row(name, f"{'█' * round(WIDTH * median / fastest):{WIDTH}}", rate)
+@dataclass
+class InProcesses(Contender):
+    """`AsyncVectorEnv`, which waits for the slowest env at each step."""
+
+    name: str = "AsyncVectorEnv"
+
+    def setup(self) -> None:
+        from gymnasium.vector import AsyncVectorEnv
+
+        self._envs: Any = AsyncVectorEnv([BriefSleeping] * NUM_ENVS)
+        self._envs.reset(seed=0)
+        self._actions = np.zeros(NUM_ENVS, np.int64)
+
+    def round(self, seconds: float) -> float:
+        return throughput(self._step, seconds)
+
+    def _step(self) -> int:
+        self._envs.step(self._actions)
+        return NUM_ENVS
+
+    def teardown(self) -> None:
+        self._envs.close()
+
+
+@dataclass
+class Awaited(Contender):
+    """A group of awaitable envs on the event loop of one worker: first come, first served."""
+
+    name: str = "build_env_group"
+
+    def setup(self) -> None:
+        from rlightning_aio import sync
+
+        self._group = sync.build_env_group(BriefAwaiting, num_workers=NUM_ENVS)
+        self._group.init()
+        batch, _ = self._group.reset(seed=0)
+        self._actions = np.zeros(NUM_ENVS, np.int64)
+        self._group.step_async(batch.respond(action=self._actions))
+
+    def round(self, seconds: float) -> float:
+        return throughput(self._step, seconds)
+
+    def _step(self) -> int:
+        batch, _ = self._group.collect_async(min_results=1)
+        self._group.step_async(batch.respond(action=self._actions[: len(batch)]))
+        return len(batch)
+
+    def teardown(self) -> None:
+        self._group.close()
+
+
+class Line(NamedTuple):
+    """A line of the table: what is stepped, and who steps it."""
+
+    title: str
+    theirs: Contender
+    ours: Contender
+
+
+CARTPOLES = Work("CartPole-v1", NUM_ENVS)
+LINES = (
+    Line("MuJoCo in one batch", GYMNASIUM, OURS),
+    Line(
+        "plain Python in workers",
+        GymnasiumAsync("AsyncVectorEnv", CARTPOLES),
+        MakeVec("make_vec", CARTPOLES),
+    ),
+    Line("an env that waits", InProcesses(), Awaited()),
+)
+
+
+class Rates(NamedTuple):
+    """Env steps per second of each round."""
+
+    theirs: list[float]
+    ours: list[float]
+
+    def ratio(self) -> float:
+        """Return how many times as fast ours is; both have played the same rounds."""
+        pairs = zip(self.ours, self.theirs, strict=False)
+        return statistics.median(ours / theirs for ours, theirs in pairs)
+
+
+def table_of(rates: list[Rates]) -> Table:
+    """Return the table; a line that has not been measured says what happens."""
+    title = f"Env steps per second of {NUM_ENVS} HalfCheetahs, CartPoles and awaitable envs"
+    table = Table(title=title, box=None)
+    table.add_column("")
+    for title in ("AsyncVectorEnv", "rlightning_aio", "times as fast"):
+        table.add_column(title, justify="right")
+    for line, found in zip(LINES, rates, strict=False):
+        if not found.ours:
+            table.add_row(line.title, "starts")
+            continue
+        medians = [number_text(statistics.median(one)) for one in found]
+        table.add_row(line.title, *medians, f"{found.ratio():.1f}")
     return table
+
+
+def measure(line: Line, found: Rates, rounds: int, seconds: float, show: Callable[[], Any]) -> None:
+    """Have both take turns; add what they reach to `found`."""
+    with ExitStack() as stack:
+        theirs, ours = (stack.enter_context(Stage(one)) for one in (line.theirs, line.ours))
+        for _ in range(rounds):
+            rate, _ = theirs.round(seconds)
+            found.theirs.append(rate)
+            rate, _ = ours.round(seconds)
+            found.ours.append(rate)
+            show()
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=10, help="turns of each (default: 10)")
+    parser.add_argument("--rounds", type=int, default=5, help="turns of each (default: 5)")
     parser.add_argument("--seconds", type=float, default=0.4, help="of a turn (default: 0.4)")
     args = parser.parse_args()
     console = Console()
-    rates: dict[str, list[float]] = {GYMNASIUM.name: [], OURS.name: []}
+    rates: list[Rates] = []
     interrupted = False
     try:
-        with Live(speeds(rates), console=console) as live, ExitStack() as stack:
-            stages = [stack.enter_context(Stage(c)) for c in (GYMNASIUM, OURS)]
-            for _ in range(args.rounds):
-                for stage in stages:
-                    rate, _ = stage.round(args.seconds)
-                    rates[stage.contender.name].append(rate)
-                    live.update(speeds(rates))
+        with Live(table_of(rates), console=console) as live:
+            for line in LINES:
+                rates.append(Rates([], []))
+                live.update(table_of(rates))
+                show = lambda: live.update(table_of(rates))  # noqa: E731
+                measure(line, rates[-1], args.rounds, args.seconds, show)
     except KeyboardInterrupt:
         interrupted = True
-    pairs = list(zip(rates[OURS.name], rates[GYMNASIUM.name], strict=False))
-    if pairs:
-        ratio = statistics.median(ours / theirs for ours, theirs in pairs)
-        console.print(
-            f"\nOn this machine make_vec is {ratio:.1f} times as fast as AsyncVectorEnv.\n"
-        )
-    console.print(NEXT_STEPS, highlight=False, soft_wrap=True)
+    console.print(f"\n{NEXT_STEPS}", highlight=False, soft_wrap=True)
     return 130 if interrupted else 0
 
 

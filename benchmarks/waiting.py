@@ -1,4 +1,5 @@
-"""Envs whose steps wait for 20 to 500 ms and do nothing else, awaitable and not.
+"""Envs whose steps wait for 20 to 500 ms (brief ones: a tenth of that) and do nothing else,
+awaitable and not.
 
 The latencies are log-normal and drawn beforehand; each env begins at another one of them.
 """
@@ -56,3 +57,16 @@ class Sleeping(Waits, gym.Env[Any, Any]):
         del action
         time.sleep(self.latency())
         return IDLE, 1.0, False, False, {}
+
+
+class _Brief(Waits):
+    def latency(self) -> float:
+        return super().latency() / 10
+
+
+class BriefAwaiting(_Brief, Awaiting):
+    pass
+
+
+class BriefSleeping(_Brief, Sleeping):
+    pass
