@@ -192,7 +192,7 @@ class Facade:
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        return self._driver.call(self._core.pending)
+        return self._driver.look(self._core.pending)
 
     def step_async(self, batch: BatchedData) -> None:
         """Send a step to each env of `batch`; `collect_async` returns the results. Never blocks.
@@ -369,7 +369,7 @@ class Facade:
         Raises:
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        return self._driver.call(self._core.describe_workers, time.monotonic_ns())
+        return self._driver.look(self._core.describe_workers, time.monotonic_ns())
 
     def print_timing_summary(self) -> None:
         """Print the figures of `get_stats` as a table."""

@@ -92,6 +92,10 @@ class AioDriver:
         self.check_caller()
         return function(*args)
 
+    def look(self, function: Callable[..., T], *args: Any) -> T:
+        """Call a function that only looks at the group: as any other."""
+        return self.call(function, *args)
+
     def interruptible(self, execute: Callable[[], T]) -> T:
         """Call a function that runs an env; asyncio handles Ctrl-C."""
         return execute()

@@ -157,7 +157,7 @@ class SyncDriver:
         Of an interrupt that it has not raised, the next call hears: it must not take a result or an
         error. Where there is none of these, it is raised at once.
         """
-        state = self._enter()
+        state = self._enter(hears=True)
         try:
             result = function(*args)
         finally:
@@ -167,10 +167,18 @@ class SyncDriver:
             raise KeyboardInterrupt
         return result
 
+    def look(self, function: Callable[[*A], T], *args: *A) -> T:
+        """Call a function that only looks at the group; an interrupt is for the next `call`."""
+        state = self._enter(hears=False)
+        try:
+            return function(*args)
+        finally:
+            self._leave(*state)
+
     # -- one thread at a time, and Ctrl-C ---------------------------------------------
 
-    def _enter(self) -> tuple[bool, bool, bool]:
-        """Begin a call.
+    def _enter(self, *, hears: bool) -> tuple[bool, bool, bool]:
+        """Begin a call, which raises an interrupt that the last one has not raised if it `hears`.
 
         Returns True if it is no call within another; True if it holds back Ctrl-C, as a program
         that handles SIGINT in its own way goes on doing so; and True if it was allowed before.
@@ -188,7 +196,7 @@ class SyncDriver:
                 and _signal.getsignal(_SIGINT) is signal.default_int_handler
             )
             if holds_back:
-                if self._was_interrupted:
+                if hears and self._was_interrupted:
                     self._was_interrupted = False
                     raise KeyboardInterrupt
                 self._is_interrupted = False
@@ -211,7 +219,8 @@ class SyncDriver:
                 self._is_interrupted = True
                 self._stop_holding_back()
             # Nothing is called from here on, so Python handles no signal before the call returns.
-            self._was_interrupted, self._is_interrupted = self._is_interrupted, False
+            self._was_interrupted |= self._is_interrupted
+            self._is_interrupted = False
 
     def _stop_holding_back(self) -> None:
         if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.

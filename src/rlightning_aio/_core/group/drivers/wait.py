@@ -129,6 +129,10 @@ class Driver(Watcher, Protocol):
         """Call a function of the group that doesn't wait, after `check_caller`."""
         ...
 
+    def look(self, function: Callable[..., T], *args: Any) -> T:
+        """Call a function that only looks at the group, after `check_caller`."""
+        ...
+
     def forget(self) -> None:
         """Forget all sources without unregistering them, as the parent still watches them."""
         ...
