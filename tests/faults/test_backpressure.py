@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -123,7 +124,9 @@ def test_an_unread_stderr_hides_no_death() -> None:
         assert process.stdout is not None
         assert process.stderr is not None
         assert sum("exited with code 3" in line for line in read_until(process.stdout, "read")) == 3
-        written = process.stderr.read()
-        read_until(process.stdout, "printed by faulty-0")
-        read_until(process.stdout, "closed")
+        with ThreadPoolExecutor() as pool:
+            reading = pool.submit(process.stderr.read)
+            read_until(process.stdout, "printed by faulty-0")
+            read_until(process.stdout, "closed")
+            written = reading.result()
     assert written.count("e" * 1023 + "\n") == 3000

@@ -357,7 +357,7 @@ def test_infos_of_ten_megabytes_arrive_complete(start: Start) -> None:
 def test_megabytes_on_stdout_and_stderr_change_nothing(
     start: Start, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """They reach the trainer's stderr; the step is an ordinary one."""
+    """They reach the trainer's stdout and stderr; the step is an ordinary one."""
     group, tokens = start(two_workers()), Tokens()
     for _ in range(2):
         batch, _ = group.step(
@@ -365,8 +365,9 @@ def test_megabytes_on_stdout_and_stderr_change_nothing(
         )
         tokens.check(batch)
     group.close()
-    written = capfd.readouterr().err
-    assert written.count("o") == written.count("e") == 2 * 4 * 3000 * 1023
+    written = capfd.readouterr()
+    assert written.out.count("o") == written.err.count("e") == 2 * 4 * 3000 * 1023
+    assert not written.out.count("e")
 
 
 def local_env(reward: Callable[[Any], float]) -> Callable[[], gym.Env[Any, Any]]:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import select
 import socket
+import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from patience import HANG
 
 from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.messages import WorkerPlace
@@ -116,13 +118,63 @@ def test_an_exit_is_reported_even_if_another_process_continues_to_write(
     os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
     server: Any = object.__new__(fork_server._ForkServer)
     server._poll = select.poll()
-    server._outlet = fork_server._Outlet(server._poll)
+    outlet = fork_server._Outlet(server._poll, 2)
     server._trainer = type("Trainer", (), {"send": sent.append})
     channel = os.open(os.devnull, os.O_RDONLY)
-    server._children = {pid: fork_server._Child(7, pid, reader, channel)}
+    server._children = {
+        pid: fork_server._Child(7, pid, [fork_server._Output(reader, outlet)], channel)
+    }
     server._handle_exits()
     os.close(writer)
     (exited,) = sent
     assert isinstance(exited, Exited)
     assert (exited.host_id, exited.exit_code) == (7, 1)
     assert exited.stderr_tail.endswith("last words")
+
+
+PRINTING = """
+import os, sys
+import gymnasium as gym
+from rlightning_aio import sync
+
+
+class Printing(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        print("a line of reset")
+        return 0, {}
+
+    def step(self, action):
+        print("to stdout")
+        print("to stderr", file=sys.stderr)
+        if action:
+            os.kill(os.getpid(), 9)
+        return 0, 0.0, False, False, {}
+
+
+with sync.build_env_group(Printing) as group:
+    batch, _ = group.reset(seed=0)
+    for action in (0, 1):
+        batch, _ = group.step(batch.respond(action=[action]))
+"""
+
+
+def test_what_an_env_prints_goes_to_stdout(tmp_path: Path) -> None:
+    """At once, so that the last lines of a worker that is killed are there, too."""
+    (tmp_path / "printing.py").write_text(PRINTING)
+    command = [sys.executable, tmp_path / "printing.py"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines() == ["a line of reset", *["to stdout"] * 2, "a line of reset"]
+    assert ended.stderr.count("to stderr\n") >= 2
+
+
+def test_a_program_with_one_output_shows_lines_in_their_order(tmp_path: Path) -> None:
+    """As on a terminal, where stdout and stderr are the same."""
+    (tmp_path / "printing.py").write_text(PRINTING)
+    with (tmp_path / "output").open("w") as output:
+        command = [sys.executable, tmp_path / "printing.py"]
+        subprocess.run(command, stdout=output, stderr=output, check=True, timeout=HANG)
+    lines = (tmp_path / "output").read_text().splitlines()
+    assert lines[:3] == ["a line of reset", "to stdout", "to stderr"]

@@ -1,8 +1,9 @@
 """The fork server: a small process that forks workers and reports their exit.
 
 One runs for each combination of interpreter and environment variables. It has imported the modules
-of the simulator, so a worker starts in milliseconds. It keeps the last lines that each worker wrote
-to stderr. When the trainer closes its end of the socket or dies, all workers are killed.
+of the simulator, so a worker starts in milliseconds. It passes on what workers write to stdout and
+stderr, and keeps the last lines of each. When the trainer closes its end of the socket or dies, all
+workers are killed.
 Rule: it has one thread when it forks. It builds no env.
 """
 
@@ -24,7 +25,7 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
@@ -39,7 +40,8 @@ from rlightning_aio._core.hosts.process.fork_messages import (
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+    from io import TextIOWrapper
     from types import FrameType
 
     from rlightning_aio._core.hosts.process.fork_messages import Message
@@ -82,7 +84,8 @@ _DUMP_SECONDS: Final = 0.3
 _ERROR_CHARACTERS: Final = 60_000
 _OUTLET_BYTES: Final = 1 << 20
 _READ_SECONDS: Final = 0.2
-"""If the reader of stderr reads nothing for this long, it is considered gone."""
+"""If the reader of stdout or stderr reads nothing for this long, it is considered gone."""
+_STDOUT: Final = 1
 _STDERR: Final = 2
 
 
@@ -94,21 +97,30 @@ class _Child:
 
     host_id: int
     pid: int
-    stderr: int
+    outputs: list[_Output]
     channel: int
     tail: bytearray = field(default_factory=bytearray)
     kill_at: float | None = None
+
+
+@dataclass
+class _Output:
+    """What a worker writes to stdout, to stderr, or to both if they are the same file here."""
+
+    reader: int
+    outlet: _Outlet
     silent: bool = False
 
 
 class _Outlet:
-    """Forwards the stderr of workers, and never blocks.
+    """Forwards what workers write to a descriptor, and never blocks.
 
     The stderr of the trainer may be a pipe without a reader. Then output waits here, and when
     there is too much of it, in the pipes of the workers.
     """
 
-    def __init__(self, poll: select.poll) -> None:
+    def __init__(self, poll: select.poll, descriptor: int) -> None:
+        self.descriptor = descriptor
         self._poll = poll
         self._waiting = bytearray()
 
@@ -123,26 +135,27 @@ class _Outlet:
     def empty(self, until: float) -> None:
         """Write the rest while the reader reads."""
         reader = select.poll()
-        reader.register(_STDERR, select.POLLOUT)
+        reader.register(self.descriptor, select.POLLOUT)
         while self._waiting and time.monotonic() < until and reader.poll(_READ_SECONDS * 1000):
             self.flush()
 
     def flush(self) -> None:
         """Write without blocking; poll for more room if necessary."""
         probe = select.poll()
-        probe.register(_STDERR, select.POLLOUT)
+        probe.register(self.descriptor, select.POLLOUT)
         while self._waiting:
             events = probe.poll(0)
             if not events:
-                self._poll.register(_STDERR, select.POLLOUT)
+                self._poll.register(self.descriptor, select.POLLOUT)
                 return
             try:
                 # A pipe that is writable takes this much without blocking.
-                del self._waiting[: os.write(_STDERR, self._waiting[: select.PIPE_BUF])]
+                size = os.write(self.descriptor, self._waiting[: select.PIPE_BUF])
+                del self._waiting[:size]
             except OSError:
                 self._waiting.clear()  # The reader is gone.
         with contextlib.suppress(KeyError):
-            self._poll.unregister(_STDERR)
+            self._poll.unregister(self.descriptor)
 
 
 def die_with_parent() -> None:
@@ -171,7 +184,9 @@ class _ForkServer:
         self._poll = select.poll()
         if trainer_process >= 0:
             self._poll.register(trainer_process, select.POLLIN)
-        self._outlet = _Outlet(self._poll)
+        # Where both are the same file, such as a terminal, one pipe keeps the order of lines.
+        streams = (_STDERR,) if os.path.sameopenfile(_STDOUT, _STDERR) else (_STDOUT, _STDERR)
+        self._outlets = [_Outlet(self._poll, stream) for stream in streams]
         # A byte arrives here whenever a child exits.
         self._wakeup, wakeup = socket.socketpair()
         self._wakeup.setblocking(False)
@@ -212,8 +227,10 @@ class _ForkServer:
         if descriptor == self._wakeup.fileno():
             with contextlib.suppress(BlockingIOError):
                 self._wakeup.recv(4096)
-        elif descriptor == _STDERR:
-            self._outlet.flush()
+        elif descriptor in (_STDOUT, _STDERR):
+            for outlet in self._outlets:
+                if outlet.descriptor == descriptor:
+                    outlet.flush()
             self._choose_readable()
         else:
             self._forward(descriptor)
@@ -232,26 +249,29 @@ class _ForkServer:
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
-        pipe: list[int] = []
+        pipes: list[int] = []
         parent = os.getpid()
         try:
             if len(descriptors) < 2:
                 raise OSError("its descriptors didn't arrive: too many are open")
-            pipe += os.pipe()
+            for _ in self._outlets:
+                pipes += os.pipe()
             pid = os.fork()
         except OSError as error:
-            for descriptor in (*pipe, *descriptors):
+            for descriptor in (*pipes, *descriptors):
                 os.close(descriptor)
             self._trainer.send(NotForked(order.place.host_id, str(error)))
             return
-        reader, writer = pipe
+        readers, writers = pipes[::2], pipes[1::2]
         channel, arena = descriptors
         if pid == 0:
-            _run_worker(self._become_worker, parent, writer, order, channel, arena)
-        os.close(writer)
-        os.close(arena)
-        os.set_blocking(reader, False)
-        self._children[pid] = _Child(order.place.host_id, pid, reader, channel)
+            _run_worker(self._become_worker, parent, writers, order, channel, arena)
+        for descriptor in (*writers, arena):
+            os.close(descriptor)
+        for reader in readers:
+            os.set_blocking(reader, False)
+        outputs = [_Output(*both) for both in zip(readers, self._outlets, strict=True)]
+        self._children[pid] = _Child(order.place.host_id, pid, outputs, channel)
         self._choose_readable()
         self._trainer.send(Forked(order.place.host_id, pid))
 
@@ -260,7 +280,8 @@ class _ForkServer:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         for child in self._children.values():
-            os.close(child.stderr)
+            for output in child.outputs:
+                os.close(output.reader)
             os.close(child.channel)
         if self._trainer_process >= 0:
             os.close(self._trainer_process)
@@ -285,33 +306,35 @@ class _ForkServer:
     def _choose_readable(self) -> None:
         """Read from all workers; if too much output waits, only from those about to be killed."""
         for child in self._children.values():
-            readable = not child.silent and (not self._outlet.full or child.kill_at is not None)
-            if readable:
-                self._poll.register(child.stderr, select.POLLIN)
-            else:
-                with contextlib.suppress(KeyError):
-                    self._poll.unregister(child.stderr)
+            for output in child.outputs:
+                is_read = not output.outlet.full or child.kill_at is not None
+                if is_read and not output.silent:
+                    self._poll.register(output.reader, select.POLLIN)
+                else:
+                    with contextlib.suppress(KeyError):
+                        self._poll.unregister(output.reader)
 
     def _forward(self, descriptor: int) -> None:
-        """Forward the stderr of a worker, and keep the end of it."""
+        """Forward the output of a worker, and keep the end of it."""
         for child in self._children.values():
-            if child.stderr == descriptor:
-                self._drain(child)
+            for output in child.outputs:
+                if output.reader == descriptor:
+                    self._drain(child, output)
 
-    def _drain(self, child: _Child, most: int = _CHUNK_BYTES) -> None:
+    def _drain(self, child: _Child, output: _Output, most: int = _CHUNK_BYTES) -> None:
         try:
-            data = os.read(child.stderr, most)
+            data = os.read(output.reader, most)
         except BlockingIOError:
             return
         if not data:
-            child.silent = True
+            output.silent = True
             self._choose_readable()
             return
         child.tail += data
         del child.tail[:-_TAIL_BYTES]
-        was_full = self._outlet.full
-        self._outlet.write(data)
-        if self._outlet.full != was_full:
+        was_full = output.outlet.full
+        output.outlet.write(data)
+        if output.outlet.full != was_full:
             self._choose_readable()
 
     def _handle_exits(self) -> None:
@@ -321,12 +344,13 @@ class _ForkServer:
             if not ended:
                 continue
             child = self._children.pop(pid)
-            # Only what is in the pipe now: a process that it started may continue to write.
-            if unread := _unread(child.stderr):
-                self._drain(child, unread)
-            with contextlib.suppress(KeyError):
-                self._poll.unregister(child.stderr)
-            os.close(child.stderr)
+            for output in child.outputs:
+                # Only what is in the pipe now: a process that it started may continue to write.
+                if unread := _unread(output.reader):
+                    self._drain(child, output, unread)
+                with contextlib.suppress(KeyError):
+                    self._poll.unregister(output.reader)
+                os.close(output.reader)
             tail = bytes(child.tail).decode(errors="replace")
             self._trainer.send(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
             os.close(child.channel)
@@ -349,7 +373,8 @@ class _ForkServer:
             self._wait_for_children(until)
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)
-        self._outlet.empty(until)
+        for outlet in self._outlets:
+            outlet.empty(until)
 
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
@@ -363,15 +388,22 @@ def _unread(pipe: int) -> int:
 
 
 def _run_worker(
-    leave: Callable[[], None], parent: int, stderr: int, order: Fork, channel: int, arena: int
+    leave: Callable[[], None],
+    parent: int,
+    outputs: Sequence[int],
+    order: Fork,
+    channel: int,
+    arena: int,
 ) -> None:
     """Run a worker in a forked child; never returns."""
     code = 1
     try:
-        # Standard output too: a program may read that of the trainer.
-        os.dup2(stderr, 1)
-        os.dup2(stderr, 2)
-        os.close(stderr)
+        os.dup2(outputs[0], _STDOUT)
+        os.dup2(outputs[-1], _STDERR)
+        for output in outputs:
+            os.close(output)
+        # What an env prints comes at once, and isn't lost if the worker is killed.
+        cast("TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
         leave()
         die_with_parent()
         if os.getppid() != parent:

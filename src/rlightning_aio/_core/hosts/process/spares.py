@@ -64,20 +64,25 @@ def inherited() -> Key:
         folder = Path.cwd()
     except FileNotFoundError:  # It was deleted.
         folder = None
-    try:
-        stderr = os.fstat(2)[:3]
-    except OSError:  # It is closed.
-        stderr = ()
     return (
         tuple(sorted(os.environ.items())),
         tuple(sys.path),
         folder,
-        stderr,
+        _file(1),
+        _file(2),
         tuple(line for line in status if line.startswith(_INHERITED)),
         (thread / "limits").read_text(),
         (thread / "cgroup").read_text(),
         os.getpriority(os.PRIO_PROCESS, 0),
     )
+
+
+def _file(descriptor: int) -> tuple[int, ...]:
+    """Return the identity of an open file; nothing if the descriptor is closed."""
+    try:
+        return os.fstat(descriptor)[:3]
+    except OSError:
+        return ()
 
 
 def keep(key: Key, spare: RunningForkServer) -> None:
