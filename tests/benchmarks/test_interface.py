@@ -12,7 +12,7 @@ MOST = {
     "members": 404,
     "arguments": 470,
     "fields": 24,
-    "commands": 8,
+    "commands": 9,
     "options": 31,
     "extras": 15,
 }
