@@ -93,8 +93,9 @@ async def test_distinct_seeds_differ_and_repeat() -> None:
     ("deed", "kind", "blame"),
     [("raise", "env_raised", "either"), ("hang", "env_hung", "either"), ("die", "env_died", "env")],
 )
+@pytest.mark.parametrize("on_env_error", ["raise", "restart"])
 async def test_a_failed_attempt_is_tried_again(
-    place: dict[str, Any], deed: str, kind: str, blame: str
+    place: dict[str, Any], deed: str, kind: str, blame: str, on_env_error: str
 ) -> None:
     """In the end the group is complete, and the record says what failed before."""
     here = place.get("placement") in ("loop", "inline")
@@ -110,7 +111,11 @@ async def test_a_failed_attempt_is_tried_again(
             await episode.step(deed)
         await earner(episode)
 
-    limit: dict[str, Any] = {} if deed == "raise" else {"step_timeout": 0.5}
+    if deed != "raise" and on_env_error == "restart":
+        pytest.skip("it is about exceptions")
+    limit: dict[str, Any] = {"step_timeout": 0.5}
+    if deed == "raise":
+        limit = {"on_env_error": on_env_error}
     async with rooms(place, **limit) as group:
         found = await played(group, tasks(3), agent, size=2)
     assert len(found) == 3

@@ -45,7 +45,7 @@ def test_the_first_deaths_of_an_entry_have_a_line_each(log: Log) -> None:
     """The third says what comes next; another entry has its own three."""
     log.die(3)
     log.die(1, entry="f")
-    more = "; further deaths in entry 'e' are counted, in one line a minute"
+    more = "; further restarts in entry 'e' are counted, in one line a minute"
     assert log.lines == ["death 0 of e", "death 1 of e", f"death 2 of e{more}", "death 0 of f"]
 
 
@@ -56,7 +56,7 @@ def test_further_deaths_are_one_line_a_minute_and_none_is_lost(log: Log) -> None
     lines = log.lines
     assert len(lines) == 5
     log.log.flush(log.now, everything=True)
-    counts = [int(re.findall(r"'e': (\d+) further death", line)[0]) for line in lines + log.lines]
+    counts = [int(re.findall(r"'e': (\d+) further restart", line)[0]) for line in lines + log.lines]
     assert sum(counts) == 600
     assert max(counts) <= 121
 
@@ -72,7 +72,7 @@ def test_a_count_says_of_what_and_where(log: Log) -> None:
     log.pass_time(60)
     (line,) = log.lines
     assert line == (
-        "entry 'e': 17 further deaths of workers within 77 s, all replaced: was killed by SIGKILL "
+        "entry 'e': 17 further restarts within 77 s: was killed by SIGKILL "
         "(8), exited with code 3 (5), could not be rebuilt: error 0 (1), others (3); while "
         "executing e-1 (8), e-2 (5), e-0 (4)"
     )
@@ -83,7 +83,7 @@ def test_deaths_of_unknown_cause_are_counted(log: Log) -> None:
     for _ in range(4):
         log.log.note("e", "a death", "ended with its fork server: it exited", None, log.now)
     log.pass_time(60)
-    expected = "entry 'e': 1 further death of workers within 60 s, all replaced: "
+    expected = "entry 'e': 1 further restart within 60 s: "
     assert log.lines[3] == f"{expected}ended with its fork server: it exited (1)"
 
 

@@ -66,6 +66,7 @@ class Entry:
     on_death: str
     every: int | None
     max_restarts: int
+    on_error: str
 
     @property
     def own_limit(self) -> float:
@@ -272,6 +273,9 @@ class Env:
         gone: its worker ended and is not replaced.
         dirty: its last result could not be read, so its episode must end.
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
+        exceptions: how often it may have raised, where it is then rebuilt.
+        errors: of these since it last completed a step: at least and at most as many.
+        put_away: it has raised, and is rebuilt before it does anything else.
         seen: `deaths` that its results have shown.
         saves: states to which it may be put back after a death; before_reset: those of them that
             were saved as the reset was sent that is in flight.
@@ -293,6 +297,9 @@ class Env:
     gone: bool = False
     dirty: bool = False
     hangs: int = 0
+    exceptions: int = 0
+    errors: tuple[int, int] = (0, 0)
+    put_away: bool = False
     seen: int = 0
     since_save: int = 0
     before_reset: list[State] = field(default_factory=list)
@@ -313,6 +320,11 @@ class Env:
     def deaths(self) -> int:
         """How often its host may have died, or the env been replaced alone."""
         return self.host.deaths + self.hangs
+
+    @property
+    def losses(self) -> int:
+        """How often its episode may have been lost."""
+        return self.deaths + self.exceptions
 
     @property
     def was_reset(self) -> bool:
@@ -460,6 +472,7 @@ class Model:
         if env.request is not None:
             env.kept.append(env.request)
         env.request, env.limbo, env.dirty, env.deadly = None, False, True, True
+        env.errors = 0, env.errors[1] + 1
         self.counts["aborted"] += 1
 
     # -- results
@@ -490,9 +503,13 @@ class Model:
             restarted = ["worker_restarted" in row.info] * len(row.words)
         require(len(set(restarted)) == 1, "restarted in part")
         _check_sent(env, request, row)
+        if restarted[0] and row.info.get("worker_restarted", "")[:7] == "raised ":
+            self._judge_restarted(env, request, row)
+            return
         if restarted[0]:
             self._judge_marked(env, request, row)
             return
+        require(not env.put_away or request.kind != "step", "a step of an env that has raised")
         is_reset = request.kind == "reset"
         states = env.possible() if is_reset else [env.state, *env.loose]
         limit = self._limit_of(env)
@@ -508,6 +525,9 @@ class Model:
         if found[0]:
             env.seen = request.deaths
         env.adopt(*[now[k] for k in found])
+        if request.kind == "step" and not request.due:
+            env.errors = 0, 0
+        env.put_away = False
         expected = played[found[0]]
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         self._save(env, request)
@@ -531,16 +551,67 @@ class Model:
             env.saves = [state.copy() for state in (env.state, *env.loose)]
             env.since_save = 0
 
-    def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
-        if not env.torn:
-            require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
-            require(env.entry.on_death != "raise", "marked, where a death is to be raised")
+    def _raising(self, env: Env, request: Request) -> list[Act]:
+        """What of a request an env may raise."""
+        if env.put_away and request.kind == "step":
+            request = self._begun_again(env, request)
+        acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
+        for state in env.torn:  # A new episode in place of the step.
+            acts += state.faults(Request("reset"))
+        return [act for act in acts if act[0] in (*RAISING, "rubbish")]
+
+    def _begun_again(self, env: Env, request: Request) -> Request:
+        """The reset that follows an exception; an awaitable env begins the same episode again."""
+        if env.entry.form != "awaitable":
+            return Request("reset")
+        seed, options = (request.seed, request.options) if request.resets else env.state.begun
+        return Request("reset", seed=seed, options=options)
+
+    def _judge_restarted(self, env: Env, request: Request, row: Row) -> None:
+        """Check the result of an env that has raised and was rebuilt."""
+        require(env.entry.on_error == "restart", "restarted, where exceptions are raised")
+        self._judge_heads(row)
+        require(row.info["env_at_fault"] == env.env_id, "another env has raised", row.info)
+        if not env.put_away:
+            require(self._raising(env, request), "restarted, and nothing has raised")
+            env.errors = env.errors[0] + 1, env.errors[1] + 1
+            require(env.errors[0] <= env.entry.max_restarts, "restarted once too often")
+        state = env.fresh()
+        state.play(self._begun_again(env, request))
+        require(state.scripts.words == row.words, "not as rebuilt", state.scripts.words)
+        env.adopt(state)
+        env.put_away, env.saves = False, []
+        self.counts["restarted after an exception"] += 1
+        self._save(env, Request("reset"))
+
+    def _put_away(self, env: Env, request: Request) -> None:
+        """Check an exception that no restart follows at once."""
+        retried = env.entry.form == "awaitable" and request.resets
+        most = env.entry.max_restarts + 1 if retried else env.errors[1] + 1
+        spent = most + env.deaths > env.entry.max_restarts
+        require(spent, "raised, with restarts left", env.errors)
+        env.errors = (most if not env.deaths else 0), max(most, env.errors[1] + 1)
+        begun = self._begun_again(env, request)
+        env.state = env.fresh()
+        env.state.begun = begun.seed, begun.options
+        env.loose, env.torn, env.saves, env.since_save = [], [], [], 0
+        env.put_away = True
+        self.counts["exceptions past max_restarts"] += 1
+
+    def _judge_heads(self, row: Row) -> None:
         require(isinstance(row.info.get("worker_restarted"), str), "marked without a cause")
         many = len(row.words)
         heads = row.rewards, row.terminated, row.truncated
         require(heads == ([0.0] * many, [False] * many, [True] * many), "not marked in all ways")
         for column, value in ((row.resets, True), (row.limit, False)):
             require(column in (None, [value] * many), "not marked in all ways")
+        require("episode" not in row.info, "an episode that was lost")
+
+    def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
+        if not env.torn:
+            require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
+            require(env.entry.on_death != "raise", "marked, where a death is to be raised")
+        self._judge_heads(row)
         self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
         shows = "worker_resumed" in row.info
         require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
@@ -548,10 +619,12 @@ class Model:
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
+        # It may have raised before.
+        raised = env.entry.on_error == "restart" and bool(self._raising(env, request))
         found = [
             state
             for one in again
-            for state in env.after_loss()
+            for state in (*env.after_loss(), *[env.fresh()] * raised)
             if state.play(one).outcome.words == row.words
         ]
         require(found, "marked, in no state that it may have")
@@ -561,11 +634,12 @@ class Model:
             require(row.info["worker_resumed"] in lost, "a wrong number of lost steps", lost)
             state.cut = False
         elif request.kind == "step" and not request.due:
-            require(env.torn or not env.saves, "a new episode, and the old one was saved")
-        require("episode" not in row.info, "an episode that was lost")
+            kept = env.saves and not (env.torn or raised)
+            require(not kept, "a new episode, and the old one was saved")
         was_idle = request.deaths > env.seen
         env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
         env.adopt(*found)
+        env.put_away = False
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
         self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
@@ -639,17 +713,18 @@ class Model:
             env.saves, env.since_save = env.before_reset, 0
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
-        acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
-        for state in env.torn:  # A new episode in place of the step.
-            acts += state.faults(Request("reset"))
+        acts = self._raising(env, request)
         raising = [act for act in acts if act[0] in RAISING]
-        if raising:
+        is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
+        if env.entry.on_error == "restart" and fault.exception_type != "KeyboardInterrupt":
+            require(raising or is_rubbish, "an error of nobody", repr(fault), request)
+            self._put_away(env, request)
+        elif raising:
             likely = [act for act in raising if str(act[1]) in fault.exception_text]
             check_raised(fault, *(likely or raising)[0])
             self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
-            rubbish = any(effect == "rubbish" for effect, _ in acts)
-            require(rubbish and not request.resets, "an error of nobody", repr(fault), request)
+            require(is_rubbish and not request.resets, "an error of nobody", repr(fault), request)
             env.state.scripts.step(request.acts)
             env.state.infos = []
             env.dirty = True
@@ -665,7 +740,8 @@ class Model:
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind == "call"
         if entry.on_death == "raise" or not in_call:
-            spent = entry.on_death == "raise" or host.deaths > entry.max_restarts
+            errors = [one.errors[1] for one in self.envs.values() if one.host is host]
+            spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
             require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
             for other in self.envs.values():
                 if other.host is host:

@@ -74,6 +74,7 @@ class Plan:
     on_death: str = "restart"
     every: int | None = None
     max_restarts: int = 3
+    on_error: str = "raise"
     timeout: float | None = None
     start: str = ""
 
@@ -83,10 +84,13 @@ class Plan:
             "name": self.name, "num_workers": self.num_workers, "placement": self.placement,
             "max_restarts": self.max_restarts, "step_timeout": self.timeout,
             "reset_timeout": self.timeout, "on_worker_death": self.on_death,
+            "on_env_error": self.on_error,
         }  # fmt: skip
         if self.placement in ("inline", "loop"):
             if self.placement == "inline":
-                del found["max_restarts"], found["on_worker_death"]
+                del found["on_worker_death"]
+                if self.on_error == "raise":
+                    del found["max_restarts"]
         else:
             found["envs_per_process"] = self.share
         if self.timeout is None:
@@ -122,7 +126,7 @@ class Plan:
         """What the model must know."""
         return Entry(
             self.name, self.form, self.layout, self.controls, self.num_envs, self.mode,
-            self.limit, self.on_death, self.every, self.max_restarts,
+            self.limit, self.on_death, self.every, self.max_restarts, self.on_error,
         )  # fmt: skip
 
 
@@ -228,6 +232,9 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
         plans[k] = replace(plans[k], start=rng.choice(["raise", "exit", "hang"]))
     if kind in ("vectors", "sb3"):
         features, plans = _as_rows(rng, features, kind)
+    apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
+    if {"raise", "rubbish"} & features and apart.random() < 0.8:
+        plans = [_restarted(apart, plan) for plan in plans]
     ops_of_kind = KINDS[kind][1]
     names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
     # A few of them make up most of a program.
@@ -259,6 +266,13 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
     if plan.form == "stacked" and kind == "sb3":
         plan = replace(plan, mode="same_step")
     return features, [plan]
+
+
+def _restarted(rng: Random, plan: Plan) -> Plan:
+    """The same plan, perhaps with envs that are rebuilt after an exception."""
+    if rng.random() < 0.3:
+        return plan
+    return replace(plan, on_error="restart", max_restarts=rng.choice([3, 1, 0]))
 
 
 def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:

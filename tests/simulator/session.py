@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from simulator.model import Env, Violation, require
-from simulator.scripted import DYING, FIXED, TOKENS, Act, encoded
+from simulator.scripted import DYING, FIXED, RAISING, TOKENS, Act, encoded
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -248,6 +248,8 @@ class Session:
         effect = rng.choice(faults) if faults else effect
         if effect.removesuffix(" next") in (*DYING, "die", "hang"):
             env.host.ask()  # Only a world counts deaths by itself.
+        if effect.removesuffix(" next") in (*RAISING, "rubbish"):
+            env.exceptions += env.entry.on_error == "restart"
         return effect, token
 
     def faults_of(self, env: Env) -> list[str]:

@@ -247,7 +247,7 @@ class Training(InContext):
         for env in self.envs:
             for k in range(len(env.codes)):
                 trail = self.trails[env.first + k]
-                trail.allow(env.deaths + self.raised[env.env_id])
+                trail.allow(env.losses + self.raised[env.env_id])
                 trail.resumes = env.entry.every is not None
         for part in parts:
             self._take(part)
@@ -328,7 +328,8 @@ class Evaluations(InContext):
             self.lose(fault)
         except RLightningError as error:
             self.count(error)
-            require(any(env.deaths >= 3 for env in self.envs), "given up", repr(error))
+            spent = [env.deaths >= env.entry.max_restarts for env in self.envs]
+            require(any(spent), "given up", repr(error))
 
     async def drain(self) -> None:
         """Take what an evaluation has left that did not end."""

@@ -179,7 +179,7 @@ class Vectors(Session):
             self.fail(fault)
             return
         except ResetNeeded:
-            died = [env.deaths > 0 for env in self.env_of]
+            died = [env.losses > 0 for env in self.env_of]
             require(any(died) and not mask[died].all(), "others were lost, and none has died")
             self.counts["died beside a mask"] += 1
             return
@@ -203,7 +203,7 @@ class Vectors(Session):
             return
         for k, (words, echo) in enumerate(values):
             require(tuple(echo) == (7,), "another call's arguments", echo)
-            died = self.env_of[k].deaths > 0
+            died = self.env_of[k].losses > 0
             require(
                 died or not self.is_whole or tuple(words[0]) == self.shown[k], "state", k, words
             )
@@ -260,7 +260,8 @@ class Vectors(Session):
         died = "worker_restarted" in info
         if died:
             self.counts["died"] += 1
-            require(env.host.mortal and env.deaths > 0, "marked, and nothing has died", info)
+            may_be = env.exceptions > 0 or (env.host.mortal and env.deaths > 0)
+            require(may_be, "marked, and nothing is lost", info)
         trail.resumes = env.entry.every is not None
         was_over, stays = self.over[k], self.mode == "disabled" and not died
         self.over[k] = any(ends) or (was_over and stays)
@@ -284,7 +285,7 @@ class Vectors(Session):
             trail.last = None  # The episode ends with the step before.
             self.lost[k] = self.mode == "disabled"
             return
-        trail.allow(self.breaks + env.deaths)
+        trail.allow(self.breaks + env.losses)
         trail.add(Transition(before, act, reward, *ends, after), goes_on=was_over and stays)
 
     async def finish(self) -> None:

@@ -58,6 +58,13 @@ def mortals(mode: AutoresetMode, *, dies: bool, **entry: Any) -> Any:
     return VectorEnv(makers, autoreset_mode=mode, envs_per_process=1, max_restarts=9, **entry)
 
 
+def raising(mode: AutoresetMode, place: dict[str, Any]) -> Any:
+    """Three envs that raise where `mortals` die."""
+    makers = [lambda k=k: Mortal(k, dies=True, raises=True) for k in range(3)]
+    fields: dict[str, Any] = {"on_env_error": "restart", "max_restarts": 9, **place}
+    return VectorEnv(makers, autoreset_mode=mode, **fields)
+
+
 def plainly(stepped: Any, mode: AutoresetMode) -> Any:
     """Results without causes of deaths and without times."""
     infos = stepped[-1]
@@ -122,6 +129,25 @@ def test_a_death_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) ->
         return wrappers.NormalizeReward(wrappers.RecordEpisodeStatistics(envs))
 
     ours, theirs = wrap(mortals(mode, dies=True)), wrap(mortals(mode, dies=False))
+    both_do(ours, theirs, mode, actions)
+    ours.close()
+
+
+@pytest.mark.parametrize("place", [{"placement": "inline"}, {"envs_per_process": 3}])
+@pytest.mark.parametrize("mode", MODES)
+def test_an_exception_looks_like_an_episode_that_is_cut_short(
+    mode: AutoresetMode, place: dict[str, Any]
+) -> None:
+    """With ``on_env_error: restart``; others of the same process go on."""
+    die, terminate, truncate, step = 0, 2, 3, 4
+    actions = np.array(
+        [
+            [step, step, step], [die, step, step], [die, step, terminate], [die, step, die],
+            [step, die, step], [step, step, step], [die, die, die], [step, die, step],
+            [terminate, step, truncate], [die, truncate, step], [step, step, die],
+        ]
+    )  # fmt: skip
+    ours, theirs = raising(mode, place), mortals(mode, dies=False)
     both_do(ours, theirs, mode, actions)
     ours.close()
 

@@ -85,7 +85,12 @@ def _refused(config: EnvConfig) -> dict[str, str]:
 
 
 def _is_neutral(config: EnvConfig, name: str) -> bool:
-    """Return True if a field is set to a default that asks for nothing: none, empty, off, or 1."""
+    """Return True if a field is set to a default that asks for nothing: none, empty, off, or 1.
+
+    Restarts after exceptions of an env need no worker.
+    """
+    if name == "max_restarts" and config.on_env_error == "restart":
+        return True
     default = EnvConfig.model_fields[name].get_default(call_default_factory=True, validated_data={})
     return (not default or default == 1) and getattr(config, name) == default
 
@@ -142,6 +147,12 @@ def _check_snapshot_every(config: EnvConfig) -> str | None:
     return None
 
 
+def _check_on_env_error(config: EnvConfig) -> str | None:
+    if config.on_env_error == "restart" and ENVS.is_hardware(config.backend):
+        return f"restart would move what backend {config.backend!r} moves; only your resets may"
+    return None
+
+
 def _check_video(config: EnvConfig) -> str | None:
     video = config.video
     if video is None:
@@ -168,6 +179,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "snapshot_every": _check_snapshot_every,
+    "on_env_error": _check_on_env_error,
     "video": _check_video,
 }
 

@@ -134,6 +134,9 @@ class EnvConfig(_Fields):
     """Reaction to a worker that dies or hangs; ``raise`` by default for hardware."""
     snapshot_every: int | None = Field(default=None, ge=1)
     """Number of steps after which an env's state is saved, for ``on_worker_death: resume``."""
+    on_env_error: Literal["raise", "restart"] = "raise"
+    """Reaction to an exception of an env's `reset` or `step`: raise it, or close and rebuild the
+    env and begin another episode, whose first result is marked like that of a replaced worker."""
     max_restarts: int = Field(default=3, ge=0)
     """Number of restarts in a row, without a step in between, before giving up."""
     imports: tuple[str, ...] = Field(default=(), strict=False)

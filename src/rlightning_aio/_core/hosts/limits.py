@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
@@ -43,18 +43,22 @@ def hung(cause: str, op: int, at_fault: str | None) -> Loss:
 
 
 class RestartPolicy:
-    """How many losses in a row an entry bears, of a worker or of an awaitable env.
+    """How many losses in a row an entry bears, of a worker or of an env.
 
     Args:
         config: of the entry.
-        done: the participle of what follows a loss: "replaced" or "rebuilt".
+        field: of the entry, says whether any is borne: ``on_worker_death`` or ``on_env_error``.
+        done: the participle of what follows a loss: "replaced", "rebuilt" or "restarted".
 
     Attributes:
         raises: no loss is borne.
     """
 
-    def __init__(self, config: EnvConfig, done: str) -> None:
-        self.raises = config.on_worker_death == "raise"
+    def __init__(
+        self, config: EnvConfig, field: Literal["on_worker_death", "on_env_error"], done: str
+    ) -> None:
+        self.raises = getattr(config, field) == "raise"
+        self._field = field
         self._most = config.max_restarts
         self._done = done
 
@@ -65,7 +69,7 @@ class RestartPolicy:
     def then(self, losses: int) -> str:
         """Say in a clause what follows `losses` in a row."""
         if self.raises:
-            return f"on_worker_death is 'raise', so it is not {self._done}"
+            return f"{self._field} is 'raise', so it is not {self._done}"
         if losses > self._most:
             return f"it is not {self._done} after {losses - 1} restarts in a row (max_restarts)"
         pause = restart_pause(losses)

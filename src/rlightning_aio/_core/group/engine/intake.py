@@ -33,6 +33,7 @@ from rlightning_aio._core.hosts.messages import (
     Withdrawn,
 )
 from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, answers_with_value
 
 if TYPE_CHECKING:
@@ -126,12 +127,31 @@ class Intake:
 
     def _on_raised(self, completion: Raised) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
-        if slot is not None:
-            self._fail(self._requests.alone(slot), lambda _: self.raised(slot, completion.error))
+        if slot is None:
+            return
+        fault = self.raised(slot, completion.error)
+        if fault is not None:
+            self._fail(self._requests.alone(slot), lambda _: fault)
+            return
+        self._requests.has_news = True  # What is in flight has changed, and nobody gets a reply.
+        self._send_again(completion.host_id, self._requests.alone(slot))
 
-    def raised(self, slot: int, error: ErrorText) -> EnvRaised:
-        """Make the error for the current request of `slot`, which ended in `error`."""
+    def raised(self, slot: int, error: ErrorText) -> EnvRaised | None:
+        """Return the error that the current request of `slot` ends in, as its env raised `error`.
+
+        None if the env is restarted instead: its episode is lost, which its next result reports.
+        """
         lost = self._continuity.raised(slot)
+        fault = self._fault_of(slot, error, lost)
+        if not self._supervisor.env_errors.ends_env(slot, error):
+            return fault
+        kind, blame = fault.outcome.kind, fault.outcome.blame
+        why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
+        self._continuity.abandon([slot], why)
+        return None if self._supervisor.env_errors.restarts(slot, error, fault) else fault
+
+    def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
+        """Make the error; `lost`: the loss that the result would have reported."""
         after = f" (its worker {lost.cause}, and was replaced)" if lost is not None else ""
         after += without_terminal(error, self._supervisor.hosts[self._requests.hosts.item(slot)])
         op = self._requests.numbering.op(slot)

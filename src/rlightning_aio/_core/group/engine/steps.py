@@ -172,9 +172,8 @@ class Steps:
         try:
             slots, packed = self.write(batch, now)
             at_once = self._alone is not None and len(slots) > 0
-            if at_once and not (self._conditions.unusual or self._continuity.due[0]):
-                self._step_at_once(now)
-            else:
+            at_once = at_once and not (self._conditions.unusual or self._continuity.due[0])
+            if not (at_once and self._step_at_once(now)):
                 send = partial(self.send, slots, packed, now)
                 ticket, now = yield from self._waiting.ask(now, slots, send)
                 if ticket.errors:
@@ -331,8 +330,12 @@ class Steps:
         if self._supervisor.members.possible:
             self._intake.drain()  # Requests to absent envs are withdrawn immediately.
 
-    def _step_at_once(self, now: float) -> None:
-        """Step the only env here and now: there is nobody to wait for."""
+    def _step_at_once(self, now: float) -> bool:
+        """Step the only env here and now: there is nobody to wait for.
+
+        Returns False if it raised and is restarted, which the first result of its next episode
+        reports.
+        """
         assert self._alone is not None
         requests, slots = self._requests, self._envs.all
         try:
@@ -340,6 +343,8 @@ class Steps:
         except BaseException as error:
             requests.numbering.renew(slots, _STEP)
             fault = self._intake.raised(0, ErrorText.of(error))
+            if fault is None:
+                return False
             self._stats.note_failures(slots, fault.outcome.kind)
             if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
                 requests.collector.keep(slots, fault)
@@ -351,6 +356,7 @@ class Steps:
         requests.collector.take(1)
         if self._completions:
             self._intake.drain()  # An info has come in a new form.
+        return True
 
     # -- hand out ---------------------------------------------------------------------
 

@@ -133,8 +133,8 @@ class HostRecord:
         refusals: consecutive attempts to start a replacement that the system refused;
             refused_since: the time of the first.
         held: requests (entries and arguments) since its death, kept until a replacement is up.
-        deaths: by slot, deaths of workers that this env is blamed for, since it last completed a
-            step; key None for deaths of unknown cause.
+        deaths: by slot, deaths of workers that this env is blamed for, and exceptions that it was
+            restarted after, since it last completed a step; key None for deaths of unknown cause.
         culprit: the slot of the env that the last worker was executing when it died.
         suspects: without one, the slots of those that owed a reply while none was executed.
         dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
@@ -149,7 +149,7 @@ class HostRecord:
             if its use of the cores is known; membership: if envs join and leave it.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
-        restart_policy: how many deaths in a row are borne.
+        restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
         slots: of its envs.
     """
@@ -187,6 +187,7 @@ class HostRecord:
     limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
     restart_policy: RestartPolicy = field(init=False)
+    error_policy: RestartPolicy = field(init=False)
     is_local: bool = field(init=False)
     is_hardware: bool = field(init=False)
     slots: range = field(init=False)
@@ -198,7 +199,8 @@ class HostRecord:
         self.membership = self.host if isinstance(self.host, Membership) else None
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
-        self.restart_policy = RestartPolicy(self.config, "replaced")
+        self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")
+        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted")
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)

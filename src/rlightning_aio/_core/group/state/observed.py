@@ -17,7 +17,7 @@ __all__ = ["NO_SPAN", "Fate", "Observed", "Observer"]
 
 NO_SPAN: Final = contextlib.nullcontext()
 """The span of other work while no observer is attached."""
-Fate: TypeAlias = Literal["hung", "died", "given up", "up"]
+Fate: TypeAlias = Literal["hung", "raised", "died", "given up", "up"]
 """What may happen to a host after its first start."""
 
 

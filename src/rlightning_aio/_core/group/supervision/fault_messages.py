@@ -1,6 +1,6 @@
 """Messages about dead, hung and late workers: the env at fault, the cause, lost replies.
 
-`CrashLog` keeps those about deaths from filling the log.
+`CrashLog` keeps those about restarts from filling the log.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ __all__ = [
 
 _LINES: Final = 3
 _QUIET_SECONDS: Final = 300.0
-"""Time without so many deaths, after which each has a line of its own again."""
+"""Time without so many restarts, after which each has a line of its own again."""
 _SECONDS: Final = 60.0
-"""Between lines about deaths that are counted."""
+"""Between lines about restarts that are counted."""
 _MOST_NAMED: Final = 3
 
 _log = logging.getLogger("rlightning_aio")
@@ -195,7 +195,7 @@ def _why(envs: EnvTable, requests: Requests, record: HostRecord, cause: str) -> 
 
 @dataclass
 class _Deaths:
-    """The deaths of one entry.
+    """The restarts of one entry.
 
     Attributes:
         recent: times of the last three.
@@ -209,11 +209,11 @@ class _Deaths:
 
 
 class CrashLog:
-    """Deaths of workers in the log, each in a line of its own at first, then counted.
+    """Restarts in the log, each in a line of its own at first, then counted.
 
-    Of each entry, the first three deaths within five minutes have a line each, and further ones one
-    line a minute together. Callers pass the time in (monotonic seconds). A death after which an env
-    is given up is no part of it, as it is raised.
+    Of each entry, the first three restarts within five minutes have a line each, and further ones
+    one line a minute together. Callers pass the time in (monotonic seconds). A death or exception
+    that is not followed by one is no part of it, as it is raised.
 
     Attributes:
         due: when `flush` has something to log.
@@ -223,15 +223,24 @@ class CrashLog:
         self.due = math.inf
         self._entries: dict[str, _Deaths] = {}
 
-    def note(self, entry: str, message: str, cause: str, at_fault: str | None, now: float) -> None:
-        """Log a death, or count it.
+    def note(
+        self,
+        entry: str,
+        message: str,
+        cause: str,
+        at_fault: str | None,
+        now: float,
+        traceback: str = "",
+    ) -> None:
+        """Log a restart, or count it.
 
         Args:
-            entry: of the worker.
-            message: all about the death, for a line of its own.
+            entry: of the worker or env.
+            message: all about the cause, for a line of its own.
             cause: in a clause, for a count.
-            at_fault: the id of the env that the worker was executing, if it is known.
+            at_fault: the id of the env that was being executed, if it is known.
             now: the time.
+            traceback: follows the message.
         """
         deaths = self._entries.setdefault(entry, _Deaths())
         recent = deaths.recent
@@ -239,8 +248,8 @@ class CrashLog:
             recent.append(now)
             then = ""
             if len(recent) == _LINES and now - recent[0] < _QUIET_SECONDS:
-                then = f"; further deaths in entry {entry!r} are counted, in one line a minute"
-            _log.warning("%s%s", message, then)
+                then = f"; further restarts in entry {entry!r} are counted, in one line a minute"
+            _log.warning("%s%s%s", message, then, f"\n{traceback.rstrip()}" if traceback else "")
             return
         recent.append(now)
         if not deaths.causes:
@@ -264,7 +273,7 @@ class CrashLog:
             count = deaths.causes.total()
             whose = f"; while executing {_counted(deaths.at_fault)}" if deaths.at_fault else ""
             _log.warning(
-                "entry %r: %d further death%s of workers within %.0f s, all replaced: %s%s",
+                "entry %r: %d further restart%s within %.0f s: %s%s",
                 entry,
                 count,
                 "s" if count > 1 else "",

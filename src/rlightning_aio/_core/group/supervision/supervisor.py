@@ -19,6 +19,7 @@ from rlightning_aio._core.group.drivers.wait import Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import DEATH
 from rlightning_aio._core.group.state.host_record import HostRecord, Stage
 from rlightning_aio._core.group.state.slab_layout import check_actions
+from rlightning_aio._core.group.supervision.env_errors import EnvErrors
 from rlightning_aio._core.group.supervision.fault_messages import (
     CrashLog,
     cause_of,
@@ -84,9 +85,10 @@ class Supervisor:
         members: the envs that join and leave.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
-            their deaths; overdue: names envs that owe a result for long.
+            restarts; env_errors: of envs; overdue: names envs that owe a result for long.
         metas: one for each local env, and for each host that envs join; empty before the start.
-        any_deaths: a worker died, and its replacement has not completed a step yet.
+        any_deaths: a worker died or an env raised, and what came in its place has not completed a
+            step yet.
         close_errors: env id and error of each env whose `close` raised.
         look_by: time by which a trainer that never waits must call `check`.
     """
@@ -111,6 +113,7 @@ class Supervisor:
         self.hints = Hints(self.records)
         self.overdue = Overdue(group)
         self.crash_log = CrashLog()
+        self.env_errors = EnvErrors(group, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False

@@ -153,10 +153,10 @@ class AwaitedEnv:
         if not self.made.done():
             return
         self.runner.is_abandoned = True
-        if self._idle is None:
+        if self.answering is not None:
             self._is_cancelled = True
             self.task.cancel()
-        elif not self._idle.done():
+        elif self._idle is not None and not self._idle.done():
             self._idle.set_result(None)
 
     async def _close(self) -> None:

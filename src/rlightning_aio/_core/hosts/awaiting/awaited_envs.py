@@ -37,7 +37,7 @@ from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvHung, WorkerDied
 from rlightning_aio.outcomes import Loss, Outcome
-from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
@@ -137,7 +137,8 @@ class AwaitedEnvs:
         self._ending = False
         config = order.config
         self._close_seconds = config.close_timeout or CLOSE_SECONDS
-        self._restarts = RestartPolicy(config, "rebuilt")
+        self._restarts = RestartPolicy(config, "on_worker_death", "rebuilt")
+        self._renews = config.on_env_error == "restart"
         self._limits = {
             op: TimeLimit(seconds, self._expire) for op, seconds in limits_of(config).items()
         }
@@ -295,7 +296,10 @@ class AwaitedEnvs:
         record = self._records[env.index]
         if error is None and op_of(entry) == Operation.STEP:
             record.losses = 0
-        self._finish(record, completion_of(self._host_id, entry, outcome, error))
+        if self._renews and error is not None and not answers_with_value(op_of(entry)):
+            cause = f"raised {ErrorText.of(error).summary}"
+            self._put_away(record, env, Loss(cause, "env_raised", "either", record.name))
+        self._finish(record, completion_of(self._host_id, env.runner, entry, outcome, error))
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self._inline and isinstance(error, KeyboardInterrupt):
             self._loop.call_soon(_reraise, error)

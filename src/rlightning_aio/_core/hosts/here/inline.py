@@ -130,7 +130,8 @@ class InlineHost:
             outcome = self._watcher.interruptible(execute)
         except BaseException as raised:
             error = raised
-        completion = completion_of(self.host_id, entry, outcome, error)
+        runner = self._runners[slot_of(entry) - self.first_slot]
+        completion = completion_of(self.host_id, runner, entry, outcome, error)
         self._post(completion or Result(self.host_id, entry, {}))
         if isinstance(error, KeyboardInterrupt):
             raise error  # It is meant for the program, but the request ends, too.
@@ -138,7 +139,12 @@ class InlineHost:
 
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row; the queue must have no request to it."""
-        return self._watcher.interruptible(self._runners[0].step)
+        runner = self._runners[0]
+        try:
+            return self._watcher.interruptible(runner.step)
+        except BaseException as error:
+            runner.note_error(_STEP, error)
+            raise
 
     def close(self) -> None:
         """Close the envs immediately."""
@@ -179,7 +185,7 @@ class _Threads:
         self.indices = {
             index
             for index, runner in enumerate(runners)
-            if runner.fast_path.on_stepped(partial(inbox.put, partial(self._ended, index)))
+            if runner.on_stepped(partial(inbox.put, partial(self._ended, index)))
         }
         watcher.watch(self)
 

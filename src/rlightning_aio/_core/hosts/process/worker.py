@@ -172,7 +172,11 @@ class Worker:
         index = slot_of(request) - self._first_slot
         op, runner = op_of(request), self._runners[index]
         try:  # As `exchange.serve` does; `execute` would take a microsecond more.
-            outcome = self._steps[index]() if op == _STEP else runner.execute(op, None)
+            if op == _STEP:
+                outcome = self._steps[index]()
+            else:
+                outcome = runner.execute(op, None)
+                self._steps[index] = runner.step  # Perhaps of an env that was rebuilt.
         except BaseException as error:
             outcome = error
         if outcome is None and not self._is_child:
@@ -189,7 +193,8 @@ class Worker:
         """
         error = outcome if isinstance(outcome, BaseException) else None
         self._on_end(error)
-        completion = completion_of(_HOST_ID, request, outcome, error)
+        runner = self._runners[slot_of(request) - self._first_slot]
+        completion = completion_of(_HOST_ID, runner, request, outcome, error)
         if completion is not None:
             self._post(completion)
 

@@ -62,11 +62,23 @@ def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunn
     config, index = order.config, order.worker_indices[place]
     if makers := makers_of(config):
         config = config.model_copy(update={"task": makers[place]})
-    env = _built(order, config, index, order.preprocess_fns[place])
-    env.trainer_pid = None if inline else order.trainer_pid
+
+    def make() -> BaseEnv:
+        env = _built(order, config, index, order.preprocess_fns[place])
+        env.trainer_pid = None if inline else order.trainer_pid
+        return env
+
+    env = make()
+    kind = _runner_class(env, config)
     video = config.video
-    filmed = video is not None and index in video.envs
-    return _runner_class(env, config)(env, inline=inline, video=video if filmed else None)
+    # Others are replaced by their host, with a runner of their own.
+    rebuilt = config.on_env_error == "restart" and not kind.is_awaitable
+    return kind(
+        env,
+        inline=inline,
+        video=video if video is not None and index in video.envs else None,
+        rebuild=make if rebuilt else None,
+    )
 
 
 def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:

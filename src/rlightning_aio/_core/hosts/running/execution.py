@@ -45,21 +45,27 @@ def execute(
         error = raised
     if on_end is not None:
         on_end(error)
-    return completion_of(host_id, entry, outcome, error)
+    return completion_of(host_id, runner, entry, outcome, error)
 
 
 def completion_of(
-    host_id: int, entry: int, outcome: Any, error: BaseException | None = None
+    host_id: int,
+    runner: EnvRunner,
+    entry: int,
+    outcome: Any,
+    error: BaseException | None = None,
 ) -> Result | Value | Raised | None:
     """Return the completion of a request, or None if the row holds the whole result.
 
     Args:
         host_id: of the env's host.
+        runner: of the env.
         entry: of the request.
         outcome: the part of the result that is out of band; for a call, its value.
         error: what the env has raised instead.
     """
     if error is not None:
+        runner.note_error(op_of(entry), error)
         return Raised(host_id, entry, ErrorText.of(error))
     if answers_with_value(op_of(entry)):
         return Value(host_id, entry, outcome)

@@ -7,6 +7,7 @@ Gymnasium env takes a short way (`RowWriter.short_stepper`).
 from __future__ import annotations
 
 import contextlib
+import logging
 import pickle
 import random
 import time
@@ -42,7 +43,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
-from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.entries import Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
@@ -69,6 +70,8 @@ __all__ = [
     "resume_all",
     "seed_generators",
 ]
+
+_log = logging.getLogger("rlightning_aio")
 
 
 def loaded(arguments: Any) -> Any:
@@ -99,9 +102,10 @@ class EnvRunner:
         inline: results stay in this process. Results that hold torch tensors are then returned
             without a copy; elsewhere tensors become NumPy arrays on the CPU.
         video: what to film from the first episode on; None films nothing.
+        rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
 
     Attributes:
-        restarts: how many workers had this env before.
+        restarts: how many workers had this env before, and how often it was rebuilt.
         fast_path: what the env offers to save time.
         checkpoints: of the env.
         step: steps with the action in the row.
@@ -115,14 +119,32 @@ class EnvRunner:
     is_awaitable: ClassVar[bool] = False
 
     def __init__(
-        self, env: BaseEnv, *, inline: bool = False, video: VideoConfig | None = None
+        self,
+        env: BaseEnv,
+        *,
+        inline: bool = False,
+        video: VideoConfig | None = None,
+        rebuild: Callable[[], BaseEnv] | None = None,
     ) -> None:
-        self.env = env
-        self.meta: EnvMeta = initialised(env)
         self.restarts = 0
         self._inline = inline
+        self._video = video
+        self._rebuild = rebuild
+        # The env has raised, and is to be rebuilt; it was closed for that.
+        self._is_spent = self._has_closed = False
+        self._on_stepped: Callable[[], None] | None = None
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
+        self._read_action: Callable[[], Any] = _no_action
+        self.checkpoints: Checkpoints
+        self._saver: Saver | None = None
+        self._attach_again: Callable[[], None]
+        self._adopt(env)
+
+    def _adopt(self, env: BaseEnv) -> None:
+        """Use a new env from now on; it has no row yet."""
+        self.env = env
+        self.meta: EnvMeta = initialised(env)
         self.fast_path = fast_path_of(env)
         bare = self.fast_path.bare_step()
         self._step_env: Callable[[Any], Any] = bare or (
@@ -131,10 +153,9 @@ class EnvRunner:
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
         self._input = input_of(env)
-        self._read_action: Callable[[], Any] = _no_action
-        self.checkpoints: Checkpoints
-        self._saver: Saver | None = None
-        self._camera = None if video is None else _camera(env, video)
+        self._camera = None if self._video is None else _camera(env, self._video)
+        if self._on_stepped is not None:
+            self.fast_path.on_stepped(self._on_stepped)
 
     def started(self) -> EnvStarted:
         """Return the description of the env that the trainer gets."""
@@ -161,6 +182,7 @@ class EnvRunner:
         layout = self.layout
         num_envs = self.env.config.num_envs
         self._slab, self._row, self._announce = slab, row, announce
+        self._attach_again = partial(self.attach, slab, row, announce, send_checkpoint)
         self._writer = RowWriter(
             slab,
             row,
@@ -220,6 +242,8 @@ class EnvRunner:
         what `execute` does. The arguments are those of `execute`.
         """
         arguments = loaded(arguments)
+        if self._is_spent:
+            self._renew()
         if op == Operation.STEP:
             action, extras = arguments or STEP_IN_ROW
             return partial(self._step_with, action, extras), self._finish_step
@@ -242,8 +266,43 @@ class EnvRunner:
             # Where nothing is to be shown, it goes back to where the trainer knows it to be.
             self._saver.save(before=not show)
 
+    def on_stepped(self, stepped: Callable[[], None]) -> bool:
+        """Have the env call `stepped`, see `FastPath.on_stepped`; also one that is rebuilt."""
+        self._on_stepped = stepped
+        return self.fast_path.on_stepped(stepped)
+
+    def note_error(self, op: int, error: BaseException) -> None:
+        """Record that a request has raised; Ctrl-C is no error of the env."""
+        is_its_own = not (answers_with_value(op) or isinstance(error, KeyboardInterrupt))
+        self._is_spent |= is_its_own and self._rebuild is not None
+
+    def _renew(self) -> None:
+        """Close the env, which has raised, and make another in its place.
+
+        Raises what that raises; the next request tries again.
+        """
+        assert self._rebuild is not None
+        try:
+            self.close()
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # It may be in any state.
+            text = "env %r, as it was closed to be rebuilt: %s"
+            _log.warning(text, self.env.env_id, ErrorText.of(error).summary)
+        key = self.layout.key
+        self._adopt(self._rebuild())
+        self._has_closed = False
+        if self.layout.key != key:
+            raise ValueError("its spaces changed with the restart")
+        self.restarts += 1
+        self._attach_again()
+        self._is_spent = False
+
     def close(self) -> Awaitable[None] | None:
         """Close the env, and the film of an episode that is under way."""
+        if self._has_closed:
+            return None
+        self._has_closed = True
         try:
             if self._camera is not None:
                 self._camera.close()
@@ -259,7 +318,7 @@ class EnvRunner:
     def _record_video(self, video: VideoConfig | None) -> None:
         """Film episodes from the next one on, or stop filming; the current film ends here."""
         camera = None if video is None else _camera(self.env, video)
-        former, self._camera = self._camera, camera
+        former, self._camera, self._video = self._camera, camera, video
         if camera is not None:
             self._watch(camera)
         self._bind()

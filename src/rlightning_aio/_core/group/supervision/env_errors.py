@@ -1,0 +1,72 @@
+"""`EnvErrors`: exceptions of envs that are rebuilt after them (``on_env_error: restart``).
+
+They count as restarts in a row together with the deaths that an env is blamed for.
+Left out: what becomes of the request (see `Intake`), and the making of the env (see `EnvRunner`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rlightning_aio.protocol.entries import Operation, answers_with_value
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.supervision.fault_messages import CrashLog
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.messages import ErrorText
+    from rlightning_aio.errors import EnvRaised
+
+__all__ = ["EnvErrors"]
+
+
+class EnvErrors:
+    """See the module.
+
+    Args:
+        group: its tables.
+        crash_log: of the group.
+        on_count: called when an exception was counted.
+    """
+
+    def __init__(self, group: Tables, crash_log: CrashLog, on_count: Callable[[], object]) -> None:
+        self._group = group
+        self._crash_log = crash_log
+        self._on_count = on_count
+
+    def _record(self, slot: int) -> HostRecord:
+        return self._group.records[self._group.requests.hosts.item(slot)]
+
+    def ends_env(self, slot: int, error: ErrorText) -> bool:
+        """Return True if an env that has raised this is rebuilt before its next request."""
+        is_call = answers_with_value(self._group.requests.numbering.op(slot))
+        is_interrupt = error.type_name == "KeyboardInterrupt"
+        return not (self._record(slot).error_policy.raises or is_call or is_interrupt)
+
+    def restarts(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
+        """Count an exception that has ended an env; True if an episode begins at once for it.
+
+        Args:
+            slot: of the env.
+            error: what it has raised.
+            fault: what the caller gets otherwise.
+        """
+        group, record = self._group, self._record(slot)
+        policy, name = record.error_policy, record.config.name
+        count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
+        self._on_count()
+        then = policy.then(count)
+        if not policy.bears(count):
+            fault.add_note(then)
+            return False
+        record.restarts += 1
+        doing = Operation(group.requests.numbering.op(slot)).name.lower()
+        message = f"{group.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
+        cause, now = f"raised {error.type_name}", group.clock()
+        self._crash_log.note(name, message, cause, fault.env_id, now, error.traceback)
+        observer = group.observed.observer
+        if observer is not None:
+            observer.note_fate("raised", record.host.host_id, slot, error.summary)
+        return True

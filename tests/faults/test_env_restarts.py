@@ -1,0 +1,250 @@
+"""With ``on_env_error: restart``, an exception costs its env one episode, as a death does."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from faults.driven import Driven, Tokens, entry, marked, two_workers
+from faults.drivers import on_one_driver
+
+from rlightning_aio.errors import ConfigError, EnvRaised
+from rlightning_aio.evaluation import evaluate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    import rlightning_aio as rl
+
+    Start: TypeAlias = Callable[..., Driven]
+
+CAUSES = {
+    "raise": "raised ValueError: as asked for",
+    "odd constructor": "raised faults.faulty.OddConstructor: code 7 in step",
+    "system exit": "raised SystemExit: 5",
+}
+
+
+def check_marked(batch: rl.BatchedData, env_id: str, cause: str, kind: str) -> None:
+    """Check that one result of a batch, and no other, is marked as this."""
+    for key, ret in batch.items():
+        assert marked(ret) == (key == env_id)
+    row = batch.ids().index(env_id)
+    outcome = batch.outcome[row]
+    assert batch.restarted.tolist() == [k == row for k in range(len(batch))]
+    assert (outcome.kind, outcome.env_id, outcome.cause) == (kind, env_id, cause)
+    info = batch.info()[row]
+    assert (info["worker_restarted"], info["env_at_fault"]) == (cause, env_id)
+
+
+@pytest.mark.parametrize("form", ["step", "step_async"])
+def test_an_exception_in_a_step_ends_one_episode(start: Start, form: str) -> None:
+    """The env is rebuilt, in the same process; all others have stepped."""
+    group, tokens = start(two_workers(on_env_error="restart")), Tokens()
+    pids = [ret.observation[1] for ret in group.reset()[0].values()]
+    for number, (name, cause) in enumerate(CAUSES.items()):
+        asked = tokens.steps(group.group.env_ids, {"faulty-1": name})
+        if form == "step":
+            batch, _ = group.step(asked)
+        else:
+            group.step_async(asked)
+            batch, _ = group.collect_async(wait_all=True)
+        check_marked(batch, "faulty-1", cause, "env_raised")
+        others = [k for k, key in enumerate(batch.ids()) if key != "faulty-1"]
+        tokens.check(batch.take(others))
+        assert group.group.num_restarts == number + 1
+        batch, _ = group.step(tokens.steps(group.group.env_ids))
+        tokens.check(batch)
+    assert [ret.observation[1] for ret in batch.values()] == pids
+
+
+@on_one_driver
+def test_an_exception_in_a_reset_begins_another_episode(start: Start) -> None:
+    """With options, which go through the channel, and without; what came after it is lost."""
+    group, tokens = start(two_workers(on_env_error="restart")), Tokens()
+    cause = CAUSES["raise"]
+    batch, _ = group.reset(options={"fault": "raise"}, env_ids=["faulty-1"])
+    check_marked(batch, "faulty-1", cause, "not_started")
+    group.call("faulty-1", "arm", "resetting", "raise")
+    batch, _ = group.reset(seed=3)
+    check_marked(batch, "faulty-1", cause, "not_started")
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+@pytest.mark.parametrize("place", ["resetting", "building"])
+def test_exceptions_in_a_row_are_raised_at_last(start: Start, tmp_path: Path, place: str) -> None:
+    """The env stays usable: its next step begins an episode that says what has happened."""
+    switch = tmp_path / "broken"
+    kwargs = {"faults": {place: "raise"}, "only": 1, "while_exists": str(switch)}
+    fields: dict[str, Any] = {"on_env_error": "restart", "max_restarts": 2}
+    group, tokens = start(two_workers(env_kwargs=kwargs, **fields)), Tokens()
+    env_ids = group.group.env_ids
+    switch.touch()
+    with pytest.raises(EnvRaised, match="as asked for") as caught:
+        group.step(tokens.steps(env_ids, {"faulty-1": "raise"}))
+    assert caught.value.__notes__[0] == (
+        "it is not restarted after 2 restarts in a row (max_restarts)"
+    )
+    assert (caught.value.outcome.kind, caught.value.results.ids()) == (
+        "env_raised", ["faulty-0", "faulty-2", "faulty-3"],
+    )  # fmt: skip
+    with pytest.raises(EnvRaised, match="as asked for"):
+        group.step(tokens.steps(env_ids))
+    switch.unlink()
+    batch, _ = group.step(tokens.steps(env_ids))
+    check_marked(batch, "faulty-1", CAUSES["raise"], "env_raised")
+    tokens.check(group.step(tokens.steps(env_ids))[0])
+    batch, _ = group.step(tokens.steps(env_ids, {"faulty-1": "raise"}))
+    check_marked(batch, "faulty-1", CAUSES["raise"], "env_raised")
+    assert group.group.num_restarts == 3
+
+
+@on_one_driver
+def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
+    group, tokens = start(two_workers(on_env_error="restart")), Tokens()
+    with pytest.raises(EnvRaised):
+        group.call("faulty-1", "do", "raise")
+    with pytest.raises(EnvRaised):
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "keyboard interrupt"}))
+    assert group.group.num_restarts == 0
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(batch)
+
+
+class Lives(gym.Env[Any, Any]):
+    """Its observation is its number among all that were made, and its steps; action 1 raises.
+
+    Attributes:
+        made: how many were made in this process; closed: of them, the numbers of those closed.
+    """
+
+    observation_space = gym.spaces.Box(0, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    made: ClassVar[int] = 0
+    closed: ClassVar[list[int]] = []
+
+    def __init__(self) -> None:
+        Lives.made += 1
+        self.number, self.steps = Lives.made, 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.steps = 0
+        return self._observed(), {"told": (options or {}).get("task", "nothing")}
+
+    def step(self, action: Any) -> Any:
+        if action:
+            raise KeyError("a bug")
+        self.steps += 1
+        return self._observed(), 1.0, self.steps == 4, False, {}
+
+    def _observed(self) -> Any:
+        return np.array([self.number, self.steps], np.float64)
+
+    def lives(self) -> tuple[int, list[int]]:
+        return Lives.made, Lives.closed
+
+    def close(self) -> None:
+        Lives.closed.append(self.number)
+
+
+class AwaitedLives:
+    """The same with coroutines."""
+
+    observation_space, action_space = Lives.observation_space, Lives.action_space
+
+    def __init__(self) -> None:
+        self.env = Lives()
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        await asyncio.sleep(0)
+        return self.env.reset(seed=seed, options=options)
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(0)
+        return self.env.step(action)
+
+    async def close(self) -> None:
+        await asyncio.sleep(0)
+        self.env.close()
+
+    def lives(self) -> tuple[int, list[int]]:
+        return self.env.lives()
+
+
+@pytest.mark.parametrize(
+    ("driver", "place"),
+    [
+        ("sync", {"task": Lives, "placement": "inline", "num_workers": 1}),
+        ("sync", {"task": Lives, "placement": "inline", "num_workers": 3}),
+        ("uvloop", {"task": Lives, "placement": "inline", "num_workers": 3}),
+        ("sync", {"task": Lives, "envs_per_process": 3, "num_workers": 3}),
+        ("sync", {"task": AwaitedLives, "envs_per_process": 3, "num_workers": 3}),
+        ("uvloop", {"task": AwaitedLives, "placement": "loop", "num_workers": 3}),
+    ],
+)
+def test_the_env_is_closed_and_rebuilt_wherever_it_lives(
+    build: Start, place: dict[str, Any]
+) -> None:
+    """An awaitable env, which has the options of its episode, begins that episode again."""
+    Lives.made, Lives.closed = 0, []
+    group = build({"name": "e", "on_env_error": "restart", **place})
+    group.init()
+    batch, _ = group.reset(options={"task": "a task"})
+    batch, _ = group.step(batch.respond(action=np.zeros(len(batch), int)))
+    first = batch.observation[:, 0].tolist()
+    for fault in (1, 2):
+        actions = np.zeros(len(batch), int)
+        actions[-1] = 1
+        batch, _ = group.step(batch.respond(action=actions))
+        assert batch.restarted.tolist() == [False] * (len(batch) - 1) + [True]
+        assert batch.outcome[-1].cause == "raised KeyError: 'a bug'"
+        assert batch.observation[-1].tolist() == [first[-1] + fault, 0]
+        awaits = place["task"] is AwaitedLives
+        assert batch.info()[-1]["told"] == ("a task" if awaits else "nothing")
+        assert batch.observation[:-1, 0].tolist() == first[:-1]
+        batch, _ = group.step(batch.respond(action=np.zeros(len(batch), int)))
+        assert batch.observation[-1].tolist() == [first[-1] + fault, 1]
+    made, closed = group.call("e-0", "lives")
+    assert (made, closed) == (len(batch) + 2, [first[-1], first[-1] + 1])
+
+
+@on_one_driver
+def test_an_evaluation_plays_the_lost_episode_again(build: Start) -> None:
+    class Fails(Lives):
+        def step(self, action: Any) -> Any:
+            return super().step(int(self.number == 1 and self.steps == 2))
+
+    Lives.made = 0
+    group = build({"name": "e", "task": Fails, "placement": "inline", "on_env_error": "restart"})
+    group.init()
+    with group.group.auto_reset(math.inf):
+        found = evaluate(group.group, lambda batch: np.zeros(len(batch), int), 3)
+    assert [episode.length for episode in found.episodes] == [4, 4, 4]
+    assert found.lost == 1
+
+
+@on_one_driver
+def test_a_robot_is_never_moved_by_an_exception(build: Start) -> None:
+    with pytest.raises(ConfigError, match="only your resets may"):
+        build({"name": "arm", "backend": "piper", "task": "sim", "on_env_error": "restart"})
+
+
+@on_one_driver
+def test_the_log_has_the_traceback(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    """The first three in five minutes."""
+    group, tokens = start(entry(2, on_env_error="restart")), Tokens()
+    for _ in range(5):
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "raise"}))
+        group.step(tokens.steps(group.group.env_ids))
+    texts = [record.getMessage() for record in caplog.records]
+    assert len(texts) == 3
+    for text in texts:
+        assert "env 'faulty-1' (entry 'faulty'" in text
+        assert "raised in step: ValueError: as asked for; restart 1 of 3 in a row" in text
+        assert "faulty.py" in text
+    assert "further restarts in entry 'faulty' are counted, in one line a minute\n" in texts[-1]
