@@ -187,6 +187,41 @@ def test_a_field_that_is_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -
     env.close()
 
 
+@pytest.mark.usefixtures("implementation")
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, np.int64])
+@pytest.mark.parametrize("task", ["HalfCheetah-v5", "Ant-v5"])
+def test_actions_of_any_type_cost_the_same(task: str, kind: type[Any]) -> None:
+    """Costs are computed in the type of the actions, which may be a part of something else."""
+    ours, theirs = MujocoBatch(make(task, {})(), 3), SyncVectorEnv([make(task, {})] * 3)
+    assert_alike(ours.reset(seed=0), theirs.reset(seed=0))
+    width = ours.single_action_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
+    wide = np.random.default_rng(0).uniform(-2, 2, (20, 3, 2 * width))
+    for actions in wide.astype(kind)[..., ::2]:
+        assert_alike(ours.step(actions), theirs.step(actions))
+    ours.close()
+    theirs.close()
+
+
+def test_returned_arrays_are_used_again_when_nobody_has_them() -> None:
+    """Whoever holds one, or a view of it, keeps its values."""
+    batch = MujocoBatch(make("HalfCheetah-v5", {})(), 2)
+    batch.reset(seed=0)
+    kept: list[tuple[Any, Any]] = []
+    actions = np.zeros((2, 6), np.float32)
+    for k in range(40):
+        observations, rewards, _, _, infos = batch.step(actions)
+        if k % 3 == 0:
+            kept.append((observations[:, 1:][::-1], observations.copy()))
+            kept.append((rewards, rewards.copy()))
+            kept.append((infos["x_position"][1:], infos["x_position"][1:].copy()))
+        del observations, infos
+    for values, copy in kept[1::3] + kept[2::3]:
+        np.testing.assert_array_equal(values, copy)
+    for values, copy in kept[::3]:
+        np.testing.assert_array_equal(values[::-1], copy[:, 1:])
+    batch.close()
+
+
 SMALL = "a simulation that runs out of memory"
 """MuJoCo raises an error for it when it has several contacts."""
 WILD = "a simulation that moves too fast"

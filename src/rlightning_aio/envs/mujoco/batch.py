@@ -51,8 +51,6 @@ _SAME_STEP: Final = AutoresetMode.SAME_STEP
 _BRIEF_NS: Final = 500_000
 _STATE: Final = ("_num_steps", "_last", "_ended")
 """Attributes that are part of the state, in addition to the simulations."""
-_OF_SIMULATIONS: Final = ("rows", "before", "num_steps")
-"""Their arrays that are part of the state."""
 
 
 def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
@@ -133,10 +131,14 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._take_back(k)
         self._mode = autoreset_mode
         self._read_step_limit()
-        self._num_steps = np.zeros(num_envs, np.int64)
+        # Steps of all; those of a simulation began at its element of `_began`, and `_soonest` is
+        # the first at which one of them can be truncated.
+        self._clock = 0
+        self._began = np.zeros(num_envs, np.int64)
         # The observations that were returned last; never written to.
         self._last = np.zeros((num_envs, *self.env.observation_space.shape))
         self._ended: NDArray[np.bool_] | None = None
+        self._nobody = np.zeros(num_envs, np.bool_)
         self._is_whole = True  # No step or reset was interrupted.
 
     def _read_step_limit(self) -> None:
@@ -146,6 +148,16 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             if isinstance(wrapper, gym.wrappers.TimeLimit):
                 self._limiter = wrapper
                 self._limit = self._limiter._max_episode_steps  # noqa: SLF001
+        self._soonest = 0
+
+    @property
+    def _num_steps(self) -> NDArray[np.int64]:
+        """Steps since the last reset."""
+        return self._clock - self._began
+
+    @_num_steps.setter
+    def _num_steps(self, values: NDArray[np.int64]) -> None:
+        self._began, self._soonest = self._clock - values, 0
 
     # -- resets -------------------------------------------------------------------------
 
@@ -176,8 +188,8 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._is_whole = False
         ids, observations = np.flatnonzero(mask), self._last.copy()
         begun = self._begin(ids, observations, [seeds[k] for k in ids.tolist()], options)
-        ended = np.zeros(self.num_envs, np.bool_) if self._ended is None else self._ended
-        self._ended, self._is_whole = ended & ~mask, True
+        ended = (self._nobody if self._ended is None else self._ended) & ~mask
+        self._ended, self._is_whole = ended if ended.any() else self._nobody, True
         self._keep(observations)
         return observations, self._infos(partial(of_resets, begun, self.num_envs, self._add_info))
 
@@ -216,7 +228,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             seeds: of the simulations `ids`.
             options: passed to the task.
         """
-        self._num_steps[ids] = 0
+        self._began[ids] = self._clock
         if not self._resets_together:
             given = [None] * len(ids) if seeds is None else seeds
             each = [
@@ -251,7 +263,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         scale: Any = env._reset_noise_scale  # noqa: SLF001
         noise = drawn(generators, self._task.noise, scale, env.model.nq, env.model.nv)
         simulations.starts[ids] = np.concatenate([env.init_qpos, env.init_qvel]) + noise
-        simulations.num_steps[ids] = 0
+        simulations.begin(ids)
         return each
 
     def _generator(self, k: int, seed: int | None) -> np.random.Generator:
@@ -317,26 +329,20 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
                 f"actions must have shape {self.action_space.shape}, not {actions.shape}"
             )
         self._is_whole, task = False, self._task
-        # `any` of an array takes four times as long as `count_nonzero`.
-        due = (
-            np.flatnonzero(ended) if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
-        )
+        due = ended.nonzero()[0] if self._mode == _NEXT_STEP and ended is not self._nobody else None
         begun, failures = self._simulate(actions, due)
-        rewards, terminated, columns = task.stepped(actions)
+        rewards, terminated, columns = task.stepped()
         observations = task.observations
-        self._num_steps += 1
         if due is not None:
             begun = begun or self._begin(due, observations)
-            self._num_steps[due], rewards[due], terminated[due] = 0, 0.0, False
-        truncated = self._num_steps >= self._limit
-        if failures:
-            failed = list(failures)
+            self._began[due], rewards[due] = self._clock + 1, 0.0
+        failed = list(failures)
+        if failed:
             observations[failed], rewards[failed] = self._last[failed], 0.0
-            terminated[failed], truncated[failed] = False, True
-        self._ended = ended = terminated | truncated
+        terminated, truncated, ended = self._end(terminated, due, failed)
         finished = None
-        if self._mode == _SAME_STEP and np.count_nonzero(ended):
-            ids = np.flatnonzero(ended)
+        if self._mode == _SAME_STEP and ended is not self._nobody:
+            ids = ended.nonzero()[0]
             finished = Finished(ended, observations[ids])
             begun = self._begin(ids, observations)
         self._keep(observations)
@@ -347,6 +353,29 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         made = self._infos(infos) if finished is None else infos()
         return observations, rewards, terminated, truncated, made
 
+    def _end(
+        self, terminated: NDArray[np.bool_] | None, due: Any, failed: list[int]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Count a step, and record who has ended. Return terminations, truncations, and both."""
+        self._clock += 1
+        can_end = terminated is not None or bool(failed)
+        if terminated is None:
+            terminated = np.zeros(self.num_envs, np.bool_)
+        elif due is not None:
+            terminated[due] = False
+        if self._clock < self._soonest:
+            truncated = np.zeros(self.num_envs, np.bool_)
+        else:
+            self._soonest, can_end = int(self._began.min()) + self._limit, True
+            truncated = self._clock - self._began >= self._limit
+        if failed:
+            terminated[failed], truncated[failed] = False, True
+        ended = terminated | truncated if can_end else self._nobody
+        if can_end and not np.count_nonzero(ended):  # `any` takes four times as long.
+            ended = self._nobody
+        self._ended = ended
+        return terminated, truncated, ended
+
     def _simulate(
         self, actions: NDArray[Any], due: NDArray[np.intp] | None
     ) -> tuple[Begun | None, dict[int, str]]:
@@ -356,8 +385,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             Those that were reset, and failures with their reasons.
         """
         simulations, task = self._simulations, self._task
-        simulations.controls[:] = actions
-        simulations.num_steps[:] = self.env.frame_skip
+        simulations.control(actions, self.env.frame_skip)
         begun = ids = None
         if due is not None and not self._resets_together:
             ids = np.setdiff1d(np.arange(self.num_envs, dtype=np.int32), due)
@@ -410,7 +438,8 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             if not np.array_equal(state, self._simulations.rows[k], equal_nan=True):
                 self._task.put(k, data)
             if self._limiter is not None and self._limiter._elapsed_steps is not None:  # noqa: SLF001
-                self._num_steps[k] = self._limiter._elapsed_steps  # noqa: SLF001
+                self._began[k] = self._clock - self._limiter._elapsed_steps  # noqa: SLF001
+                self._soonest = 0
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value.
@@ -447,7 +476,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         return {
             # With the model and all options.
             "env": save_state(self._made),
-            "simulations": [getattr(self._simulations, name).copy() for name in _OF_SIMULATIONS],
+            "simulations": self._simulations.save_state(),
             "place": self._task.place,
             "own": self._own,
             "randomizer": None if self._randomizer is None else self._randomizer.save_state(),
@@ -467,8 +496,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         elif drawn is not None:
             raise ValueError("the snapshot's simulations are randomized, and this env's are not")
         load_state(self._made, state["env"])
-        for name, values in zip(_OF_SIMULATIONS, state["simulations"], strict=True):
-            getattr(self._simulations, name)[:] = values
+        self._simulations.load_state(state["simulations"])
         self._own = [dict(own) for own in state["own"]]
         if self._randomizer is not None:
             self._randomizer.load_state(drawn)

@@ -11,23 +11,36 @@ from __future__ import annotations
 
 import ctypes
 import math
+import sys
 from ctypes import c_double, c_int64, c_void_p
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
 from rlightning_aio.protocol import kernel
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["AdvancePlan", "FieldPart", "Output", "address_of", "compiled", "offset_of"]
+__all__ = [
+    "AdvancePlan",
+    "FieldPart",
+    "Output",
+    "address_of",
+    "compiled",
+    "inline_offset_of",
+    "live_timestep",
+    "offset_of",
+]
 
 _MOST_PARTS: Final = 32
+_MOST_KNOWN: Final = 6
+_KINDS: Final = ("copy", "squares", "within", "also_within")
+"""Of parts, in the order of the compiled function's."""
 _TYPES: Final[dict[str, Any]] = {
     "int": ctypes.c_int,
     "mjtBool": ctypes.c_bool,
@@ -39,25 +52,46 @@ _TYPES: Final[dict[str, Any]] = {
 }
 
 
+def _num_references(known: Iterable[tuple[Any, int]]) -> list[int]:
+    return [sys.getrefcount(values) for values, _ in known]
+
+
+(_UNSHARED,) = _num_references([(np.empty(1), 0)])
+# Without the GIL, another thread may be about to take a reference.
+_HAS_GIL: Final[bool] = getattr(sys, "_is_gil_enabled", lambda: True)()
+
+
 class FieldPart(NamedTuple):
-    """Values `first` to `stop` of a flattened field of a simulation, clipped."""
+    """Values `first` to `stop` of a flattened field of a simulation.
+
+    Attributes:
+        kind: ``copy``, clipped; ``squares``, the sum of squares of the clipped values; ``within``,
+            1 if all are between `low` and `high`, else 0; ``also_within``, the same, and to be
+            joined to the part before, which is 0 then.
+    """
 
     field: str
     first: int = 0
     stop: int | None = None
     low: float = -math.inf
     high: float = math.inf
+    kind: Literal["copy", "squares", "within", "also_within"] = "copy"
 
     def of(self, field: NDArray[Any]) -> NDArray[Any]:
-        """Copy the part of fields ``[n, ...]``."""
+        """Make the part of fields ``[n, ...]``."""
         found = field.reshape(len(field), math.prod(field.shape[1:]))[:, self.first : self.stop]
-        if self.low == -math.inf and self.high == math.inf:
-            return found
-        return found.clip(self.low, self.high)
+        if self.kind.endswith("within"):
+            return np.all((self.low < found) & (found < self.high), axis=1, keepdims=True)
+        if self.low != -math.inf or self.high != math.inf:
+            found = found.clip(self.low, self.high)
+        if self.kind == "squares":
+            return np.add.reduce(np.square(found), axis=1, keepdims=True)
+        return found
 
 
 class _Part(ctypes.Structure):
     _fields_ = (
+        ("kind", c_int64),
         ("field", c_int64),
         ("first", c_int64),
         ("count", c_int64),
@@ -84,8 +118,13 @@ class AdvancePlan(ctypes.Structure):
         ("sizes", c_int64 * 3),
         ("num_steps", c_void_p),
         ("starts", c_void_p),
-        ("controls", c_void_p),
         ("before", c_void_p),
+        ("controls", c_void_p),
+        ("squares", c_void_p),
+        ("is_single", c_int64),
+        ("warning", c_int64),
+        ("unstable", c_int64 * 3),
+        ("warned", c_int64),
         ("num_parts", c_int64),
         ("parts", _Part * _MOST_PARTS),
     )
@@ -120,29 +159,42 @@ class Output:
         for part in parts:
             size = len(range(getattr(template, part.field).size)[part.first : part.stop])
             step = count if by_columns else 1
+            width -= part.kind == "also_within"
             if plan is not None:
                 slot = plan.parts[plan.num_parts]
                 plan.num_parts += 1
                 slot.field, slot.first = offset_of(part.field, template), part.first
                 slot.count, slot.low, slot.high = size, part.low, part.high
+                slot.kind = _KINDS.index(part.kind)
                 self._slots.append((slot, 8 * width * step))
-            width += size
+            width += size if part.kind == "copy" else 1
         for slot, _ in self._slots:
             slot.row, slot.column = (1, count) if by_columns else (width, 1)
         self.values: NDArray[np.float64]
+        self._known: list[tuple[NDArray[np.float64], int]] = []
         self.put(np.zeros((width, count) if by_columns else (count, width)))
 
-    def put(self, values: NDArray[np.float64]) -> None:
-        """Write to `values` from now on."""
+    def put(self, values: NDArray[np.float64], address: int | None = None) -> None:
+        """Write to `values` from now on; their address is asked for if it isn't given."""
         self.values = values
         if self._slots:
-            address = address_of(values)
+            address = address_of(values) if address is None else address
             for slot, offset in self._slots:
                 slot.values = address + offset
 
     def renew(self) -> None:
-        """Leave `values` to whoever has them, and write to an array without contents."""
-        self.put(np.empty_like(self.values))
+        """Leave `values` to whoever has them, and write to an array that nobody else has.
+
+        A new one, and asking for its address, take as long as ten operations of NumPy, so those
+        that nobody has any more are used again. Views and tensors have the array, too.
+        """
+        counts = _num_references(self._known)
+        if _HAS_GIL and _UNSHARED in counts:
+            self.put(*self._known[counts.index(_UNSHARED)])
+            return
+        values = np.empty(self.values.shape)
+        self._known = [*self._known[1 - _MOST_KNOWN :], (values, address_of(values))]
+        self.put(*self._known[-1])
 
     def copy(self) -> None:
         """Leave `values` to whoever has them, and write to a copy."""
@@ -154,6 +206,9 @@ class Output:
         first = 0
         for part in self.parts:
             found = part.of(fields[part.field])
+            if part.kind == "also_within":
+                first -= 1
+                found = found & (rows[ids, first : first + 1] != 0)
             rows[ids, first : first + found.shape[1]] = found
             first += found.shape[1]
 
@@ -186,6 +241,25 @@ def offset_of(field: str, data: Any) -> int:
     if values.size and (found != address_of(values) or values.dtype != np.float64):
         raise RuntimeError(f"mjData.{field} is not where this version of mujoco says")
     return offset
+
+
+def live_timestep(options: Any) -> ctypes.c_double:
+    """Find the time step in the memory of an `mjOption`, where reading it takes less time.
+
+    Raises:
+        RuntimeError: another value is there than its binding says.
+    """
+    struct = _struct("mjOption")
+    address = address_of(options.gravity) - struct.gravity.offset + struct.timestep.offset
+    found = c_double.from_address(address)
+    if found.value != options.timestep:
+        raise RuntimeError("mjOption.timestep is not where this version of mujoco says")
+    return found
+
+
+def inline_offset_of(field: str) -> int:
+    """Offset of a field of `mjData` that is no pointer."""
+    return getattr(_struct("mjData"), field).offset
 
 
 @cache

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.envs.mujoco.outputs import FieldPart
+from rlightning_aio.envs.mujoco.outputs import FieldPart, live_timestep
 from rlightning_aio.envs.wrappers import wrappers_of
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ __all__ = ["Task", "is_batched", "task_of"]
 Columns = Callable[[], dict[str, Any]]
 """Makes infos of several simulations, from values that don't change later."""
 Judgement = tuple[Any, Any, Columns]
-"""Rewards, terminations, infos."""
+"""Rewards, terminations or None, infos."""
 
 
 class Task:
@@ -46,7 +46,6 @@ class Task:
             uniformly; or more than that.
         columns: what rewards and infos are made of, ``[..., n]``: a new array in each step.
         place: position of the body, for its velocity: ``[n]`` or ``[2, n]``.
-        actions: of the step.
         observations: after the step.
     """
 
@@ -57,13 +56,12 @@ class Task:
         simulations.forget_outputs()
         self.env = env
         self.simulations = simulations
-        self._options: Any = env.model.opt
+        self._timestep = live_timestep(env.model.opt)
         self._num: int = simulations.count
         self._observed = simulations.output(*self.observed())
         self._watched = simulations.output(*self.watched(), by_columns=True)
         self._columns_before = self.columns
         self.place: Any = None
-        self.actions: Any = None
 
     @property
     def columns(self) -> NDArray[np.float64]:
@@ -131,24 +129,19 @@ class Task:
             self.place = now.copy() if self.place is None else self.place.copy()
             self.place[..., ids] = now[..., ids]
 
-    def stepped(self, actions: NDArray[Any]) -> Judgement:
-        """Return rewards, terminations and infos of a step with these actions."""
-        self.actions = actions
+    def stepped(self) -> Judgement:
+        """Return rewards, terminations and infos of a step."""
         self.finish()
         return self.judge()
 
     def velocity(self) -> NDArray[np.float64]:
         """Record the current positions, and return velocities since the last step."""
         before, self.place = self.place, self.position()
-        # Gymnasium's `dt`, read with one call of MuJoCo's bindings in place of two.
-        return (self.place - before) / (self._options.timestep * self.env.frame_skip)
+        return (self.place - before) / (self._timestep.value * self.env.frame_skip)  # By its `dt`.
 
-    def never(self) -> NDArray[np.bool_]:
-        return np.zeros(self._num, np.bool_)
-
-    def ended(self, healthy: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def ended(self, healthy: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         """Terminations of robots that end their episodes when they fall, if they do."""
-        return ~healthy if self.env._terminate_when_unhealthy else self.never()
+        return ~healthy if self.env._terminate_when_unhealthy else None
 
 
 def _skipping(env: Any, count: int, low: float = -np.inf, high: float = np.inf) -> list[FieldPart]:
@@ -157,15 +150,19 @@ def _skipping(env: Any, count: int, low: float = -np.inf, high: float = np.inf) 
     return [FieldPart("qpos", skipped), FieldPart("qvel", low=low, high=high)]
 
 
-def _squares(rows: NDArray[Any]) -> Any:
-    return np.add.reduce(np.square(rows), axis=1)
+def _also(
+    field: str,
+    first: int = 0,
+    stop: int | None = None,
+    limits: tuple[float, float] = (-np.inf, np.inf),
+) -> FieldPart:
+    """Part that must be within limits, or finite, in addition to the part before."""
+    return FieldPart(field, first, stop, *limits, kind="also_within")
 
 
-def _all_within(low: float, values: NDArray[Any], high: float) -> Any:
-    """Return whether all values of each row are between; mostly, those of all rows are."""
-    if low < values.min() and values.max() < high:
-        return True
-    return ((low < values) & (values < high)).all(axis=1)
+def _including(low: float, high: float) -> tuple[float, float]:
+    """Make limits that are not within themselves but let the given ones be."""
+    return float(np.nextafter(low, -np.inf)), float(np.nextafter(high, np.inf))
 
 
 def _at(xy: NDArray[np.float64]) -> dict[str, Any]:
@@ -202,7 +199,7 @@ class HalfCheetah(Task):
     def judge(self) -> Judgement:
         velocity, x = self.velocity(), self.columns[0]
         forward = self.env._forward_reward_weight * velocity
-        control = self.env._ctrl_cost_weight * _squares(self.actions)
+        control = self.env._ctrl_cost_weight * self.simulations.squares
 
         def infos() -> dict[str, Any]:
             return {
@@ -212,7 +209,7 @@ class HalfCheetah(Task):
                 "reward_ctrl": -control,
             }
 
-        return forward - control, self.never(), infos
+        return forward - control, None, infos
 
     def begun(self, ids: NDArray[np.intp]) -> Columns:
         x = self.columns[0]
@@ -232,7 +229,7 @@ class Swimmer(Task):
     def judge(self) -> Judgement:
         velocity, xy = self.velocity(), self.columns
         forward = self.env._forward_reward_weight * velocity[0]
-        control = self.env._ctrl_cost_weight * _squares(self.actions)
+        control = self.env._ctrl_cost_weight * self.simulations.squares
 
         def infos() -> dict[str, Any]:
             return {
@@ -241,7 +238,7 @@ class Swimmer(Task):
                 "reward_ctrl": -control,
             }
 
-        return forward - control, self.never(), infos
+        return forward - control, None, infos
 
     def begun(self, ids: NDArray[np.intp]) -> Columns:
         xy = self.columns
@@ -249,35 +246,29 @@ class Swimmer(Task):
 
 
 class Hopper(Task):
-    def __init__(self, env: Any, simulations: Simulations) -> None:
-        super().__init__(env, simulations)
-        # Of the angle, and of what is not in `watched`.
-        self.rest = simulations.output(FieldPart("qpos", 2), FieldPart("qvel"))
-
     def observed(self) -> list[FieldPart]:
         return _skipping(self.env, 1, -10, 10)
 
     def watched(self) -> list[FieldPart]:
-        return [FieldPart("qpos", 0, 3)]
+        return [FieldPart("qpos", 0, 2), *self.healthy()]
 
     def position(self) -> Any:
         return self.columns[0]
 
-    def healthy(self) -> NDArray[np.bool_]:
-        least, most = self.env._healthy_state_range
-        return self.upright() & _all_within(least, self.rest.values, most)
+    def healthy(self) -> list[FieldPart]:
+        state = self.env._healthy_state_range
+        return [*self.upright(), _also("qpos", 2, None, state), _also("qvel", 0, None, state)]
 
-    def upright(self) -> NDArray[np.bool_]:
-        (low, high), (least, most) = self.env._healthy_z_range, self.env._healthy_angle_range
-        _, z, angle = self.columns
-        return (low < z) & (z < high) & (least < angle) & (angle < most)
+    def upright(self) -> list[FieldPart]:
+        height, angle = self.env._healthy_z_range, self.env._healthy_angle_range
+        return [FieldPart("qpos", 1, 2, *height, kind="within"), _also("qpos", 2, 3, angle)]
 
     def judge(self) -> Judgement:
         env, columns = self.env, self.columns
-        velocity, healthy = self.velocity(), self.healthy()
+        velocity, healthy = self.velocity(), columns[2] != 0
         forward = env._forward_reward_weight * velocity
         survive = healthy * env._healthy_reward
-        control = env._ctrl_cost_weight * _squares(self.actions)
+        control = env._ctrl_cost_weight * self.simulations.squares
 
         def infos() -> dict[str, Any]:
             return {
@@ -300,7 +291,7 @@ class Hopper(Task):
 
 
 class Walker2d(Hopper):
-    def healthy(self) -> NDArray[np.bool_]:
+    def healthy(self) -> list[FieldPart]:
         return self.upright()
 
 
@@ -311,8 +302,6 @@ class Ant(Task):
     def __init__(self, env: Any, simulations: Simulations) -> None:
         self.body = env.model.body(env._main_body).id
         super().__init__(env, simulations)
-        self.state = simulations.output(FieldPart("qpos"), FieldPart("qvel"))
-        self.forces = simulations.output(FieldPart("cfrc_ext", 0, None, *env._contact_force_range))
 
     def observed(self) -> list[FieldPart]:
         parts = _skipping(self.env, 2)
@@ -321,20 +310,27 @@ class Ant(Task):
         return parts
 
     def watched(self) -> list[FieldPart]:
-        first = 3 * self.body
-        return [FieldPart("xpos", first, first + 2), FieldPart("qpos", 0, 3)]
+        first, (low, high) = 3 * self.body, self.env._healthy_z_range
+        return [
+            FieldPart("xpos", first, first + 2),
+            FieldPart("qpos", 0, 2),
+            # Its bounds are healthy, too.
+            FieldPart("qpos", 2, 3, *_including(low, high), kind="within"),
+            _also("qpos"),
+            _also("qvel"),
+            FieldPart("cfrc_ext", 0, None, *self.env._contact_force_range, kind="squares"),
+        ]
 
     def position(self) -> Any:
         return self.columns[:2]
 
     def judge(self) -> Judgement:
-        env, velocity = self.env, self.velocity()
-        (low, high), xy, z = env._healthy_z_range, self.columns[2:4], self.columns[4]
-        healthy = _all_within(-np.inf, self.state.values, np.inf) & (low <= z) & (z <= high)
+        env, velocity, xy = self.env, self.velocity(), self.columns[2:4]
+        healthy = self.columns[4] != 0
         forward = velocity[0] * env._forward_reward_weight
         survive = healthy * env._healthy_reward
-        control = env._ctrl_cost_weight * _squares(self.actions)
-        contact = env._contact_cost_weight * _squares(self.forces.values)
+        control = env._ctrl_cost_weight * self.simulations.squares
+        contact = env._contact_cost_weight * self.columns[5]
 
         def infos() -> dict[str, Any]:
             return {
@@ -357,11 +353,6 @@ class _Humanoid(Task):
 
     needs_forces = True
 
-    def __init__(self, env: Any, simulations: Simulations) -> None:
-        super().__init__(env, simulations)
-        self.forces = simulations.output(FieldPart("cfrc_ext"))
-        self.controls = simulations.output(FieldPart("ctrl"))
-
     def observed(self) -> list[FieldPart]:
         env, parts = self.env, _skipping(self.env, 2)
         if env._include_cinert_in_observation is True:
@@ -375,16 +366,19 @@ class _Humanoid(Task):
         return parts
 
     def watched(self) -> list[FieldPart]:
-        return [FieldPart("qpos", 0, 3), FieldPart("ten_length"), FieldPart("ten_velocity")]
+        squares = [FieldPart(name, kind="squares") for name in ("ctrl", "cfrc_ext")]
+        tendons = [FieldPart("ten_length"), FieldPart("ten_velocity")]
+        return [FieldPart("qpos", 0, 3), *squares, *tendons]
 
     def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
         """Cost of external forces."""
-        return (weight * _squares(self.forces.values)).clip(*limits)
+        low, high = limits
+        return np.minimum(np.maximum(weight * self.columns[4], low), high)
 
 
 def _tendons(columns: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
     """Infos of lengths and velocities of tendons, from what humanoids watch."""
-    lengths, velocities = np.split(columns[3:], 2)
+    lengths, velocities = np.split(columns[5:], 2)
     return {"tendon_length": lengths.T.copy(), "tendon_velocity": velocities.T.copy()}
 
 
@@ -392,13 +386,14 @@ class Humanoid(_Humanoid):
     def __init__(self, env: Any, simulations: Simulations) -> None:
         super().__init__(env, simulations)
         self.places = simulations.output(FieldPart("xipos"), by_columns=True)
+        self.masses = simulations.model_field("body_mass")  # Changes show here.
 
     def position(self) -> Any:
-        masses = self.simulations.model_field("body_mass")
+        masses = self.masses
         places = self.places.values.reshape(-1, 3, self._num)[:, :2]
         # Of each simulation, or of all.
         weights = masses.T[:, np.newaxis] if masses.ndim == 2 else masses[:, np.newaxis, np.newaxis]
-        return np.add.reduce(weights * places, axis=0) / masses.sum(axis=-1)
+        return np.add.reduce(weights * places, axis=0) / np.add.reduce(masses, axis=-1)
 
     def judge(self) -> Judgement:
         env, columns, velocity = self.env, self.columns, self.velocity()
@@ -406,7 +401,7 @@ class Humanoid(_Humanoid):
         healthy = (low < z) & (z < high)
         forward = env._forward_reward_weight * velocity[0]
         survive = healthy * env._healthy_reward
-        control = env._ctrl_cost_weight * _squares(self.controls.values)
+        control = env._ctrl_cost_weight * self.columns[3]
         contact = self.clipped(env._contact_cost_weight, env._contact_cost_range)
 
         def infos() -> dict[str, Any]:
@@ -430,7 +425,7 @@ class HumanoidStandup(_Humanoid):
     def judge(self) -> Judgement:
         env, columns = self.env, self.columns
         up = (columns[2] - 0) / env.model.opt.timestep
-        control = env._ctrl_cost_weight * _squares(self.controls.values)
+        control = env._ctrl_cost_weight * self.columns[3]
         impact = self.clipped(env._impact_cost_weight, env._impact_cost_range)
 
         def infos() -> dict[str, Any]:
@@ -441,7 +436,7 @@ class HumanoidStandup(_Humanoid):
                 "reward_impact": -impact,
             }
 
-        return up - control - impact + 1, self.never(), infos
+        return up - control - impact + 1, None, infos
 
     def stands(self, columns: NDArray[np.float64]) -> dict[str, Any]:
         return {
@@ -516,9 +511,9 @@ class Pusher(Task):
         arm, thing, goal = (self.observations[:, k : k + 3] for k in (14, 17, 20))
         near = -_lengths(thing - arm) * env._reward_near_weight
         distance = -_lengths(thing - goal) * env._reward_dist_weight
-        control = -_squares(self.actions) * env._reward_control_weight
+        control = -self.simulations.squares * env._reward_control_weight
         infos = {"reward_dist": distance, "reward_ctrl": control, "reward_near": near}
-        return distance + control + near, self.never(), infos.copy
+        return distance + control + near, None, infos.copy
 
 
 class Reacher(Task):
@@ -553,9 +548,9 @@ class Reacher(Task):
     def judge(self) -> Judgement:
         env = self.env
         distance = -_lengths(self.tip.values - self.target.values) * env._reward_dist_weight
-        control = -_squares(self.actions) * env._reward_control_weight
+        control = -self.simulations.squares * env._reward_control_weight
         infos = {"reward_dist": distance, "reward_ctrl": control}
-        return distance + control, self.never(), infos.copy
+        return distance + control, None, infos.copy
 
 
 _KINDS: dict[str, type[Task]] = {

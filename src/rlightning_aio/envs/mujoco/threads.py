@@ -26,6 +26,7 @@ from rlightning_aio.envs.mujoco.outputs import (
     Output,
     address_of,
     compiled,
+    inline_offset_of,
     offset_of,
 )
 
@@ -49,6 +50,8 @@ _UNSTABLE: Final = {
     )
 }
 """Warnings upon which MuJoCo resets a simulation to the defaults of its model."""
+_CONTROLS: Final = (np.float32, np.float64)
+"""Types of actions whose squares the compiled function sums up."""
 _DTYPES: Final = {8: np.float64, 4: np.int32, 1: np.uint8}
 
 
@@ -107,7 +110,7 @@ class Simulations:
         moving: the part of `rows` that a step reads and changes; controls are only read.
         num_steps: of MuJoCo, for each simulation in the next `advance`; 0 for a reset.
         starts: positions and velocities after a reset, ``[count, nq + nv]``.
-        controls: of the steps, ``[count, nu]``.
+        squares: of the controls of the last steps, summed up, ``[count]``.
         before: `moving` before the last steps, or after the last reset.
         busy_ns: duration of the last call of `advance`; 0 before the first.
 
@@ -153,11 +156,15 @@ class Simulations:
         self.moving = self.rows[:, : mujoco.mj_stateSize(model, self._signature)]
         self.num_steps = np.zeros(count, np.int64)
         self.starts = np.zeros((count, model.nq + model.nv))
-        self.controls = np.zeros((count, model.nu))
+        self._even_steps = 0  # The number of steps of all, if it is the same.
         self.before = self.moving.copy()
         self._outputs: list[Output] = []
         self._fields: dict[str, NDArray[Any]] = {}
         self._plan = None if function is None else self._planned()
+        self._kind: Any
+        self._controls: NDArray[Any]
+        self.squares: NDArray[Any]
+        self._use(np.float64)
         self._function, self._plan_at = c_void_p(function), self._plan and byref(self._plan)
         num_warnings = int(mujoco.mjtWarning.mjNWARNING)
         # Pairs of the last details and a number.
@@ -175,7 +182,7 @@ class Simulations:
         if not self._has_forces:
             functions[3] = c_void_p()
         fields = [offset_of(name, template) for name in ("qpos", "qvel", "ctrl")]
-        arrays = (self.num_steps, self.starts, self.controls, self.before)
+        arrays = (self.num_steps, self.starts, self.before)
         return AdvancePlan(
             *functions,
             self._signature,
@@ -183,6 +190,8 @@ class Simulations:
             (c_int64 * 3)(*fields),
             (c_int64 * 3)(model.nq, model.nv, model.nu),
             *map(address_of, arrays),
+            warning=inline_offset_of("warning"),
+            unstable=(c_int64 * 3)(*_UNSTABLE),
         )
 
     def output(self, *parts: FieldPart, by_columns: bool = False) -> Output:
@@ -258,10 +267,8 @@ class Simulations:
             ValueError: MuJoCo refuses the values.
         """
         chosen, count = _chosen(ids)
-        num_failed = self._library.mjb_setConst(self._batch, chosen, count)
-        if num_failed:
-            causes = "; ".join(self._failures(num_failed).values())
-            raise ValueError(f"MuJoCo refuses a model: {causes}")
+        if self._library.mjb_setConst(self._batch, chosen, count):
+            raise ValueError(f"MuJoCo refuses a model: {'; '.join(self._failures().values())}")
 
     def show_model(self, k: int) -> None:
         """Write the model of simulation `k` to the common model, if simulations differ."""
@@ -284,21 +291,54 @@ class Simulations:
             RuntimeError: MuJoCo can't reset a simulation.
         """
         began = time.monotonic_ns()
-        if self._plan is None:
+        plan = self._plan
+        if plan is None:
             failures = self._advance_by_numpy(ids)
         else:
             chosen, count = _chosen(ids)
-            failures = self._failures(
-                self._library.mjb_apply(
-                    self._batch, chosen, count, self._function, self._plan_at, True
-                )
+            num_failed = self._library.mjb_apply(
+                self._batch, chosen, count, self._function, self._plan_at, True
             )
+            failures = self._failures() if num_failed or plan.warned else {}
+            plan.warned = 0
         self.busy_ns = time.monotonic_ns() - began
         for k, cause in failures.items():
             if not self.num_steps[k]:
                 raise RuntimeError(f"MuJoCo can't reset: {cause}")
-            self.before[k], self.num_steps[k] = self.moving[k], 0
+            self.before[k] = self.moving[k]
+            self.begin(k)
         return failures
+
+    def begin(self, ids: Any) -> None:
+        """Have the next `advance` reset the simulations `ids`; or note that they were moved."""
+        self.num_steps[ids], self._even_steps = 0, 0
+
+    def control(self, actions: NDArray[Any], num_steps: int) -> None:
+        """Have the next `advance` take so many steps of MuJoCo with these controls, in all.
+
+        Args:
+            actions: ``[count, nu]``.
+            num_steps: of MuJoCo.
+        """
+        if self._even_steps != num_steps:
+            self.num_steps[:], self._even_steps = num_steps, num_steps
+        kind = actions.dtype.type
+        if kind is not self._kind:
+            self._use(kind)
+        # Their own address is not asked for, as that takes as long as several copies.
+        self._controls[...] = actions
+        if self._plan is None or kind not in _CONTROLS:
+            self.squares = np.add.reduce(np.square(actions), axis=1)
+
+    def _use(self, kind: type[Any]) -> None:
+        """Take controls of a type from now on."""
+        self._kind, plan = kind, self._plan
+        kind = kind if kind in _CONTROLS else np.float64
+        self._controls = np.zeros((self.count, self._model.nu), kind)
+        self.squares = self._summed = np.zeros(self.count, kind)
+        if plan is not None:
+            plan.controls, plan.squares = map(address_of, (self._controls, self._summed))
+            plan.is_single = kind is np.float32
 
     def _advance_by_numpy(self, ids: NDArray[np.int32] | None) -> dict[int, str]:
         """The twin of the compiled function, for several simulations. Return failures."""
@@ -313,15 +353,18 @@ class Simulations:
             self.rows[begun], nq = first, self._model.nq
             self._field("qpos")[begun] = self.starts[begun, :nq]
             self._field("qvel")[begun] = self.starts[begun, nq:]
-            failures = self._failures(library.mjb_forward(batch, *_chosen(begun), _ALL_STAGES))
+            if library.mjb_forward(batch, *_chosen(begun), _ALL_STAGES):
+                failures = self._failures()
             self.before[begun] = self.moving[begun]
             if self._has_forces:
                 self._field("cfrc_ext")[begun] = 0.0
         if len(stepped):
-            self._field("ctrl")[stepped] = self.controls[stepped]
+            self._field("ctrl")[stepped] = self._controls[stepped]
             self.before[stepped] = self.moving[stepped]
             chosen, num_steps = _chosen(stepped), int(self.num_steps[stepped[0]])
-            failures |= self._failures(library.mjb_step(batch, *chosen, num_steps, 0))
+            num_failed = library.mjb_step(batch, *chosen, num_steps, 0)
+            if num_failed or np.count_nonzero(self._warned):
+                failures |= self._failures()
             if self._keeps_data:
                 forces = library.mj_rnePostConstraint  # It ignores the further arguments.
                 library.mjb_apply(batch, *chosen, forces, None, False)
@@ -333,11 +376,8 @@ class Simulations:
             )
         return failures
 
-    def _failures(self, num_failed: int) -> dict[int, str]:
-        """Reasons of failures in a call that returned their number."""
+    def _failures(self) -> dict[int, str]:
         failures: dict[int, str] = {}
-        if not num_failed and not np.count_nonzero(self._warned):
-            return failures
         for warning, name in _UNSTABLE.items():
             for k in np.flatnonzero(self._warnings[:, warning]).tolist():
                 failures[k] = f"NaN, infinite or huge {name}: the simulation is unstable"
@@ -346,10 +386,20 @@ class Simulations:
             failures[k] = " ".join(self._library.mjb_error(self._batch, k).decode().split())
         return failures
 
+    def save_state(self) -> list[NDArray[Any]]:
+        """Return the state of all simulations."""
+        return [each.copy() for each in (self.rows, self.before, self.num_steps)]
+
+    def load_state(self, state: list[NDArray[Any]]) -> None:
+        """Restore what `save_state` returned."""
+        self.rows[:], self.before[:], self.num_steps[:] = state
+        self._even_steps = 0
+
     def put(self, k: int, data: Any, unread: Output) -> None:
         """Continue simulation `k` from `data`, and copy its parts to all outputs but one."""
         state_of(self._model, data, self.rows[k])
-        self.before[k], self.num_steps[k] = self.moving[k], 0
+        self.before[k] = self.moving[k]
+        self.begin(k)
         for output in self._outputs:
             if output is not unread:
                 output.read(
