@@ -14,7 +14,7 @@ import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation import Episode, EpisodeSpec, Evaluation, evaluate, outcomes
-from rlightning_aio.evaluation.estimates import mean_estimate, wilson_estimate
+from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -357,3 +357,18 @@ def test_what_nothing_is_known_of() -> None:
     one = mean_estimate([3.0])
     assert one is not None
     assert (one.mean, one.low, one.high) == (3.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "printed"),
+    [
+        (Estimate(4.876, 4.281, 5.471, 80), "4.88 [4.28, 5.47] (n=80)"),
+        (Estimate(1234.5, 1199.2, 1269.8, 9), "1234 [1199, 1270] (n=9)"),
+        (Estimate(0.0123, 0.0119, 0.0127, 9), "0.01230 [0.01190, 0.01270] (n=9)"),
+        (Estimate(500.0, 500.0, 500.0, 3), "500.00 [500.00, 500.00] (n=3)"),
+        (Estimate(7.0, None, None, 1), "7 (n=1)"),
+        (Estimate(float("nan"), None, None, 4), "nan (n=4)"),
+    ],
+)
+def test_an_estimate_prints_what_is_known(estimate: Estimate, printed: str) -> None:
+    assert str(estimate) == printed

@@ -113,3 +113,19 @@ def test_the_repr_of_a_group_lists_its_envs_and_their_placement() -> None:
     )
     group.close()
     assert repr(group) == said
+
+
+def test_init_logs_what_it_has_started(caplog: pytest.LogCaptureFixture) -> None:
+    """With the sub-environments of envs that callables have made."""
+
+    def several() -> Any:
+        return gym.make_vec("CartPole-v1", 3, "sync")
+
+    config = {"name": "a", "task": several, "num_workers": 2, "placement": "inline"}
+    with caplog.at_level("INFO", "rlightning_aio"), sync.build_env_group(config) as group:
+        group.init()
+        envs = "a: 2 envs of 3 sub-environments, placement inline, 0 worker processes"
+        assert repr(group) == f"EnvGroup({envs})"
+    (text,) = [record.getMessage() for record in caplog.records]
+    assert text.startswith("started within ")
+    assert text.endswith(envs)

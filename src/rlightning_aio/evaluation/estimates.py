@@ -15,6 +15,8 @@ __all__ = ["Estimate", "mean_estimate", "wilson_estimate"]
 _Z: Final = NormalDist().inv_cdf(0.975)
 _T: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 """The 97.5 % quantiles of Student's t with 1 to 10 degrees of freedom."""
+_SHOWN_DIGITS: Final = 2
+"""Of half of an interval, where an estimate is printed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +33,16 @@ class Estimate:
     low: float | None
     high: float | None
     count: int
+
+    def __str__(self) -> str:
+        """Return ``mean [low, high] (n=count)``, with as many digits as the interval determines."""
+        if self.low is None or self.high is None:
+            return f"{self.mean:.4g} (n={self.count})"
+        half = (self.high - self.low) / 2
+        known = 0.0 < half < math.inf
+        digits = max(0, _SHOWN_DIGITS - 1 - math.floor(math.log10(half))) if known else 2
+        mean, low, high = (f"{value:.{digits}f}" for value in (self.mean, self.low, self.high))
+        return f"{mean} [{low}, {high}] (n={self.count})"
 
 
 def mean_estimate(values: Sequence[float]) -> Estimate | None:

@@ -157,6 +157,7 @@ class Supervisor:
             EnvMeta(env_id=server_id, observation_space=None, action_space=None)
             for server_id in self.members.server_ids
         ]
+        _log.info("started within %.1f s: %s", self._clock() - now, self.workers.summary())
         return self.metas
 
     def _launch_first(self, record: HostRecord) -> None:

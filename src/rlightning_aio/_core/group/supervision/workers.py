@@ -90,8 +90,12 @@ def _entry(records: Sequence[HostRecord]) -> str:
     config = records[0].config
     if placement_of(config.backend, config.placement).max_members:
         return config.backend
-    sizes = f" of {config.num_envs} sub-environments" if config.num_envs > 1 else ""
     envs = sum(len(record.slots) for record in records)
+    # Only its spaces say so of an env that a callable has made.
+    each = [env.meta.num_envs for r in records for env in r.started] or [config.num_envs] * envs
+    sizes = f" of {each[0]} sub-environments" if each[0] > 1 else ""
+    if len({*each}) > 1:
+        sizes = f" with {sum(each)} sub-environments"
     workers = sum(record.killable is not None for record in records)
     return (
         f"{envs} env{'' if envs == 1 else 's'}{sizes}, placement {config.placement}, "
