@@ -28,7 +28,7 @@ from rlightning_aio.config import EnvConfig
 MODULES: Final = {
     "": "the package", "sync": "blocking", "vector": "vector", "sb3": "vector",
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
-    "attempts": "attempts",
+    "attempts": "attempts", "trl": "trainers", "tinker": "trainers",
     "policies": "evaluation", "policy_servers": "evaluation", "export": "evaluation",
     "metrics": "metrics", "remote": "remote", "serving": "remote", "errors": "errors",
     "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",

@@ -21,6 +21,7 @@ INTERNAL = {"_core", "batch", "cli", "config", "envs", "protocol", "registry", "
 INTERNAL |= {
     "files",
     "json_text",
+    "loop_thread",
     "outcomes",
     "piper",
     "sealing",
@@ -35,6 +36,7 @@ WORDS = {
     "errors",
     "files",
     "json_text",
+    "loop_thread",
     "outcomes",
     "registry",
     "sealing",

@@ -35,6 +35,7 @@ ELSEWHERE = {
     "tianshou": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
     "torchrl": "vector/test_pages.py",
+    "trainers": "trainers/test_page.py",
 }
 
 

@@ -18,7 +18,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.envs.openenv.session import OpenEnvSession, ServerRefused
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.policy_servers.loop_thread import LoopThread
+from rlightning_aio.loop_thread import LoopThread
 
 ENVS = 4
 

@@ -18,9 +18,9 @@ from websockets.exceptions import ConnectionClosed
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio.batch.contents import origin_of
 from rlightning_aio.errors import PolicyServerError
+from rlightning_aio.loop_thread import LoopThread
 from rlightning_aio.policies.episodes import begins_of_envs
 from rlightning_aio.policy_servers.connection import MAX_BYTES, connected
-from rlightning_aio.policy_servers.loop_thread import LoopThread
 from rlightning_aio.protocol.columns import index
 
 if TYPE_CHECKING:

@@ -40,6 +40,10 @@ class LoopThread:
             self._running = loop, thread
         return asyncio.run_coroutine_threadsafe(coroutine, self._running[0])
 
+    def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        """Run a coroutine, and wait for it."""
+        return self.submit(coroutine).result()
+
     def close(self) -> None:
         """Cancel all coroutines, and end the thread."""
         if self._running is None:
