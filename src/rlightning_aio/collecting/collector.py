@@ -65,7 +65,9 @@ class Collector(Generic[G, R]):
     else at their own, if they have any. Between two calls, envs may be reset, restored and called
     by others: their chains end, and new ones begin with what `EnvGroup.reset` or `EnvGroup.restore`
     returned last. Envs that others have stepped begin a new episode, and so do envs that raised an
-    error and were not reset. A robot's or a client's env does that only if you reset it.
+    error and were not reset. A robot's or a client's env does that only if you reset it. The first
+    call resets all envs, unless one call has reset or restored them all since the collector was
+    made; to resume, make the collector and then restore a snapshot.
 
         async with rl.build_env_group(config) as group:
             collector = Collector(group, policy, num_transitions=2048, min_results=4, seed=0)
@@ -180,7 +182,8 @@ class Collector(Generic[G, R]):
         self._kinds: dict[str, EnvKind] = {}
         self._started = self._start_cut_off = self._start_raised = False
         self._start_fault: EnvFault | None = None
-        self._newest: Newest
+        self._newest: Newest = newest_of(self._group)
+        self._newest.keeps = True
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
         # Results in order of progress: received, not yet stored, not yet answered.
@@ -274,9 +277,12 @@ class Collector(Generic[G, R]):
         self._expecting = False
 
     def _start(self) -> Procedure[None]:
-        """Reset all envs, and wait for all of them."""
+        """Reset all envs, and wait for all of them, unless the program has done so."""
         try:
-            self._received, _ = yield partial(self._group.reset, seed=self._seed)
+            if self._order is None and not (self._start_cut_off or self._start_raised):
+                self._received = self._newest.take_all_returned()
+            if self._received is None:
+                self._received, _ = yield partial(self._group.reset, seed=self._seed)
         except EnvBusy:
             if self._start_cut_off:
                 yield from self._await_start()
@@ -289,10 +295,9 @@ class Collector(Generic[G, R]):
             self._start_cut_off = not isinstance(error, Exception)
             self._start_raised = isinstance(error, EnvFault)
             raise
-        self._newest = newest_of(self._group)
         if self._min_results is None:
             self._min_results = default_min_results(self._group)
-        self._started = self._newest.keeps = True
+        self._started = True
 
     def _start_again(self) -> Procedure[None]:
         """Begin again where envs have raised, and the program has reset some of them meanwhile."""

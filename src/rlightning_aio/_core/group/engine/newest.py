@@ -73,6 +73,14 @@ class Newest:
         self._kept = {}
         return [batch.take(own) for batch, own in rows.values()]
 
+    def take_all_returned(self) -> BatchedData | None:
+        """Return the newest results of all envs, if one call has returned them to the program."""
+        if not self._kept:
+            return None
+        batches = self.take_returned(self.idle(()))
+        is_all = len(batches) == 1 and len(batches[0]) == len(self._members.everyone())
+        return batches[0] if is_all else None
+
     def idle(self, batches: Iterable[BatchedData]) -> list[str]:
         """Return the ids of envs that are here and idle, and have no result in `batches`."""
         wanted = np.zeros(len(self._envs), np.bool_)
