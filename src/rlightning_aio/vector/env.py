@@ -27,7 +27,7 @@ from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
 from rlightning_aio.vector.pending import check_free, check_running, check_sent
-from rlightning_aio.vector.proxies import EnvProxy, check_name
+from rlightning_aio.vector.proxies import CalledEnvs, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, checked_mode, seeds_of_envs
 from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
@@ -45,7 +45,9 @@ __all__ = ["VectorEnv", "per_worker"]
 T = TypeVar("T")
 
 
-class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
+class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_random` is a tuple.
+    CalledEnvs, gym.vector.VectorEnv[Any, Any, Any]
+):
     """Envs in worker processes behind Gymnasium's vector interface.
 
     Args:
@@ -389,18 +391,6 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         collect = partial(collect_calls, self.group)
         return tuple(self._rows.values(self._finish("call", timeout, collect)))
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Attribute `name` of each env, found through its wrappers."""
-        return self.call(name)
-
-    @property
-    def envs(self) -> list[Any]:
-        """A proxy of each env; it fetches attributes when they are read."""
-        return [
-            EnvProxy(partial(self._look_up, place), partial(self.call_one, place))
-            for place in range(self.num_envs)
-        ]
-
     def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env at `place`, or get its attribute."""
         check_name(name)
@@ -443,16 +433,6 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def render(self) -> tuple[Any, ...]:
         """Return one rendered frame of each env."""
         return self.call("render")
-
-    @property
-    def np_random(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # As theirs.
-        """Random generators of the envs: a tuple of copies."""
-        return self.get_attr("np_random")
-
-    @property
-    def np_random_seed(self) -> Any:
-        """Seeds of the envs' random generators: a tuple."""
-        return self.get_attr("np_random_seed")
 
     # -- the end ----------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from rlightning_aio.envs.mujoco.batch import MujocoBatch
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.vector.lazy_infos import LazyColumns
 from rlightning_aio.vector.pending import check_free, check_running, check_sent
-from rlightning_aio.vector.proxies import EnvProxy, check_name
+from rlightning_aio.vector.proxies import CalledEnvs, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 
 if TYPE_CHECKING:
@@ -29,7 +29,9 @@ __all__ = ["MujocoVectorEnv"]
 
 
 # skrl looks for Gymnasium among the bases themselves.
-class MujocoVectorEnv(MujocoBatch, gym.vector.VectorEnv[Any, Any, Any]):
+class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_random`.
+    MujocoBatch, CalledEnvs, gym.vector.VectorEnv[Any, Any, Any]
+):
     """Simulations of one of Gymnasium's MuJoCo tasks behind Gymnasium's vector interface.
 
     MuJoCo steps and resets them in threads of this process. Returned arrays are fresh: no later
@@ -140,46 +142,24 @@ class MujocoVectorEnv(MujocoBatch, gym.vector.VectorEnv[Any, Any, Any]):
         check_name(name)
         return super().call(name, *args, **kwargs)
 
-    def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Attribute `name` of each env, found through its wrappers."""
-        return self.call(name)
-
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value, or to equal values in a list or tuple."""
         check_running(self)
         super().set_attr(name, values)
 
-    @property
-    def envs(self) -> list[Any]:
-        """A proxy of each env; it fetches attributes when they are read."""
-        return [
-            EnvProxy(partial(self._look_up, k), partial(self.call_one, k))
-            for k in range(self.num_envs)
-        ]
-
-    def _look_up(self, k: int, name: str) -> tuple[bool, Any]:
+    def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
         is_method = callable(getattr(self.env, name, None))
-        return is_method, None if is_method else self.call_one(k, name)
+        return is_method, None if is_method else self.call_one(place, name)
 
-    def call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of env `k`, or get its attribute."""
+    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of env `place`, or get its attribute."""
         check_free(self, self._pending, "call_async")
         check_name(name)
-        return super().call_one(k, name, *args, **kwargs)
+        return super().call_one(place, name, *args, **kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
         return self.is_wrapped(name_of(wrapper_class))
-
-    @property
-    def np_random(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # As theirs.
-        """Random generators of the envs: a tuple."""
-        return self.get_attr("np_random")
-
-    @property
-    def np_random_seed(self) -> Any:
-        """Seeds of the envs' random generators: a tuple."""
-        return self.get_attr("np_random_seed")
 
     # -- state and rendering ---------------------------------------------------------------
 

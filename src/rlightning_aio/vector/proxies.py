@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["EnvProxy", "check_name"]
+__all__ = ["CalledEnvs", "EnvProxy", "check_name"]
 
 _NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
 
@@ -41,6 +41,46 @@ class EnvProxy:
 
     def __setattr__(self, name: str, value: Any) -> None:
         self._call("set_wrapper_attr", name, value)
+
+
+class CalledEnvs:
+    """Mixin for vector envs that answer calls on single envs."""
+
+    num_envs: int
+
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call method `name` of each env, found through its wrappers, or get an attribute."""
+        raise NotImplementedError
+
+    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the env at `place`, or get its attribute."""
+        raise NotImplementedError
+
+    def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
+        """Return True and None for a method of the env at `place`, or False and the attribute."""
+        raise NotImplementedError
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Attribute `name` of each env, found through its wrappers."""
+        return self.call(name)
+
+    @property
+    def envs(self) -> list[Any]:
+        """A proxy of each env; it fetches attributes when they are read."""
+        return [
+            EnvProxy(partial(self._look_up, place), partial(self.call_one, place))
+            for place in range(self.num_envs)
+        ]
+
+    @property
+    def np_random(self) -> Any:
+        """Random generators of the envs: a tuple."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Seeds of the envs' random generators: a tuple."""
+        return self.get_attr("np_random_seed")
 
 
 def check_name(name: str) -> None:
