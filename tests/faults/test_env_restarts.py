@@ -105,6 +105,19 @@ def test_exceptions_in_a_row_are_raised_at_last(start: Start, tmp_path: Path, pl
 
 
 @on_one_driver
+def test_so_many_exceptions_in_an_hour(start: Start) -> None:
+    """Whatever has been stepped in between."""
+    group, tokens = start(entry(2, on_env_error="restart", max_restarts="2/hour")), Tokens()
+    for _ in range(2):
+        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": "raise"}))
+        assert batch.restarted.tolist() == [False, True]
+        group.step(tokens.steps(group.group.env_ids))
+    with pytest.raises(EnvRaised) as caught:
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "raise"}))
+    assert "2 restarts within the last hour" in caught.value.__notes__[0]
+
+
+@on_one_driver
 def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
     group, tokens = start(two_workers(on_env_error="restart")), Tokens()
     with pytest.raises(EnvRaised):

@@ -200,7 +200,8 @@ class HostRecord:
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
         self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")
-        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted")
+        times = self.restart_policy.times
+        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted", times)
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)

@@ -57,14 +57,15 @@ class EnvErrors:
         policy, name = record.error_policy, record.config.name
         count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
         self._on_count()
-        then = policy.then(count)
-        if not policy.bears(count):
+        now = group.clock()
+        is_borne, then = policy.judge(count, now, pauses=False)
+        if not is_borne:
             fault.add_note(then)
             return False
         record.restarts += 1
         doing = Operation(group.requests.numbering.op(slot)).name.lower()
         message = f"{group.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
-        cause, now = f"raised {error.type_name}", group.clock()
+        cause = f"raised {error.type_name}"
         self._crash_log.note(name, message, cause, fault.env_id, now, error.traceback)
         observer = group.observed.observer
         if observer is not None:

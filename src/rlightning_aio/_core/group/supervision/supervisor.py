@@ -437,9 +437,9 @@ class Supervisor:
             record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
         deaths = record.deaths_in_a_row
         self._note_deaths(True)
-        policy = record.restart_policy
-        replaced = not is_fault or policy.bears(deaths)
-        then = policy.then(deaths) if is_fault else "it is replaced"
+        replaced, then = True, "it is replaced"
+        if is_fault:
+            replaced, then = record.restart_policy.judge(deaths, self._clock())
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))

@@ -480,8 +480,8 @@ class AwaitedEnvs:
     def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Failed | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         record.losses += 1
-        then = self._restarts.then(record.losses)
-        if self._restarts.bears(record.losses):
+        is_borne, then = self._restarts.judge(record.losses, self._loop.time())
+        if is_borne:
             log.warning("%s; %s", message, then)
             return None
         for_good = self._restarts.raises
