@@ -6,7 +6,15 @@ a reset that fails, an agent that is stuck, and a model's server that is away. `
 again. The table counts outcomes against what was injected; `gather` is the same program without it:
 a loop over the tasks, an env for each attempt, no time limits.
 
+Then the first 6 of 8 attempts whose latencies are log-normal, against waiting for all 8, and how
+long it takes until the env of a surplus attempt plays the next; and the memory of an attempt, with
+2,000 in flight.
+
     python benchmarks/attempts.py [--json]
+
+A run that is killed ten times, and goes on from its file, is a test:
+
+    RLIGHTNING_AIO_KILLS=10 python -m pytest tests/attempts/test_killed.py
 """
 
 from __future__ import annotations
@@ -24,6 +32,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
+import psutil
 from harness import machine_facts, machine_text
 
 import rlightning_aio as rl
@@ -42,6 +51,7 @@ FAULTS: Final = {
 }
 """What goes wrong, and the outcome that is to say so."""
 GIVE_UP_SECONDS: Final = 20.0
+MEDIAN_SECONDS, IN_FLIGHT = 0.05, 2000
 
 
 def fault_of(seed: int, index: int, faults: list[str]) -> str:
@@ -215,14 +225,76 @@ def compared(place: str, number: int) -> dict[str, Any]:
     return found
 
 
+class Slow(AwaitedTool):
+    """Each step takes as long as its action says."""
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(action)
+        return self.tool.step(action)
+
+
+async def first_of(first: int | None, number: int) -> dict[str, Any]:
+    """Play groups of 8 on 8 envs, one after another, with the same latencies for each rule."""
+    cancelled: dict[str, float] = {}
+    freed: list[float] = []
+
+    async def agent(episode: Any) -> None:
+        if (since := cancelled.pop(episode.env_id, None)) is not None:
+            freed.append(time.monotonic() - since)
+        rng = random.Random(f"{episode.spec.seed}-{episode.index}")
+        try:
+            while not episode.is_over:
+                await episode.step(MEDIAN_SECONDS * rng.lognormvariate(0.0, 1.0))
+        except asyncio.CancelledError:
+            cancelled[episode.env_id] = time.monotonic()
+            raise
+
+    tasks = [EpisodeSpec("", seed, {"folder": "/"}) for seed in range(number)]
+    async with rl.build_env_group(Slow, num_workers=SIZE, placement="loop") as group:
+        began = time.monotonic()
+        for task in tasks:
+            async for attempts in play(group, [task], agent, SIZE, Rules(first=first)):
+                assert attempts.is_complete
+        seconds = time.monotonic() - began
+    return {"seconds_per_group": seconds / number, "freed_s": max(freed, default=None)}
+
+
+async def memory_of_attempts() -> float:
+    """KiB of an attempt and its agent in its first step, without those of its env."""
+    flying, all_there, go = 0, asyncio.Event(), asyncio.Event()
+
+    async def agent(episode: Any) -> None:
+        nonlocal flying
+        await episode.step("go")
+        flying += 1
+        if flying == IN_FLIGHT:
+            all_there.set()
+        await go.wait()
+
+    async with rl.build_env_group(AwaitedTool, num_workers=IN_FLIGHT, placement="loop") as group:
+        await group.reset(options={"folder": "/"})
+        before = psutil.Process().memory_info().rss
+        tasks = [EpisodeSpec("", seed, {"folder": "/"}) for seed in range(IN_FLIGHT // SIZE)]
+        groups = play(group, tasks, agent, SIZE)
+        waiting = asyncio.ensure_future(anext(groups))
+        await all_there.wait()
+        used = psutil.Process().memory_info().rss - before
+        go.set()
+        await waiting
+        await groups.aclose()
+    return used / 1024 / IN_FLIGHT
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", type=int, default=TASKS)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     args = parser.parse_args()
     report = {place: compared(place, args.tasks) for place in ("loop", "workers")}
+    rules = {f"first {k or SIZE}": rl.run(first_of(k, min(args.tasks, 32))) for k in (None, 6)}
+    more = {**rules, "kib_per_attempt": rl.run(memory_of_attempts())}
     if args.json:
-        print(json.dumps(report))
+        print(json.dumps({**report, **more}))
         return
     print(machine_text(machine_facts(("rlightning_aio", "uvloop"))))
     for place, found in report.items():
@@ -234,6 +306,12 @@ def main() -> None:
         for kind, count in found["injected"].items():
             print(f"  {kind}: {count} injected, {mine['failures'].get(kind, 0)} found")
         print(f"  by gather: {found['gather']['end']}, {found['gather']['attempts']} attempts done")
+    for rule, found in rules.items():
+        line = f"{rule} of {SIZE}: {found['seconds_per_group']:.3f} s for each group"
+        if found["freed_s"] is not None:
+            line += f"; an env plays the next attempt {found['freed_s']:.3f} s later, at most"
+        print(f"\n{line}")
+    print(f"\n{more['kib_per_attempt']:.1f} KiB for each of {IN_FLIGHT} attempts in flight")
 
 
 if __name__ == "__main__":

@@ -16,7 +16,8 @@ from attempts.rooms import Room
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, play
 
-KILLS, TASKS, SIZE = 3, 12, 3
+KILLS = int(os.environ.get("RLIGHTNING_AIO_KILLS", "3"))
+TASKS, SIZE = 4 * KILLS, 3
 
 
 async def agent(episode: Any) -> int:
@@ -47,7 +48,7 @@ def lines_in(path: Path) -> int:
 
 
 def test_a_run_that_is_killed_goes_on(tmp_path: Path) -> None:
-    """Three times by SIGKILL, at any moment after some more attempts have ended."""
+    """Several times by SIGKILL, at any moment after some more attempts have ended."""
     path, whole = tmp_path / "killed.jsonl", tmp_path / "whole.jsonl"
     command = [sys.executable, "-m", "attempts.test_killed", str(path)]
     surroundings = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}

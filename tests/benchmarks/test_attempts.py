@@ -15,7 +15,7 @@ def test_outcomes_equal_the_faults_that_were_injected() -> None:
     command = [sys.executable, str(SCRIPT), "--json", "--tasks", "6"]
     ended = subprocess.run(command, capture_output=True, check=True, text=True)
     report = json.loads(ended.stdout.splitlines()[-1])
-    for found in report.values():
+    for found in (report["loop"], report["workers"]):
         assert found["injected"]
         mine = found["play"]
         assert (mine["groups"], mine["complete"], mine["left"]) == (6, 6, 0)
@@ -23,3 +23,5 @@ def test_outcomes_equal_the_faults_that_were_injected() -> None:
         assert mine["rewards"] == {"4.0": 48}
         assert found["gather"]["end"] != "ended"
         assert found["gather"]["attempts"] < 48
+    assert report["first 6"]["freed_s"] > 0
+    assert report["kib_per_attempt"] > 0
