@@ -49,6 +49,23 @@ class NoWork(gym.Env[Any, Any]):
         return self._observation, 0.0, False, False, {}
 
 
+class AwaitsNothing:
+    """As `NoWork`, by coroutines."""
+
+    observation_space, action_space = NoWork.observation_space, NoWork.action_space
+
+    def __init__(self) -> None:
+        self._observation = np.zeros(4, np.float32)
+
+    async def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        del seed, options
+        return self._observation, {}
+
+    async def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        del action
+        return self._observation, 0.0, False, False, {}
+
+
 class Sleeps(NoWork):
     """Sleeps in each step for a log-normal time: median 2 ms, sigma 1.5.
 

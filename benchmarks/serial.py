@@ -5,17 +5,22 @@ More cores shorten the simulations, not this part. It is the thread's own proces
 left out; of EnvPool, whose simulations run in threads of their own, all of the main thread counts,
 short spinning for results included. The second table is a model, not a measurement: a step of all
 takes the trainer's part, and all other processor time divided by the cores.
+The third table is for envs that do nothing, in workers, and as coroutines of the trainer's thread,
+where the envs' own part counts.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import statistics
 import time
 from typing import TYPE_CHECKING, Any
 
-from contenders import EnvPool, MakeVec, Work
+import numpy as np
+from contenders import EnvPool, MakeVec, OursSync, Work
 from harness import Contender, arguments, machine_facts, modules_of, number_text, say, take_turns
+from no_work import NO_WORK, AwaitsNothing
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +34,13 @@ WORKS = {
     ("Humanoid-v5", 256): 0.5,
 }
 """The maximum ratio to EnvPool of a task and a number of simulations."""
+EACH = {
+    ("plain Python envs in workers", 256): 0.3,
+    ("plain Python envs in workers", 1024): None,
+    ("awaitable envs", 256): None,
+    ("awaitable envs", 1024): None,
+}
+"""The maximum µs of the trainer for a result, of envs that do nothing."""
 MODELLED = (16, 64, 128)
 """Numbers of cores of the model."""
 PARALLEL = ("mjb_step", "mjb_apply", "mjb_forward", "mjb_reset")
@@ -89,6 +101,46 @@ class Pool(Serial, EnvPool):
         self.prepare()
 
 
+class Plain(Serial, OursSync):
+    """Envs in workers; all are stepped and awaited."""
+
+    def setup(self) -> None:
+        super().setup()
+        self.prepare()
+
+
+class Awaitable(Serial, Contender):
+    """Envs whose `step` is a coroutine, on the event loop of the trainer's thread."""
+
+    def __init__(self, name: str, count: int) -> None:
+        self.name, self._count = name, count
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        return ("rlightning_aio",)
+
+    def setup(self) -> None:
+        from rlightning_aio import build_env_group
+
+        makers = [AwaitsNothing] * self._count
+        self._envs = build_env_group({"name": "env", "task": makers, "placement": "loop"})
+        self._runner = asyncio.Runner()
+        self._runner.run(self._envs.init())
+        self._batch, _ = self._runner.run(self._envs.reset(seed=0))
+        self._actions = np.zeros((self._count, 2), np.float32)
+        self.prepare()
+
+    def step(self) -> int:
+        step = self._envs.step(self._batch.respond(action=self._actions))
+        self._batch, _ = self._runner.run(step)
+        _ = self._batch.observation, self._batch.reward
+        return self._count
+
+    def teardown(self) -> None:
+        self._runner.run(self._envs.close())
+        self._runner.close()
+
+
 def name_of(task: str, count: int) -> str:
     return f"{task.removesuffix('-v5')} x {count:,}"
 
@@ -100,6 +152,12 @@ for task, count in WORKS:
         Ours(f"make_vec, {name_of(task, count)}", work),
         Pool(f"EnvPool, {name_of(task, count)}", work),
     ]
+for kind, count in EACH:
+    name = name_of(kind, count)
+    if kind == "awaitable envs":
+        contenders.append(Awaitable(name, count))
+    else:
+        contenders.append(Plain(name, Work(NO_WORK, count), auto_reset=False))
 
 
 def medians(rounds: list[tuple[Any, Any]]) -> tuple[float, float]:
@@ -139,7 +197,20 @@ def serial_tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
                 outside, rest = medians(rounds)
                 rates = (number_text(1e6 * count / (outside + rest / n)) for n in MODELLED)
                 model.append(f"| {kind}, {name_of(task, count)} | {' | '.join(rates)} |")
-    return "\n".join([*lines, "", *model])
+    each = [
+        "| Trainer's µs for a result | median | low to high | target | |",
+        "|---|---:|---:|---:|---|",
+    ]
+    for (kind, count), bound in EACH.items():
+        spent = [value[0] / count for value, _ in turns.get(name_of(kind, count), [])]
+        if not spent:
+            continue
+        middle, judged = statistics.median(spent), "| |"
+        if bound is not None:
+            judged = f"≤ {bound} | {'met' if middle <= bound else 'missed'} |"
+        spread = f"{min(spent):.2f} to {max(spent):.2f}"
+        each.append(f"| {name_of(kind, count)} | {middle:.2f} | {spread} | {judged}")
+    return "\n".join([*lines, "", *model, "", *each])
 
 
 def main() -> None:

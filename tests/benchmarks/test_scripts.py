@@ -38,7 +38,7 @@ ASKED = {
     "pong": ["rlightning_aio"],
     "tracing": ["async half, CartPole"],
     "filming": ["compute"],
-    "serial": ["HalfCheetah x 32"],
+    "serial": ["HalfCheetah x 32", "envs x 256"],
     "loop_pause": [],
     "headline": ["make_vec"],
     "exchange": ["sync", "bare exchange"],
@@ -180,6 +180,7 @@ def check_serial(report: dict[str, Any]) -> None:
     found = report["results"]["make_vec, HalfCheetah x 32"]
     assert found["outside_us"] > 0
     assert "model, not measured" in report["tables"]
+    assert "awaitable envs x 256 |" in report["tables"]
 
 
 def check_awaitable(report: dict[str, Any]) -> None:
