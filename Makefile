@@ -187,7 +187,7 @@ $(SIMULATORS)/installed: extras := [ale,envpool,maniskill,pettingzoo,piper,sb3,t
 # Two libraries whose pages it runs, too.
 $(SIMULATORS)/installed: pages := skrl tianshou
 # What an installation is made from.
-SOURCES := pyproject.toml setup.py constraints.txt $(wildcard requirements/*.txt src/rlightning_aio/*/*.c)
+SOURCES := pyproject.toml setup.py constraints.txt $(wildcard requirements/*.txt src/rlightning_aio/*/*.c src/rlightning_aio/*/*/*.c)
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
 $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
