@@ -46,3 +46,19 @@ def test_a_partial_restore_is_no_start() -> None:
     with sync.build_env_group(POLES) as group:
         batch, _ = group.reset(seed=1)
         assert np.array_equal(first, batch.observation)
+
+
+def test_envs_of_different_shapes_are_resumed_too() -> None:
+    """One policy for each entry, some envs with sub-environments."""
+    both = [POLES, {**POLES, "name": "many", "num_envs": 2}]
+    policies = {"pole": None, "many": None}
+    with sync.build_env_group(both) as group:
+        collector = Collector(group, policies, num_transitions=30, min_results=6)
+        batch, _ = group.reset(seed=3)
+        first = collector.collect()
+    for name, one in batch.by_entry().items():
+        found = first[name]
+        shown = one.observation.reshape(-1, 4)
+        for index, observation in zip(one.index.ravel(), shown, strict=True):
+            (own, *_) = np.flatnonzero(found.index == index)
+            assert np.array_equal(found.observation[own], observation)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "all_agents",
+    "any_reset",
     "are_over",
     "columns_of_responses",
     "ended_episodes",
@@ -147,6 +148,15 @@ def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
 def are_over(batch: BatchedData) -> list[bool]:
     """Return for each result whether it ends the episodes of all agents and sub-environments."""
     return column_of_parts(batch._parts, _over_of_rows).tolist()
+
+
+def any_reset(batch: BatchedData) -> NDArray[np.bool_]:
+    """Return for each result whether the env, or one of its sub-environments, was reset."""
+    return column_of_parts(batch._parts, _resets_of_rows)
+
+
+def _resets_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
+    return np.logical_or.reduce(part.is_reset.reshape(len(part.slots), -1), axis=1)
 
 
 def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:

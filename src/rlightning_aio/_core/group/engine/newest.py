@@ -14,7 +14,7 @@ import numpy as np
 
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.contents import slots_of_results
+from rlightning_aio.batch.contents import any_reset, slots_of_results
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.registry import ENVS
 
@@ -57,10 +57,9 @@ class Newest:
 
     def note_returned(self, batch: BatchedData) -> None:
         """Keep the results of a batch in which envs were reset."""
-        resets = batch.is_reset.reshape(len(batch), -1).any(axis=1)
         slots: list[int] = slots_of_results(batch).tolist()
         marks: list[int] = self.marks(batch).tolist()
-        for row in np.flatnonzero(resets).tolist():
+        for row in np.flatnonzero(any_reset(batch)).tolist():
             self._kept[slots[row]] = marks[row], batch, row
 
     def take_returned(self, env_ids: Iterable[str]) -> list[BatchedData]:
