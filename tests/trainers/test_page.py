@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from rlightning_aio import EnvError
 
 pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
 
@@ -59,3 +63,20 @@ async def test_tinker() -> None:
 
     rewards = [found.get_total_rewards() async for found in names["play"](Renderer(), policy)]
     assert rewards == [[0.0] * 4, [1.0] * 4]
+
+
+def test_skyrl() -> None:
+    """An episode, and a lost step, which raises."""
+    names = program("skyrl_gym")
+    env = names["ShellEnv"]()
+    try:
+        prompt, _ = env.init([{"role": "user", "content": "List the files."}])
+        assert prompt[-1]["content"] == "$"
+        first, second = env.step("ls"), env.step("cat")
+        assert (first["reward"], first["done"], second["reward"], second["done"]) == (1, 0, 0, 1)
+        assert first["observations"] == [{"role": "user", "content": "ls: done"}]
+        os.kill(env.group.get_workers()[0]["pid"], signal.SIGKILL)
+        with pytest.raises(EnvError, match="SIGKILL"):
+            env.step("ls")
+    finally:
+        env.close()
