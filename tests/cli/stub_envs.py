@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
 import subprocess
 import threading
@@ -183,3 +184,23 @@ class Finishing(Stub):
 
     def close(self) -> None:
         Path(self.options["closed_file"]).touch()
+
+
+class Careless(gym.Env[Any, Any]):
+    """Draws from a generator that nobody seeds, forgets files, and divides by zero."""
+
+    observation_space = gym.spaces.Box(0, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+    files: ClassVar[list[Any]] = []
+
+    def _observed(self) -> Any:
+        return np.random.default_rng().random(2, np.float32)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.files.append(Path(__file__).open())  # noqa: SIM115
+        self.steps = 0
+        return self._observed(), {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self._observed(), math.nan, self.steps == 5, False, {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
-from cli.stub_envs import Stub
+from cli.stub_envs import Careless, Stub
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -53,3 +53,23 @@ def test_tasks_lists_the_tasks_of_a_backend() -> None:
         done = invoke("backends", name)
         assert done.exit_code == 2
         assert said in done.stderr
+
+
+def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
+    """With so many steps; a sound env has no problem."""
+    careless = {"name": "bad", "backend": "callable", "task": "cli.stub_envs:Careless"}
+    config = write_config(tmp_path, INLINE, {**careless, "placement": "inline"})
+    try:
+        found = invoke_json("check", config, "--steps", "80")["entries"]
+        text = invoke("check", config, "--steps", "80").stdout
+    finally:
+        while Careless.files:
+            Careless.files.pop().close()
+    good, bad = [each["trial"] for each in found]
+    assert good["problems"] == []
+    assert bad["episodes"] >= 10
+    rewards, seed, *leaks = bad["problems"]
+    assert "rewards are NaN" in rewards
+    assert "differ from the reset on" in seed
+    assert any("more open descriptors after" in leak for leak in leaks)
+    assert "problem: none found" in text

@@ -13,6 +13,7 @@ from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
+from rlightning_aio.cli.trial import Trial, try_out
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.json_text import json_of
@@ -36,6 +37,7 @@ class _Finding:
         skipped: the reason why it was not started.
         steps: how many steps it made; none if only a policy can choose its actions.
         offers: an OpenEnv server's own description and schemas.
+        trial: what whole episodes have shown.
     """
 
     name: str
@@ -49,11 +51,15 @@ class _Finding:
     skipped: str | None = None
     steps: int = 0
     offers: dict[str, Any] | None = None
+    trial: Trial | None = None
 
 
 def check(
     config: Config,
     overrides: Overrides = None,
+    steps: Annotated[
+        int, typer.Option(min=0, help="Play so many steps with random actions, and look closely.")
+    ] = 0,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document instead of the text.")
     ] = False,
@@ -67,20 +73,21 @@ def check(
 
         rlightning-aio check configs/cartpole.yaml
         rlightning-aio check configs/halfcheetah.yaml envs.0.task=Ant-v5
+        rlightning-aio check configs/cartpole.yaml --steps 2000
     """
     configs = load_config(config, overrides or ())
     check_installed(configs)
     findings: list[_Finding] = []
-    run_interruptible(_look(configs, findings))
+    run_interruptible(_look(configs, findings, steps))
     if as_json:
-        print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
+        print_json({"config": str(config), "entries": [_as_json(found) for found in findings]})
         return
     for found in findings:
         for line in _lines(found):
             out().print(line, soft_wrap=True, markup=False)
 
 
-async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
+async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: int) -> None:
     for config in configs:
         found = _Finding(
             config.name, config.backend, config.task_name, config.num_workers, config.num_envs
@@ -92,7 +99,7 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
         elif ENVS.is_hardware(config.backend):
             found.skipped = "it would move"
         else:
-            await _try(config, found)
+            await _try(config, found, steps)
         findings.append(found)
 
 
@@ -112,7 +119,7 @@ def _offers(config: EnvConfig) -> dict[str, Any]:
         raise ConfigError(f"{config.name!r}: {config.task_name} can't be read: {error}") from error
 
 
-async def _try(config: EnvConfig, found: _Finding) -> None:
+async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
     """Build one env of the entry and step it."""
     one = [config.model_copy(update={"num_workers": 1})]
     async with rlightning_aio.build_env_group(one) as group:
@@ -130,6 +137,13 @@ async def _try(config: EnvConfig, found: _Finding) -> None:
                 await respond_to_all(group, respond, batch)
                 batch, _ = await group.collect_async()
         found.steps = _STEPS
+        if steps:
+            found.trial = await try_out(group, steps)
+
+
+def _as_json(found: _Finding) -> dict[str, Any]:
+    trial = None if found.trial is None else found.trial._asdict()
+    return {**asdict(found), "trial": trial}
 
 
 def _has_no_samples(space: Any) -> bool:
@@ -150,6 +164,7 @@ def _lines(found: _Finding) -> list[str]:
     if found.offers is not None:
         return [head, *json_of(found.offers, indent=2).splitlines()]
     limit = found.max_episode_steps
+    trial = found.trial
     return [
         head,
         f"  observation  {found.observation_space}",
@@ -158,4 +173,13 @@ def _lines(found: _Finding) -> list[str]:
         f"  reset and stepped {found.steps} times"
         if found.steps
         else "  reset; not stepped: only a policy can choose its actions",
+        *([] if trial is None else _lines_of(trial)),
+    ]
+
+
+def _lines_of(trial: Trial) -> list[str]:
+    return [
+        f"  {counted(trial.episodes, 'episode')}; a step takes {trial.step_us:.0f} µs",
+        *[f"  problem: {problem}" for problem in trial.problems or ["none found"]],
+        f"  {trial.advice}",
     ]
