@@ -27,7 +27,7 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio import sync
-from rlightning_aio.evaluation import EpisodeSpec, QueueEvaluation, evaluate
+from rlightning_aio.evaluation import EpisodeSpec, Evaluation, evaluate
 
 Outcome = tuple[float, int, bool]
 
@@ -70,7 +70,7 @@ def busy(num_workers: int, envs_each: int, episodes: int, min_results: int) -> N
         begun = time.perf_counter()
         found = evaluate(group, policy, specs, min_results=min_results)
         seconds = time.perf_counter() - begun
-    steps = sum(record.length or 0 for record in found.records)
+    steps = sum(one.length for one in found.attempts)
     share = working["ns"] / 1e9 / seconds / num_workers
     print(
         f"{episodes} episodes, {steps} steps, {num_workers} workers of {envs_each} envs: "
@@ -170,11 +170,11 @@ def queued(
         "num_workers": num_workers * envs_each, "envs_per_process": envs_each,
     }  # fmt: skip
     with sync.build_env_group(entry) as group, group.auto_reset():
-        found: QueueEvaluation = evaluate(group, policy, specs, min_results=min_results)
-    assert not found.failed, found.failed[0].cause
+        found: Evaluation = evaluate(group, policy, specs, min_results=min_results)
+    assert not found.failed, found.failed[0].outcome
     return [
-        (one.task, one.seed, (one.total_reward or 0.0, one.length or 0, bool(one.success)))
-        for one in found.records
+        (one.spec.task, one.spec.seed, (one.reward or 0.0, one.length, bool(one.success)))
+        for one in found.played
     ]
 
 

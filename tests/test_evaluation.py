@@ -13,11 +13,14 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation import Episode, EpisodeSpec, Evaluation, evaluate, outcomes
+from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, endless, evaluate
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from rlightning_aio.attempts import Attempt
 
 SHORT, LONG = 2, 8
 
@@ -74,7 +77,7 @@ def scripted(succeeds: Callable[[int], bool], **kwargs: Any) -> Callable[[], Scr
     return lambda: Scripted(succeeds, **kwargs)
 
 
-def evaluated(group: sync.EnvGroup, episodes: int, **kwargs: Any) -> Evaluation:
+def evaluated(group: sync.EnvGroup, episodes: Any, **kwargs: Any) -> Evaluation:
     with group, group.auto_reset(1000):
         return evaluate(group, kwargs.pop("policy", nothing), episodes, **kwargs)
 
@@ -118,20 +121,48 @@ def test_the_first_episodes_are_unbiased_where_first_come_is_not() -> None:
     assert (found.success.mean, found.success.count) == (0.3, 40)
 
 
-def by_number(episodes: Sequence[Episode]) -> list[Episode]:
-    return sorted(episodes, key=lambda one: (one.env_id, one.sub_env, one.number))
+def by_number(found: Evaluation) -> list[tuple[Any, ...]]:
+    """What came of each episode, by env, sub-environment and number."""
+    return sorted(
+        (one.env_id, one.sub_env, one.index, one.reward, one.length, one.success)
+        for one in found.attempts
+    )
 
 
 def test_episodes_are_listed() -> None:
     """Each with its env, number, return and length, and values of its last info."""
-    listed: list[Episode] = []
+    listed: list[Attempt] = []
     group = group_of(scripted(lambda seed: seed % 2 == 0, key="is_success"))
     found = evaluated(group, 2, seed=4, on_episode=listed.append)
-    assert found.episodes == listed
-    assert listed == [
-        Episode("env-0", 0, 0, float(SHORT), SHORT, True),
-        Episode("env-0", 0, 1, float(LONG), LONG, False),
+    assert found.attempts == found.played == listed
+    assert by_number(found) == [
+        ("env-0", 0, 0, float(SHORT), SHORT, True),
+        ("env-0", 0, 1, float(LONG), LONG, False),
     ]
+    assert [one.spec.seed for one in listed] == [4, 5]
+    assert {one.outcome.kind for one in listed} == {"terminated"}
+
+
+def test_published_figures_stay() -> None:
+    """Returns of a policy for CartPole that were published before there was one queue."""
+
+    def lean(batch: rl.BatchedData) -> Any:
+        return (batch.observation[..., 2] > 0).astype(int)
+
+    with sync.build_env_group("CartPole-v1", num_workers=3) as group:
+        found = evaluate(group, lean, 4, seed=0)
+        queued = evaluate(group, lean, [EpisodeSpec("", seed) for seed in range(6)])
+    returns = [one[3] for one in by_number(found)]
+    assert returns == [41, 36, 32, 48, 51, 25, 34, 51, 35, 39, 45, 43]
+    by_seed = sorted((one.spec.seed, one.reward) for one in queued.attempts)
+    assert by_seed == [*enumerate([41, 51, 35, 36, 25, 39])]
+    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
+        pair = lambda mode=mode: SyncVectorEnv(  # noqa: E731
+            [lambda: gym.make("CartPole-v1")] * 2, autoreset_mode=mode
+        )
+        with group_of(pair, pair) as group:
+            found = evaluate(group, lean, 2, seed=7)
+        assert [one[3] for one in by_number(found)] == [34, 55, 45, 47, 48, 40, 51, 53]
 
 
 @pytest.mark.parametrize("mode", [None, AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
@@ -151,34 +182,42 @@ def test_episode_n_has_its_own_seed(mode: AutoresetMode | None) -> None:
     width = 1 if mode is None else 2
     rounds = 3 if mode is None else 1
     assert seen == set(range(10, 10 + rounds * 2 * width))
-    counts = {(one.env_id, one.sub_env): 0 for one in found.episodes}
+    counts = {(one.env_id, one.sub_env): 0 for one in found.attempts}
     assert len(counts) == 2 * width
-    for one in found.episodes:
+    for one in found.attempts:
         key = one.env_id, one.sub_env
-        assert one.number == counts[key]
+        assert one.index == counts[key]
         counts[key] += 1
         success = one.success
-        assert one.length == one.total_reward == (SHORT if success else LONG)
+        assert one.length == one.reward == (SHORT if success else LONG)
+        assert (one.spec.seed is None) == (mode is not None and one.index > 0)
     assert set(counts.values()) == {3}
 
 
-def test_a_resumed_evaluation_equals_an_uninterrupted_one() -> None:
-    """Finished episodes aren't played again."""
+def test_a_resumed_evaluation_equals_an_uninterrupted_one(tmp_path: Path) -> None:
+    """Finished episodes aren't played again, and are passed on first."""
     envs = [scripted(lambda seed: seed % 3 == 0)] * 3
     whole = evaluated(group_of(*envs), 4, seed=5)
-    kept: list[Episode] = []
+    kept: list[Attempt] = []
 
-    def interrupts(episode: Episode) -> None:
-        kept.append(episode)
+    def interrupts(attempt: Attempt) -> None:
+        kept.append(attempt)
         if len(kept) == 5:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        evaluated(group_of(*envs), 4, seed=5, on_episode=interrupts)
-    added: list[Episode] = []
-    rest = evaluated(group_of(*envs), 4, seed=5, played=kept, on_episode=added.append)
-    assert len(added) == 12 - 5
-    assert by_number(rest.episodes) == by_number(whole.episodes)
+    path = tmp_path / "results.jsonl"
+    with ResultsFile(path) as results, pytest.raises(KeyboardInterrupt):
+        evaluated(group_of(*envs), 4, seed=5, results=results, on_episode=interrupts)
+    seen: list[Attempt] = []
+    with ResultsFile(path) as results:
+        rest = evaluated(group_of(*envs), 4, seed=5, results=results, on_episode=seen.append)
+        assert len(results.played) == 12
+    assert by_number(rest) == by_number(whole)
+    assert seen == rest.attempts
+    assert sorted(seen[:5], key=str) == sorted(kept, key=str)
+    with ResultsFile(path) as results:
+        fewer = evaluated(group_of(*envs), 1, seed=5, results=results)
+    assert [one[2] for one in by_number(fewer)] == [0, 0, 0]
 
 
 def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
@@ -193,12 +232,15 @@ def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
     env = scripted(lambda seed: seed % 2 == 0)
     group = group_of(env, placement="process")
     found = evaluated(group, 3, seed=0, policy=dies_once)
-    assert found.lost == 1
-    assert [one.length for one in found.episodes] == [SHORT, LONG, SHORT]
+    assert found.failures == {"env_died": 1}
+    assert [one.length for one in found.attempts] == [SHORT, LONG, SHORT]
+    assert [len(one.failures) for one in found.attempts] == [0, 1, 0]
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_the_first_of_two_episodes_to_end_is_not_repeated(mode: AutoresetMode) -> None:
+def test_the_first_of_two_episodes_to_end_is_not_repeated(
+    mode: AutoresetMode, tmp_path: Path
+) -> None:
     """A worker that is lost in between begins again with the one that is missing."""
     calls = 0
 
@@ -209,26 +251,38 @@ def test_the_first_of_two_episodes_to_end_is_not_repeated(mode: AutoresetMode) -
 
     make = scripted(lambda seed: seed in (0, 3))
     both = lambda: Patient([make] * 2, autoreset_mode=mode)  # noqa: E731
-    whole = evaluated(group_of(both), 2, seed=0)
-    assert [one.length for one in by_number(whole.episodes) if one.number == 0] == [SHORT, LONG]
-    found = evaluated(group_of(both, placement="process"), 2, seed=0, policy=dies_once)
-    assert found.lost
-    assert by_number(found.episodes) == by_number(whole.episodes)
-    rest = evaluated(group_of(both), 2, seed=0, played=whole.episodes[:1])
-    assert by_number(rest.episodes) == by_number(whole.episodes)
+    with ResultsFile(tmp_path / "one.jsonl") as results:
+        whole = evaluated(group_of(both), 2, seed=0)
+        assert [one[4] for one in by_number(whole) if one[2] == 0] == [SHORT, LONG]
+        results.add(whole.attempts[0])
+        found = evaluated(group_of(both, placement="process"), 2, seed=0, policy=dies_once)
+        assert found.failures
+        assert by_number(found) == by_number(whole)
+        rest = evaluated(group_of(both), 2, seed=0, results=results)
+    assert by_number(rest) == by_number(whole)
 
 
 @pytest.mark.parametrize("together", [1, 2])
-def test_an_env_that_always_ends_its_worker_is_an_error(together: int) -> None:
-    """It would never finish its episodes. Another env of its worker is not blamed."""
+def test_episodes_of_an_env_that_always_ends_its_worker_fail(
+    together: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those of another env of its worker are played, and the log says it once."""
     env = scripted(lambda _: True)
-    group = group_of(env, env, placement="process", envs_per_process=together, max_restarts=10)
+    group = group_of(env, env, placement="process", envs_per_process=together, max_restarts=20)
 
     def ends_the_second(batch: rl.BatchedData) -> Any:
         return np.array([env_id == "env-1" for env_id in batch.env_ids()], np.int64)
 
-    with pytest.raises(rl.RLightningError, match=r"'env-1' has lost .* 3 times in a row"):
-        evaluated(group, 3, policy=ends_the_second)
+    found = evaluated(group, 2, policy=ends_the_second, retries=1)
+    assert [(one.env_id, one.index) for one in found.failed] == [("env-1", 0), ("env-1", 1)]
+    assert [one[:3] for one in by_number(Evaluation(found.played))] == [
+        ("env-0", 0, 0),
+        ("env-0", 0, 1),
+    ]
+    assert found.failures == {"env_died": 4}
+    said = [one.getMessage() for one in caplog.records if "has failed" in one.getMessage()]
+    assert len(said) == 1
+    assert "exited with code 3" in said[0]
 
 
 def test_entries_may_differ() -> None:
@@ -245,7 +299,7 @@ def test_entries_may_differ() -> None:
         return [part.respond(action=nothing(part)) for part in batch.by_entry().values()]
 
     found = evaluated(sync.build_env_group([pair, single]), 2, policy=by_entry)
-    assert [len(found.of_envs([id_]).episodes) for id_ in ("pair-0", "single-0")] == [4, 2]
+    assert [len(found.of_envs([id_]).attempts) for id_ in ("pair-0", "single-0")] == [4, 2]
 
 
 async def test_it_is_awaited_over_an_asynchronous_group() -> None:
@@ -258,7 +312,23 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
     async with rl.build_env_group(entry) as group:
         with group.auto_reset(1000):
             found = await evaluate(group, policy, np.int64(2))
-    assert len(found.episodes) == 2
+    assert len(found.attempts) == 2
+
+
+def test_an_episode_may_be_for_one_env() -> None:
+    """Others leave it to that one."""
+    queue = [EpisodeSpec("", seed, env_id="env-1") for seed in range(3)]
+    with group_of(*HALF_SUCCEED) as group:
+        found = evaluate(group, nothing, [*queue, EpisodeSpec("", 9)])
+    assert sorted(one.spec.seed or 0 for one in found.of_envs(["env-1"]).attempts)[:3] == [0, 1, 2]
+
+
+def test_it_is_printed_as_a_table() -> None:
+    """With a line for each task, and one for all."""
+    found = evaluated(group_of(*HALF_SUCCEED), [EpisodeSpec("", seed) for seed in range(8)])
+    head, line = str(found).splitlines()
+    assert head.split() == ["task", "episodes", "success", "return", "length", "failed"]
+    assert line.split()[1] == "8"
 
 
 # -- errors -----------------------------------------------------------------------------
@@ -269,11 +339,9 @@ def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
     with (group := group_of(*HALF_SUCCEED[:2])), group.auto_reset(9):
         batch, _ = group.reset()
         group.step_async(batch.take([1]).respond(action=nothing(batch)[1:]))
-        # An evaluation that plays only env 0 would take the result of env 1 for its own.
-        played = [Episode("env-1", 0, 0, 1.0, 1, None)]
-        for episodes, options in ((1, {"played": played}), ([EpisodeSpec("", 0)], {})):
+        for episodes in (1, [EpisodeSpec("", 0)]):
             with pytest.raises(EnvBusy, match="second group of the same entries"):
-                evaluate(group, nothing, episodes, **options)
+                evaluate(group, nothing, episodes)
         group.collect_async()
 
 
@@ -282,20 +350,19 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
     for limit, lengths in ((None, {SHORT, LONG}), (5, {SHORT, 5})):
         for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
             with group_of(*HALF_SUCCEED, max_episode_steps=limit) as group:
-                found: Any = evaluate(group, nothing, episodes)
-                played = found.records if isinstance(episodes, list) else found.episodes
-                assert len(played) == 8
-                assert {episode.length for episode in played} == lengths
+                found = evaluate(group, nothing, episodes)
+                assert len(found.played) == 8
+                assert {episode.length for episode in found.played} == lengths
                 with group.auto_reset(limit or 3):  # None is open.
                     found = evaluate(group, nothing, 1)
-                assert {episode.length for episode in found.episodes} == {SHORT, limit or 3}
+                assert {episode.length for episode in found.played} == {SHORT, limit or 3}
 
 
 def test_an_episode_that_may_never_end_is_named(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Once, in both forms: evaluate would wait for it for ever."""
-    monkeypatch.setattr(outcomes, "_LONG", 5)
+    monkeypatch.setattr(endless, "_LONG", 5)
     for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
         caplog.clear()
         with group_of(*HALF_SUCCEED) as group:
@@ -310,11 +377,10 @@ def test_it_needs_its_own_envs() -> None:
     with group_of(scripted(lambda _: True)) as group, group.auto_reset(9):
         with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
             evaluate(group, nothing, 0)
-        with pytest.raises(ValueError, match="max_attempts is for a queue of episodes"):
-            evaluate(group, nothing, 1, max_attempts=2)  # type: ignore[call-overload]
-        other = Episode("other-0", 0, 0, 1.0, 1, None)
-        with pytest.raises(ValueError, match=r"'other-0'.* was not played by an env of this group"):
-            evaluate(group, nothing, 1, played=[other])
+        with pytest.raises(ValueError, match="retries must be at least 0, not -1"):
+            evaluate(group, nothing, 1, retries=-1)
+        with pytest.raises(ValueError, match="there is no env 'other-0' to play"):
+            evaluate(group, nothing, [EpisodeSpec("", 0, env_id="other-0")])
 
 
 # -- statistics -------------------------------------------------------------------------
@@ -354,6 +420,7 @@ def test_what_nothing_is_known_of() -> None:
     """No episode has no figures; one has a mean alone."""
     empty = Evaluation()
     assert empty.total_reward is empty.length is empty.success is None
+    assert str(empty).splitlines()[1].split() == ["all", "0", "-", "-", "-", "0"]
     one = mean_estimate([3.0])
     assert one is not None
     assert (one.mean, one.low, one.high) == (3.0, None, None)

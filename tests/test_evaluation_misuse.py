@@ -13,6 +13,7 @@ import pytest
 from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
+from rlightning_aio import Outcome
 from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo, ResultsFile
 
 
@@ -42,7 +43,11 @@ def test_numbers_of_numpy_are_saved_and_found_again(tmp_path: Path) -> None:
     for _ in range(2):
         with ResultsFile(tmp_path / "results.jsonl") as results:
             found = evaluated(group_of(), queue, results=results)
-        assert sorted((one.seed, one.length) for one in found.records) == [(0, 3), (1, 4), (2, 5)]
+        assert sorted((one.spec.seed, one.length) for one in found.attempts) == [
+            (0, 3),
+            (1, 4),
+            (2, 5),
+        ]
     lines = (tmp_path / "results.jsonl").read_text().splitlines()
     assert [json.loads(line)["options"] for line in lines[1:]] == [{"longer": 2}] * 3
 
@@ -66,11 +71,10 @@ def test_what_is_no_episode_is_refused() -> None:
         evaluated(group_of(), [("1", 0)])
 
 
-@pytest.mark.parametrize("options", [{"seed": 3}, {"played": []}])
-def test_options_of_a_number_of_episodes_are_refused(options: dict[str, Any]) -> None:
-    """A queue would ignore them."""
-    with pytest.raises(ValueError, match=rf"{next(iter(options))} is for a number of episodes"):
-        evaluated(group_of(), **options)
+def test_a_seed_for_a_queue_is_refused() -> None:
+    """It would be ignored."""
+    with pytest.raises(ValueError, match="seed is for a number of episodes"):
+        evaluated(group_of(), seed=3)
 
 
 @pytest.mark.parametrize("as_list", [True, False])
@@ -85,17 +89,18 @@ def test_a_policy_must_answer_all_results(as_list: bool) -> None:
         evaluated(group_of(), policy=policy, min_results=3)
 
 
-def test_an_episode_that_was_lost_often_enough_before_is_not_played(tmp_path: Path) -> None:
-    """An evaluation may be killed between the last loss of an episode and its record."""
-    path = tmp_path / "results.jsonl"
-    with ResultsFile(path) as results:
-        for _ in range(2):
-            results.add_lost(EpisodeSpec("1", 0, entry="env"), "it died")
+def test_failures_in_the_file_count(tmp_path: Path) -> None:
+    """An evaluation that was killed goes on with the tries that are left."""
+    died = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
+    with ResultsFile(tmp_path / "results.jsonl") as results:
+        results.add_failure(EpisodeSpec("1", 0, entry="env"), 0, 0, died)
     for _ in range(2):
-        with ResultsFile(path) as results:
-            found = evaluated(group_of(), [EpisodeSpec("1", 0)], results=results, max_attempts=2)
-        (record,) = found.records
-        assert (record.cause, record.lost, record.length) == ("it died", ("it died",) * 2, None)
+        with ResultsFile(tmp_path / "results.jsonl") as results:
+            group = group_of(1, env_kwargs={"breaks": {"1": "raise"}})
+            found = evaluated(group, [EpisodeSpec("1", 0)], results=results, retries=1)
+        (attempt,) = found.failed
+        assert (attempt.outcome.kind, attempt.outcome.attempt) == ("env_raised", 1)
+        assert (attempt.failures, attempt.reward) == ((died,), None)
 
 
 class Dies(Tasks):
@@ -124,7 +129,7 @@ def test_a_process_that_ends_while_a_film_begins_is_replaced(tmp_path: Path) -> 
     video = EpisodeVideo(tmp_path / "films")
     found = evaluated(group_of(2, placement="process", **fields), queue, video=video)
     assert rows(found) == [("1", seed, seed + 1.0, seed + 1) for seed in (0, 1, 2, 3, 9)]
-    assert found.failed == []
+    assert not found.failed
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import time
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -16,19 +17,20 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.attempts.queue import Job, TaskInPlay
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.evaluation import (
-    EpisodeRecord,
     EpisodeSpec,
     EpisodeVideo,
-    QueueEvaluation,
+    Evaluation,
     ResultsFile,
     evaluate,
 )
-from rlightning_aio.evaluation.queue import Attempts
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from rlightning_aio.attempts import Attempt
 
 
 class Tasks(gym.Env[Any, Any]):
@@ -82,13 +84,13 @@ def nothing(batch: rl.BatchedData) -> Any:
 QUEUE = [EpisodeSpec(task, seed) for task in ("1", "2", "3") for seed in range(4)]
 
 
-def evaluated(group: sync.EnvGroup, episodes: Any = QUEUE, **kwargs: Any) -> QueueEvaluation:
+def evaluated(group: sync.EnvGroup, episodes: Any = QUEUE, **kwargs: Any) -> Evaluation:
     with group, group.auto_reset(100):
         return evaluate(group, kwargs.pop("policy", nothing), episodes, **kwargs)
 
 
-def rows(found: QueueEvaluation) -> list[tuple[Any, ...]]:
-    return sorted((one.task, one.seed, one.total_reward, one.length) for one in found.records)
+def rows(found: Evaluation) -> list[tuple[Any, ...]]:
+    return sorted((one.spec.task, one.spec.seed, one.reward, one.length) for one in found.attempts)
 
 
 ROWS = [(one.task, one.seed, (one.seed + 1.0) * int(one.task), one.seed + 1) for one in QUEUE]
@@ -102,13 +104,14 @@ def test_each_episode_runs_once_on_any_free_env() -> None:
         sizes.append(len(batch))
         return nothing(batch)
 
-    seen: list[EpisodeRecord] = []
+    seen: list[Attempt] = []
     found = evaluated(group_of(), policy=noting, on_episode=seen.append, min_results=3)
     assert rows(found) == ROWS
-    assert seen == found.records
+    assert seen == found.attempts
     assert max(sizes) == 3
     assert {one.env_id for one in seen} == {"env-0", "env-1", "env-2"}
-    assert all(one.success == (one.seed % 2 == 0) and one.entry == "env" for one in seen)
+    assert all(one.success == (one.spec.seed in (0, 2)) for one in seen)
+    assert {one.spec.entry for one in seen} == {"env"}
     assert list(found.by_task()) == ["1", "2", "3"]
     success = found.by_task()["2"].success
     assert success is not None
@@ -119,7 +122,7 @@ def test_options_reach_the_reset() -> None:
     """They make episodes of one seed different ones."""
     options = [None, {"longer": 1}, {"longer": 2}]
     found = evaluated(group_of(), [EpisodeSpec("1", 0, chosen) for chosen in options])
-    assert sorted(one.length or 0 for one in found.records) == [1, 2, 3]
+    assert sorted(one.length for one in found.attempts) == [1, 2, 3]
 
 
 async def test_it_is_awaited_over_an_asynchronous_group() -> None:
@@ -145,7 +148,7 @@ def test_an_entry_is_found_by_its_task() -> None:
     queue = [EpisodeSpec("CartPole-v1", 0), EpisodeSpec("", 1, entry="entry-MountainCar-v0")]
     with sync.build_env_group([one, two]) as group, group.auto_reset(5):
         found = evaluate(group, lambda batch: [0] * len(batch), queue)
-        assert {(one.entry, one.task) for one in found.records} == {
+        assert {(one.spec.entry, one.spec.task) for one in found.attempts} == {
             ("entry-CartPole-v1", "CartPole-v1"),
             ("entry-MountainCar-v0", "MountainCar-v0"),
         }
@@ -161,13 +164,13 @@ def test_an_env_continues_with_its_task() -> None:
     """Whatever the order of the queue; then with the task of the most episodes for each env."""
     queue = [EpisodeSpec(task, seed) for seed in range(4) for task in ("1", "2")]
     found = evaluated(group_of(1), queue)
-    assert [one.task for one in found.records] == ["1"] * 4 + ["2"] * 4
-    assert [one.seed for one in found.records] == [*range(4), *range(4)]
+    assert [one.spec.task for one in found.attempts] == ["1"] * 4 + ["2"] * 4
+    assert [one.spec.seed for one in found.attempts] == [*range(4), *range(4)]
 
     waiting = WaitingEpisodes()
     for task, number in (("a", 2), ("b", 3), ("c", 3)):
         for seed in range(number):
-            waiting.add(Attempts(EpisodeSpec(task, seed)))
+            waiting.add(Job(TaskInPlay(EpisodeSpec(task, seed)), 0))
     asked = (("a", "b"), ("x", "b"), ("x", "bc"))
     taken = [waiting.take(own, others).spec for own, others in asked]
     assert [(spec.task, spec.seed) for spec in taken] == [("a", 0), ("c", 0), ("b", 0)]
@@ -185,27 +188,27 @@ def test_sub_environments_are_refused() -> None:
 
 def test_an_episode_whose_env_raises_fails_after_some_attempts() -> None:
     """The other episodes are played, and figures are those of played ones."""
-    found = evaluated(group_of(env_kwargs={"breaks": {"2": "raise"}}), max_attempts=2)
-    assert rows(found)[:4] + rows(found)[8:] == ROWS[:4] + ROWS[8:]
-    assert [one.task for one in found.failed] == ["2"] * 4
+    found = evaluated(group_of(env_kwargs={"breaks": {"2": "raise"}}), retries=1)
+    assert rows(Evaluation(found.played)) == ROWS[:4] + ROWS[8:]
+    assert [one.spec.task for one in found.failed] == ["2"] * 4
     for one in found.failed:
-        assert (one.total_reward, one.length, one.success) == (None, None, None)
-        assert len(one.lost) == 2
-        assert one.cause is not None
-        assert "raised in step: ValueError: as asked for" in one.cause
+        assert (one.reward, one.length, one.success) == (None, 0, None)
+        assert [outcome.kind for outcome in one.failures] == ["env_raised"]
+        assert (one.outcome.kind, one.outcome.attempt) == ("env_raised", 1)
+        assert one.outcome.cause == "ValueError: as asked for"
     assert found.success is not None
-    assert (found.success.count, found.lost) == (8, 8)
+    assert (found.success.count, found.failures) == (8, {"env_raised": 8})
 
 
 def test_an_episode_whose_worker_always_ends_fails() -> None:
     """Its worker is replaced each time, and other episodes continue."""
     group = group_of(2, env_kwargs={"breaks": {"2": "exit"}}, placement="process")
     queue = [EpisodeSpec("1", 0), EpisodeSpec("2", 0), EpisodeSpec("3", 5)]
-    found = evaluated(group, queue, max_attempts=2)
+    found = evaluated(group, queue, retries=1)
     (failed,) = found.failed
-    assert (failed.task, len(failed.lost)) == ("2", 2)
-    assert "exited with code 3" in str(failed.cause)
-    assert [(one.task, one.length) for one in found.records if one.cause is None] == [
+    assert (failed.spec.task, len(failed.failures)) == ("2", 1)
+    assert "exited with code 3" in failed.outcome.cause
+    assert [(one.spec.task, one.length) for one in found.played] == [
         ("1", 1),
         ("3", 6),
     ]
@@ -219,10 +222,10 @@ def test_only_the_env_at_fault_is_charged_an_attempt(breaks: str) -> None:
         "step_timeout": 1.0,
     }  # fmt: skip
     queue = [EpisodeSpec("2", 3), *(EpisodeSpec(task, seed) for seed in (8, 9) for task in "13")]
-    found = evaluated(group_of(3, **fields), queue, max_attempts=1)
-    assert [one.task for one in found.failed] == ["2"]
-    assert found.lost == 1
-    played = sorted((one.task, one.seed) for one in found.records if one.cause is None)
+    found = evaluated(group_of(3, **fields), queue, retries=0)
+    assert [one.spec.task for one in found.failed] == ["2"]
+    assert found.failures.total() == 1
+    played = sorted((one.spec.task, one.spec.seed) for one in found.played)
     assert played == [("1", 8), ("1", 9), ("3", 8), ("3", 9)]
 
 
@@ -279,12 +282,12 @@ def test_each_suspect_is_charged_an_attempt_where_no_env_is_at_fault(
     charged = ["1", "2", "3"] if nobodys else ["2"]
     if on_worker_death == "raise" and not nobodys:  # No env is left for the others.
         with pytest.raises(rl.WorkerDied, match="exited with code 3"):
-            evaluated(group, queue, max_attempts=1)
+            evaluated(group, queue, retries=0)
         return
-    found = evaluated(group, queue, max_attempts=1)
-    assert sorted(one.task for one in found.failed) == charged
-    assert found.lost == len(charged)
-    played = sorted(one.task for one in found.records if one.cause is None)
+    found = evaluated(group, queue, retries=0)
+    assert sorted(one.spec.task for one in found.failed) == charged
+    assert found.failures.total() == len(charged)
+    played = sorted(one.spec.task for one in found.played)
     assert played == [task for task in "123" if task not in charged]
 
 
@@ -296,9 +299,9 @@ def test_an_env_whose_worker_is_not_replaced_leaves(together: int) -> None:
         "on_worker_death": "raise", "envs_per_process": together,
     }  # fmt: skip
     queue = [EpisodeSpec("1", 3), EpisodeSpec("2", 0), EpisodeSpec("3", 9)]
-    found = evaluated(group_of(4, **fields), queue, max_attempts=1)
-    assert {one.task for one in found.records} == {"1", "2", "3"}
-    assert "2" in {one.task for one in found.failed}
+    found = evaluated(group_of(4, **fields), queue, retries=0)
+    assert {one.spec.task for one in found.attempts} == {"1", "2", "3"}
+    assert "2" in {one.spec.task for one in found.failed}
     with pytest.raises(rl.WorkerDied, match="exited with code 3"):
         evaluated(group_of(2, **fields), queue)
 
@@ -310,33 +313,37 @@ def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None
     """Episodes in the file aren't played again, and lost attempts of others still count."""
     path, subject = tmp_path / "results.jsonl", {"policy": "nothing"}
     breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
-    seen: list[EpisodeRecord] = []
+    seen: list[Attempt] = []
 
-    def interrupts(record: EpisodeRecord) -> None:
+    def interrupts(record: Attempt) -> None:
         seen.append(record)
         if len(seen) == 6:
             raise KeyboardInterrupt
 
     with ResultsFile(path, subject) as results:
         with pytest.raises(KeyboardInterrupt):
-            evaluated(group_of(**breaks), results=results, on_episode=interrupts, max_attempts=2)
-        with pytest.raises(rl.ConfigError, match="another eval is writing this file"):
+            evaluated(group_of(**breaks), results=results, on_episode=interrupts, retries=1)
+        with pytest.raises(rl.ConfigError, match="another program is writing this file"):
             ResultsFile(path, subject)
     path.write_text(path.read_text() + '{"entry": "env", "ta')
     before = [json.loads(line) for line in path.read_text().splitlines()[1:-1]]
     with ResultsFile(path, subject) as results:
         assert results.played == seen
-        found = evaluated(group_of(), results=results, max_attempts=2)
-    assert found.records[:6] == seen
-    assert len(found.records) == len({one.key for one in found.records}) == 12
-    lost = sum("attempt_lost" in row for row in before)
-    assert found.lost == lost == 4
+        found = evaluated(group_of(), results=results, retries=1)
+    assert sorted(found.attempts[:6], key=str) == sorted(seen, key=str)
+    assert len(found.attempts) == len({one.spec.key for one in found.attempts}) == 12
+    failed = sum("failed_try" in row for row in before)
+    assert found.failures == {"env_raised": failed}
+    assert failed == 4
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert lines[0] == subject
-    kept = {(row["task"], row["seed"]): row for row in lines if "return" in row}
+    kept = {(row["task"], row["seed"]): row for row in lines if "outcome" in row}
+    outcome = kept["3", 2].pop("outcome")
+    assert (outcome["kind"], outcome["blame"]) == ("terminated", "policy")
     assert kept["3", 2] == {
-        "entry": "env", "task": "3", "seed": 2, "options": None, "env_id": kept["3", 2]["env_id"],
-        "return": 9.0, "length": 3, "success": True, "cause": None, "lost": [],
+        "entry": "env", "task": "3", "seed": 2, "options": None, "env_id": "", "index": 0,
+        "sub_env": 0, "reward": 9.0, "length": 3, "success": True, "failures": [], "rewards": [],
+        "columns": {}, "result": None,
     }  # fmt: skip
     with pytest.raises(rl.ConfigError, match="its policy is nothing, not other"):
         ResultsFile(path, {"policy": "other"})
@@ -348,18 +355,19 @@ def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
     class Enough(Exception):
         """Ends an evaluation."""
 
-    def stops(record: EpisodeRecord) -> None:
-        if results.lost:
+    def stops(attempt: Attempt) -> None:
+        if attempt.spec.task == "1" and attempt.spec.seed == 3:
             raise Enough
 
     breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
     with ResultsFile(tmp_path / "results.jsonl") as results:
         with pytest.raises(Enough):
-            evaluated(group_of(**breaks), results=results, on_episode=stops, max_attempts=9)
+            evaluated(group_of(**breaks), results=results, on_episode=stops, retries=9)
         assert results.played
-        found = evaluated(group_of(), results=results, max_attempts=9)
-        assert len(found.records) == len({one.key for one in found.records}) == 12
-        assert found.lost == sum(map(len, results.lost.values()))
+        failed = sum(len(results.failures(replace(one, entry="env"), 0)) for one in QUEUE)
+        found = evaluated(group_of(), results=results, retries=9)
+        assert len(found.attempts) == len({one.spec.key for one in found.attempts}) == 12
+        assert found.failures.total() == failed > 0
     with ResultsFile(tmp_path / "results.jsonl") as results:
         assert len(results.played) == 12
 
@@ -375,7 +383,7 @@ def test_a_file_whose_first_line_was_cut_is_begun_again(tmp_path: Path) -> None:
         assert path.read_bytes() == line
     for foreign in (b"shopping list", line[:-1] + b"}", b" "):
         path.write_bytes(foreign)
-        with pytest.raises(rl.ConfigError, match="is not a file written by eval"):
+        with pytest.raises(rl.ConfigError, match="is not a file of results"):
             ResultsFile(path, subject)
         assert path.read_bytes() == foreign
 
@@ -418,7 +426,7 @@ def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) 
     """The limit is the trainer's, so the film is still open when the episode ends."""
     with group_of() as group, group.auto_reset(limit):
         found = evaluate(group, nothing, QUEUE[:4], video=EpisodeVideo(tmp_path))
-    lengths = sorted(record.length or 0 for record in found.records)
+    lengths = sorted(record.length or 0 for record in found.attempts)
     assert lengths == [min(k, limit) for k in (1, 2, 3, 4)]
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == [f"env-1-seed-{seed}.mp4" for seed in range(4)]

@@ -14,7 +14,7 @@ from typing import Any
 from attempts.rooms import Room
 
 import rlightning_aio as rl
-from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, play
+from rlightning_aio.attempts import EpisodeSpec, ResultsFile, play
 
 KILLS = int(os.environ.get("RLIGHTNING_AIO_KILLS", "3"))
 TASKS, SIZE = 4 * KILLS, 3
@@ -30,7 +30,7 @@ async def agent(episode: Any) -> int:
 async def run(path: str) -> None:
     tasks = [EpisodeSpec("", seed) for seed in range(TASKS)]
     async with rl.build_env_group(Room, name="room", num_workers=2) as group:
-        with AttemptsFile(path, {"agent": "adds its index"}) as results:
+        with ResultsFile(path, {"agent": "adds its index"}) as results:
             async for _ in play(group, tasks, agent, SIZE, results=results):
                 pass
 

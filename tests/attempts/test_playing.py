@@ -18,7 +18,7 @@ from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
-from rlightning_aio.attempts import AttemptsFile, EpisodeSpec, Rules, play
+from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -374,9 +374,9 @@ async def test_numbers_that_are_not_finite_are_in_the_file(tmp_path: Path) -> No
         await episode.step("blame" if episode.index else 1)
 
     async with rooms(PLACES["loop"], num_workers=2) as group:
-        with AttemptsFile(path) as results:
+        with ResultsFile(path) as results:
             await played(group, tasks(1), agent, 2, results=results)
-    with AttemptsFile(path) as results:
+    with ResultsFile(path) as results:
         whole, failed = sorted(results.played, key=lambda attempt: attempt.index)
     assert whole.reward is not None
     assert math.isnan(whole.reward)
@@ -394,14 +394,14 @@ async def test_it_continues_from_a_file(tmp_path: Path) -> None:
         await earner(episode)
 
     async with rooms(PLACES["loop"], num_workers=2) as group:
-        with AttemptsFile(path, {"model": "m"}) as results:
+        with ResultsFile(path, {"model": "m"}) as results:
             groups = play(group, tasks(6), agent, size=2, results=results)
             async with contextlib.aclosing(groups):
                 async for _ in groups:
                     if len(results.played) >= 5:
                         break
         before = count
-        with AttemptsFile(path, {"model": "m"}) as results:
+        with ResultsFile(path, {"model": "m"}) as results:
             known = len(results.played)
             left = await played(group, tasks(6), agent, 2, results=results)
     assert before >= known >= 5

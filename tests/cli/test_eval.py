@@ -23,7 +23,13 @@ JUDGED = {"name": "judged", "task": "cli.judged_env:make", "placement": "inline"
 
 
 def by_number(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    return sorted(episodes, key=lambda one: (one["env_id"], one["number"]))
+    return sorted(episodes, key=lambda one: (one["env_id"], one["sub_env"], one["index"]))
+
+
+def results_of(attempts: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What came of each, by env and number, whenever it was played."""
+    names = ("env_id", "index", "seed", "reward", "length", "success")
+    return [{name: one[name] for name in names} for one in by_number(attempts)]
 
 
 def test_each_env_plays_the_same_number_of_episodes(tmp_path: Path) -> None:
@@ -33,20 +39,21 @@ def test_each_env_plays_the_same_number_of_episodes(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("random: 2 episodes of each env")
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("pole")]
-    assert line.split()[1:3] == ["3", "6"]
+    assert line.split()[1] == "6"
     document = invoke_json("eval", config, "--episodes", 2, "--seed", 0)
     assert not document["interrupted"]
-    (entry,) = document["entries"]
+    (entry,) = document["parts"]
+    assert (document["by"], entry["name"]) == ("entry", "pole")
     reward = entry["total_reward"]
     assert reward["low"] < reward["mean"] < reward["high"]
-    played = [(one["env_id"], one["number"]) for one in by_number(document["episodes"])]
+    played = [(one["env_id"], one["index"]) for one in by_number(document["attempts"])]
     assert played == [(f"pole-{k}", n) for k in range(3) for n in range(2)]
 
 
 def test_success_is_read_from_the_last_info(tmp_path: Path) -> None:
     """Without it there is no success rate."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
-    judged, stub = invoke_json("eval", config, "--episodes", 5, "--seed", 0)["entries"]
+    judged, stub = invoke_json("eval", config, "--episodes", 5, "--seed", 0)["parts"]
     assert judged["success"]["mean"] == 0.5
     assert judged["success"]["low"] == pytest.approx(0.2366, abs=5e-5)
     assert stub["success"] is None
@@ -59,7 +66,7 @@ def test_a_policy_is_given_by_module_and_name(tmp_path: Path) -> None:
     policy = "cli.stub_policies:respond"
     document = invoke_json("eval", config, "--episodes", 2, "--policy", policy)
     assert document["policy"] == policy
-    assert document["entries"][0]["length"]["mean"] == 4
+    assert document["parts"][0]["length"]["mean"] == 4
 
 
 def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
@@ -69,13 +76,13 @@ def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
     whole = invoke_json(*asked, "--episodes", 4)
     invoke_json(*asked, "--episodes", 2, "--resume", file)
     # The command ended in the middle of a line.
-    file.write_text(file.read_text() + '{"env_id": "pole-0", "sub')
+    file.write_text(file.read_text() + '{"task": "pole-0", "sub')
     lines = len(file.read_text().splitlines()) - 1
     both = invoke_json(*asked, "--episodes", 4, "--resume", file)
-    assert by_number(both["episodes"]) == by_number(whole["episodes"])
+    assert results_of(both["attempts"]) == results_of(whole["attempts"])
     assert (lines, len(file.read_text().splitlines())) == (1 + 6, 1 + 12)
     fewer = invoke_json(*asked, "--episodes", 1, "--resume", file)
-    assert len(fewer["episodes"]) == 3
+    assert len(fewer["attempts"]) == 3
 
 
 def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
@@ -94,7 +101,7 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     assert child.returncode == 130, stderr
     document = json.loads(stdout)
     assert document["interrupted"]
-    assert [one["env_id"] for one in document["episodes"]] == ["slow-0"]
+    assert [one["env_id"] for one in document["attempts"]] == ["slow-0"]
     assert len(file.read_text().splitlines()) == 2
     names = {path.name for path in films.iterdir()}
     assert names == {"slow-0-episode-0.mp4", "slow-0-episode-1.partial.mp4"}
@@ -110,28 +117,14 @@ def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:
         while "waits" not in (line := child.stderr.readline()):
             assert line, "it has ended"
         before = file.read_bytes()
-        assert "another eval is writing this file" in refused(*words, 2)
+        assert "another program is writing this file" in refused(*words, 2)
         assert file.read_bytes() == before
         child.kill()
         child.communicate(timeout=HANG)
     # The killed command has played all episodes.
-    file.write_text(file.read_text() + before.decode().splitlines()[1].replace("w-0", "w-1") + "\n")
-    assert len(invoke_json("eval", *words, 1)["episodes"]) == 2
-
-
-def test_a_file_that_holds_an_episode_twice_is_refused(tmp_path: Path) -> None:
-    """Two concurrent writers would have left such a file; it is not changed."""
-    config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
-    invoke_json("eval", config, "--episodes", 2, "--resume", file)
-    head, *episodes = file.read_text().splitlines(keepends=True)
-    later = [line for line in episodes if '"number": 1' in line]
-    for lines, words in (
-        ([*episodes, later[0]], "is a duplicate"),
-        (later, "is out of order"),
-    ):
-        file.write_text("".join((head, *lines)))
-        assert words in refused(config, "--resume", file)
-        assert file.read_text() == "".join((head, *lines))
+    row = {**json.loads(before.splitlines()[1]), "env_id": "slow-1", "seed": 1}
+    file.write_text(f"{file.read_text()}{json.dumps(row)}\n")
+    assert len(invoke_json("eval", *words, 1)["attempts"]) == 2
 
 
 def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
@@ -147,9 +140,9 @@ def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
     assert whole.endswith("}\n")
     kept = len(whole.splitlines()) - 1
     assert 3 < kept < 180
-    assert len(json.loads(done.stdout)["episodes"]) == kept + 1
+    assert len(json.loads(done.stdout)["attempts"]) == kept
     (small_disk / "rest").unlink()
-    assert len(invoke_json("eval", config, "--episodes", 60, "--resume", file)["episodes"]) == 180
+    assert len(invoke_json("eval", config, "--episodes", 60, "--resume", file)["attempts"]) == 180
 
 
 def test_eval_draws_films_and_traces(tmp_path: Path) -> None:
@@ -165,7 +158,7 @@ def test_eval_draws_films_and_traces(tmp_path: Path) -> None:
     names = sorted(path.name for path in films.iterdir())
     assert names == ["judged-1-episode-0.mp4", "judged-1-episode-2.mp4"]
     seen = Seen(trace)
-    played = Counter(one["env_id"] for one in json.loads(done.stdout)["episodes"])
+    played = Counter(one["env_id"] for one in json.loads(done.stdout)["attempts"])
     for env_id, count in played.items():
         lasted = [one.name for one in seen.of(env_id)]
         assert lasted[0] == "reset"
@@ -203,11 +196,12 @@ def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:
     config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
     invoke_json("eval", config, "--episodes", 1, "--seed", 3, "--resume", file)
     before = file.read_bytes()
-    assert "its seed is 3, not 4" in refused(config, "--seed", 4, "--resume", file)
+    policy = ("--policy", "cli.stub_policies:respond")
+    assert "its policy is random, not cli" in refused(config, *policy, "--resume", file)
     assert file.read_bytes() == before
     for text in ("notes", "notes\nmore notes\n", "[1]\n", "{}\n"):
         file.write_text(text)
-        assert "is not a file written by eval" in refused(config, "--resume", file)
+        assert "is not a file of results" in refused(config, "--resume", file)
         assert file.read_text() == text
 
 
@@ -233,7 +227,7 @@ def test_a_model_of_stable_baselines3(tmp_path: Path, algorithm: str, together: 
     poles = {"name": "poles", "task": "cli.judged_env:poles", "placement": "inline"}
     config = write_config(tmp_path, poles if together else POLE)
     asked = ("--policy", tmp_path / "model.zip", "--episodes", 1, "--seed", 0)
-    found = invoke_json("eval", config, *asked)["episodes"]
+    found = invoke_json("eval", config, *asked)["attempts"]
     found.sort(key=lambda one: (one["env_id"], one["sub_env"]))
     assert [one["length"] for one in found] == lengths
     pendulum = {**POLE, "name": "pendulum", "task": "Pendulum-v1"}
@@ -259,13 +253,13 @@ def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
     table = {line.split()[0]: line.split()[1:3] for line in done.stdout.splitlines()[3:]}
     assert table == {**{task: ["4", "50.0%"] for task in "abc"}, "all": ["12", "50.0%"]}
     document = invoke_json("eval", config, *asked)
-    assert [(one["task"], one["episodes"]) for one in document["tasks"]] == [
+    assert [(one["name"], one["episodes"]) for one in document["parts"]] == [
         (task, 4) for task in "abc"
     ]
-    assert sorted((one["task"], one["seed"]) for one in document["rows"]) == [
+    assert sorted((one["task"], one["seed"]) for one in document["attempts"]) == [
         (task, seed) for task in "abc" for seed in range(4)
     ]
-    assert (document["queue"], document["episodes"], document["failed"]) == (12, 12, 0)
+    assert (document["by"], document["episodes"], document["failed"]) == ("task", 12, 0)
 
 
 def test_a_file_names_the_episodes(tmp_path: Path) -> None:
@@ -274,9 +268,9 @@ def test_a_file_names_the_episodes(tmp_path: Path) -> None:
     file = tmp_path / "episodes.jsonl"
     file.write_text('{"entry": "judged", "seed": 2}\n\n{"entry": "stub", "seed": 1}\n')
     document = invoke_json("eval", config, "--episodes-file", file)
-    played = {(one["entry"], one["task"], one["seed"]) for one in document["rows"]}
+    played = {(one["entry"], one["task"], one["seed"]) for one in document["attempts"]}
     assert played == {("judged", JUDGED["task"], 2), ("stub", "any", 1)}
-    both = invoke_json("eval", config, "--seeds", "5,7")["rows"]
+    both = invoke_json("eval", config, "--seeds", "5,7")["attempts"]
     assert len(both) == 4
     for text, words in (
         ("[1]\n", "line 1: "),
@@ -291,10 +285,10 @@ def test_a_file_names_the_episodes(tmp_path: Path) -> None:
 def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
     """The others are in the table, and the exit code says that some have no result."""
     config = write_config(tmp_path, SWITCHING)
-    done = run("eval", config, "--tasks", "a,raises", "--seeds", "0:2", "--max-attempts", 2)
+    done = run("eval", config, "--tasks", "a,raises", "--seeds", "0:2", "--retries", 1)
     assert done.returncode == 1
-    assert "4 attempts lost with a worker or by an error of an env" in done.stdout
-    assert "failed: task 'raises', seed 1: env 'many-0'" in done.stdout
+    assert "by the kind of their outcome: 4 not_started" in done.stdout
+    assert "failed: task 'raises', seed 1, on env 'many-0': not_started: " in done.stdout
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("a ")]
     assert line.split()[1:3] == ["2", "50.0%"]
 

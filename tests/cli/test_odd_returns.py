@@ -53,15 +53,15 @@ def test_eval_prints_and_keeps_what_it_played(tmp_path: Path) -> None:
     assert plot.read_bytes().startswith(b"\x89PNG")
     document = json.loads(done.stdout, parse_constant=strict)
     check_notes(document["notes"])
-    means = {entry["name"]: entry["total_reward"]["mean"] for entry in document["entries"]}
+    means = {entry["name"]: entry["total_reward"]["mean"] for entry in document["parts"]}
     assert means == {"plain": 3.0, "unknown": None, "endless": None, "below": None, "huge": None}
-    lengths = [entry["length"]["mean"] for entry in document["entries"]]
+    lengths = [entry["length"]["mean"] for entry in document["parts"]]
     assert lengths == [3.0] * 5
-    assert len(document["episodes"]) == 10
+    assert len(document["attempts"]) == 10
     for line in file.read_text().splitlines():
         json.loads(line, parse_constant=strict)
     again = invoke_json(*words, "--episodes", 3)
-    assert len(again["episodes"]) == 15
+    assert len(again["attempts"]) == 15
     check_notes(again["notes"])
 
 

@@ -183,7 +183,7 @@ def resumption(use: Use) -> None:
         assert len(own) - at <= 2 * use.options.snapshot_every
     use.drain()
     if use.kind.mode == "disabled" and not use.kind.width:
-        evaluation(use, on_episode=lambda episode: episode.number or kill_a_worker(use))
+        evaluation(use, on_episode=lambda episode: episode.index or kill_a_worker(use))
     # Every worker answers, so none is found dead while the group closes.
     use.done(use.group.reset())
 
@@ -205,8 +205,8 @@ def evaluation(use: Use, folder: Path | None = None, /, **options: Any) -> None:
     least = use.options.results[0]
     with use.group.auto_reset(use.options.limit):
         found = use.done(evaluate(use.group, use.act, 3, seed=SEED, min_results=least, **options))
-    rows = {(e.env_id, e.sub_env, e.number): (e.total_reward, e.length) for e in found.episodes}
-    assert len(rows) == len(found.episodes)
+    rows = {(e.env_id, e.sub_env, e.index): (e.reward, e.length) for e in found.played}
+    assert len(rows) == len(found.attempts)
     width = max(use.kind.width, 1)
     expected: dict[Any, Any] = {}
     for k, n in itertools.product(range(NUM_ENVS), range(3)):

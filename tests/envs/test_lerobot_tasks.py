@@ -49,7 +49,7 @@ def test_tasks_of_aloha_share_an_env() -> None:
     with sync.build_env_group(config) as group, group.auto_reset():
         found = evaluate(group, act, [EpisodeSpec(tasks[k % 2], k // 2) for k in (0, 1, 2)])
     # An env continues with its own task while episodes of it wait.
-    assert [(one.task, one.length) for one in found.records] == [
+    assert [(one.spec.task, one.length) for one in found.attempts] == [
         (tasks[0], 2),
         (tasks[0], 2),
         (tasks[1], 2),

@@ -98,10 +98,10 @@ def test_tasks_share_envs_and_end_as_in_a_plain_loop() -> None:
     queue = [EpisodeSpec(task, seed) for seed in range(2) for task in tasks]
     with sync.build_env_group(entry(num_workers=2)) as group, group.auto_reset():
         found = evaluate(group, scripted(), queue)
-    assert len(found.records) == 6
-    for one in found.records:
-        alone = plain_loop(one.task, one.seed)
-        assert (one.total_reward, one.length, one.success) == alone
+    assert len(found.played) == 6
+    for one in found.played:
+        alone = plain_loop(one.spec.task, one.spec.seed)
+        assert (one.reward, one.length, one.success) == alone
     assert found.success is not None
     assert found.success.mean == 1.0
 
@@ -112,6 +112,6 @@ def test_a_task_that_does_not_exist_is_named() -> None:
         sync.build_env_group(entry("reach")).init()
     assert "did you mean 'reach-v3'?" in str(raised.value)
     with sync.build_env_group(entry()) as group, group.auto_reset():
-        found = evaluate(group, scripted(), [EpisodeSpec("pusch-v3", 0)], max_attempts=1)
+        found = evaluate(group, scripted(), [EpisodeSpec("pusch-v3", 0)], retries=0)
     (failed,) = found.failed
-    assert "did you mean 'push-v3'?" in str(failed.cause)
+    assert "did you mean 'push-v3'?" in failed.outcome.cause

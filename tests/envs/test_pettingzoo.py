@@ -277,7 +277,7 @@ def test_an_episode_waits_for_agents_that_join_late(limit: int | None, length: i
             assert resets == ([False] * length + [True]) * 2
         with group.auto_reset(limit or 99):
             found = evaluate(group, lambda batch: nothing, episodes=2)
-    assert [episode.total_reward for episode in found.episodes] == [3.0 + length - 1] * 2
+    assert [episode.reward for episode in found.attempts] == [3.0 + length - 1] * 2
 
 
 def test_the_step_limit_truncates_the_remaining_agents() -> None:

@@ -237,8 +237,8 @@ def test_an_evaluation_plays_the_lost_episode_again(build: Start) -> None:
     group.init()
     with group.group.auto_reset(math.inf):
         found = evaluate(group.group, lambda batch: np.zeros(len(batch), int), 3)
-    assert [episode.length for episode in found.episodes] == [4, 4, 4]
-    assert found.lost == 1
+    assert [episode.length for episode in found.played] == [4, 4, 4]
+    assert found.failures == {"env_raised": 1}
 
 
 @on_one_driver

@@ -45,6 +45,11 @@ def test_hangs_deaths_and_restarts_are_marked(start: Start, tmp_path: Path) -> N
     assert sorted(one.process for one in replaced) == ["worker 0 (faulty)", "worker 1 (faulty)"]
     causes = {args["cause"] for name, _, _, args in seen.marks if name == "died"}
     assert "hung in a step and was killed" in causes
+    lost = [args for name, _, _, args in seen.marks if name == "episode lost"]
+    kinds = sorted((args["kind"], args["blame"]) for args in lost)
+    assert kinds[-1] == ("env_hung", "either")  # The others of its worker are not to blame.
+    assert {kind for kind, _ in kinds[:-1]} == {"env_died"}
+    assert all(args["cause"] for args in lost)
 
 
 @on_one_driver

@@ -12,7 +12,7 @@ from rlightning_aio import sync
 from rlightning_aio.evaluation import EpisodeSpec
 
 if TYPE_CHECKING:
-    from rlightning_aio.evaluation import QueueEvaluation
+    from rlightning_aio.evaluation import Evaluation
 
 QUEUE = [EpisodeSpec("", seed) for seed in range(6)]
 
@@ -61,7 +61,7 @@ def group_of(num_workers: int = 2, **fields: Any) -> sync.EnvGroup:
     return sync.build_env_group({**entry, **fields})
 
 
-def check(found: QueueEvaluation) -> None:
+def check(found: Evaluation) -> None:
     """Each episode was played to its end, with the right actions alone."""
-    assert sorted(one.seed for one in found.records) == [one.seed for one in QUEUE]
-    assert all(one.total_reward == one.length == one.seed + 4 for one in found.records)
+    lengths = sorted((one.spec.seed, one.reward, one.length) for one in found.played)
+    assert lengths == [(one.seed, one.seed + 4, one.seed + 4) for one in QUEUE]

@@ -93,7 +93,7 @@ def played(group: Any, policy: Any) -> list[Any]:
     specs = [EpisodeSpec("", seed) for seed in range(5)]
     return [
         lambda: Collector(group, policy, num_transitions=12, wait_all=True).collect(),
-        lambda: evaluate(group, policy, 2),
+        lambda: evaluate(group, policy, 2, min_results=4),
         lambda: evaluate(group, policy, specs),
     ]
 

@@ -50,7 +50,7 @@ def test_no_action_is_left_over_after_a_lost_episode() -> None:
     with group_of(env_kwargs={"breaks": True}) as group, group.auto_reset(100):
         found = evaluate(group, ActionChunks(chunks, 3), QUEUE)
     check(found)
-    assert found.lost > 0
+    assert found.failures["env_raised"] > 0
 
 
 async def test_the_policy_may_be_a_coroutine_function() -> None:
@@ -90,7 +90,7 @@ def test_it_serves_an_evaluation_of_a_number_of_episodes() -> None:
 
     with sync.build_env_group(config) as group, group.auto_reset(8):
         found = evaluate(group, ActionChunks(policy), 3, seed=0)
-    assert [one.length for one in found.episodes] == [8, 8, 8]
+    assert [one.length for one in found.attempts] == [8, 8, 8]
     assert calls == [True, False] * 3
 
 

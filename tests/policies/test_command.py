@@ -24,10 +24,10 @@ def chunks(batch: Any) -> Any:
 
 
 def check(document: Any) -> None:
-    assert [row["seed"] for row in sorted(document["rows"], key=lambda row: row["seed"])] == [
+    assert [row["seed"] for row in sorted(document["attempts"], key=lambda row: row["seed"])] == [
         *range(4)
     ]
-    assert all(row["return"] == row["length"] == row["seed"] + 4 for row in document["rows"])
+    assert all(row["reward"] == row["length"] == row["seed"] + 4 for row in document["attempts"])
 
 
 @pytest.mark.parametrize("server", [OpenPiServer(), VlaEvalServer()], ids=["openpi", "vla-eval"])

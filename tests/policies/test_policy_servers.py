@@ -50,7 +50,7 @@ def test_actions_of_a_vla_eval_server_are_played(chunks: bool) -> None:
     check(found)
     texts = sorted(task["task_description"] for task in server.tasks)
     assert texts == sorted(
-        f"lift {one.seed}" for one in found.records for _ in range(len(one.lost) + 1)
+        f"lift {one.spec.seed}" for one in found.attempts for _ in range(len(one.failures) + 1)
     )
     assert all(task["name"] == task["task_description"] for task in server.tasks)
     assert server.ended == len(server.tasks) - 3

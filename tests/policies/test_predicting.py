@@ -78,7 +78,7 @@ def test_models_of_stable_baselines3() -> None:
     entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
     with sync.build_env_group({**entry, "placement": "inline"}) as group, group.auto_reset(500):
         found = evaluate(group, PredictPolicy(model), QUEUE)
-    returns = {one.seed: one.total_reward for one in found.records}
+    returns = {one.spec.seed: one.reward for one in found.attempts}
     assert [returns[spec.seed] for spec in QUEUE] == expected
 
 

@@ -21,7 +21,6 @@ from rlightning_aio.errors import (
     EnvFault,
     EnvRaised,
     NothingPending,
-    RLightningError,
     WorkerDied,
 )
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from simulator.model import Env
     from simulator.scripted import Act, Words
 
+    from rlightning_aio.attempts import Attempt
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting import Rollout
 
@@ -326,10 +326,6 @@ class Evaluations(InContext):
         except WorkerDied as fault:
             self.count(fault)
             self.lose(fault)
-        except RLightningError as error:
-            self.count(error)
-            spent = [env.deaths >= env.entry.max_restarts for env in self.envs]
-            require(any(spent), "given up", repr(error))
 
     async def drain(self) -> None:
         """Take what an evaluation has left that did not end."""
@@ -349,19 +345,15 @@ class Evaluations(InContext):
         count, seed = rng.randint(1, 3), rng.randrange(1000)
         found = await self.done(evaluate(self.group, self.policy, count, seed=seed))
         width = sum(len(env.codes) for env in self.envs)
-        places = {
-            (e.env_id, e.sub_env, e.number): (e.total_reward, e.length) for e in found.episodes
-        }
-        require(len(places) == len(found.episodes) == count * width, "as many of each", found)
+        places = {(one.env_id, one.sub_env, one.index): one for one in found.attempts}
+        require(len(places) == len(found.attempts) == count * width, "as many of each", found)
         for env in self.envs:
             for k in range(len(env.codes)):
                 # Of those that reset themselves only the first is seeded.
                 seeded = count if env.entry.mode == "disabled" else 1
                 for number in range(seeded):
                     own = seed + number * width + env.first + k
-                    right = self.played(env, k, own, None)
-                    shown = places[env.env_id, k, number]
-                    require(shown == right, "an episode", env.env_id, k, number, shown, right)
+                    self.check(places[env.env_id, k, number], env, k, own)
         self.counts["episodes"] += len(places)
 
     async def _queue(self, rng: Random) -> None:
@@ -373,22 +365,30 @@ class Evaluations(InContext):
             seed = 100 * k + rng.randrange(100)
             specs.append(EpisodeSpec(metas[name].task, seed, options, name))
         found = await self.done(evaluate(self.group, self.policy, specs))
-        keys = sorted(record.key for record in found.records)
+        keys = sorted(one.spec.key for one in found.attempts)
         require(keys == sorted(spec.key for spec in specs), "other episodes", keys)
-        for record in found.records:
-            env = self.by_id[record.env_id]
-            require(env.entry.name == record.entry, "an env of another entry", record)
-            if record.lost:
-                require(any(e.deaths for e in self.envs), "lost, and nothing has died", record)
-            if record.cause is None:
-                shown = record.total_reward, record.length
-                right = self.played(env, 0, record.seed, record.options)
-                require(shown == right, "an episode", record, right)
-            else:
-                require(record.total_reward is None, "a failure with a reward", record)
+        for attempt in found.attempts:
+            env = self.by_id[attempt.env_id]
+            require(env.entry.name == attempt.spec.entry, "an env of another entry", attempt)
+            self.check(attempt, env, 0, attempt.spec.seed)
         self.counts["episodes"] += len(specs)
 
-    def played(self, env: Env, k: int, seed: int, options: Any) -> tuple[float, int]:
+    def check(self, attempt: Attempt, env: Env, k: int, seed: int | None) -> None:
+        """An episode ends as it does alone, or has failed and says why."""
+        lost = [*attempt.failures, *([attempt.outcome] if attempt.outcome.is_failure else [])]
+        for outcome in lost:
+            kinds = ("env_died", "env_hung", "not_started")
+            require(outcome.kind in kinds, "another failure", attempt)
+        if lost:
+            require(any(e.deaths for e in self.envs), "lost, and nothing has died", attempt)
+        if attempt.outcome.is_failure:
+            require(attempt.reward is None, "a failure with a reward", attempt)
+        else:
+            shown = attempt.reward, attempt.length
+            right = self.played(env, k, seed, attempt.spec.options)
+            require(shown == right, "an episode", attempt, right)
+
+    def played(self, env: Env, k: int, seed: int | None, options: Any) -> tuple[float, int]:
         """Return and length of an episode that is played alone."""
         script = Script(env.codes[k], env.entry.own_limit)
         script.reset(seed, options)

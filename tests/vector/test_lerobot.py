@@ -105,8 +105,8 @@ def test_a_policy_plays_as_in_lerobots_rollout(
     with sync.build_env_group(entry) as group, group.auto_reset():
         loaded = LeRobotPolicy.from_pretrained(tmp_path)
         found = evaluate(group, loaded, [EpisodeSpec("", seed) for seed in range(4)])
-    for one in found.records:
-        assert one.total_reward == pytest.approx(float(alone[one.seed]["reward"].sum()), rel=1e-4)
+    for one in found.attempts:
+        assert one.reward == pytest.approx(float(alone[one.spec.seed]["reward"].sum()), rel=1e-4)
         assert one.success == bool(alone[one.seed]["success"].any())
 
 

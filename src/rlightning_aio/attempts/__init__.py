@@ -1,14 +1,15 @@
 """Groups of attempts: agents that are coroutines play each task several times.
 
 Rule: it uses only the public `EnvGroup`. An attempt that fails has no reward, but an `Outcome`.
-Left out: evaluation with a policy in place of an agent, which is in `evaluation`.
+`evaluation` plays the same queue with a policy in place of an agent.
 """
 
 from __future__ import annotations
 
 from rlightning_aio.attempts.episode import AttemptEpisode
+from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.playing import play
-from rlightning_aio.attempts.records import Attempt, AttemptGroup, AttemptsFile
+from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 
@@ -16,8 +17,8 @@ __all__ = [
     "Attempt",
     "AttemptEpisode",
     "AttemptGroup",
-    "AttemptsFile",
     "EpisodeSpec",
+    "ResultsFile",
     "Rules",
     "play",
 ]

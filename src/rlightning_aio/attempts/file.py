@@ -1,42 +1,53 @@
-"""Files of finished episodes, from which an interrupted evaluation resumes.
+"""`ResultsFile`: attempts as JSON lines; an interrupted run or evaluation resumes from them.
 
-Rule: one process at a time writes a file, and each line of JSON is complete before the next one. So
-however the evaluation ends, the file holds finished episodes only, each once. An incomplete last
-line is ignored. The first line is the subject of the evaluation.
+Rule: one process at a time writes a file, and each line is complete before the next one. So however
+a run ends, the file holds each attempt that has ended, once. An incomplete last line is ignored.
+The first line says what plays.
 """
 
 from __future__ import annotations
 
-import abc
 import contextlib
 import fcntl
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self
 
+from rlightning_aio.attempts.records import Attempt
+from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import check_writable
+from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
 
-__all__ = ["EpisodeFile"]
+    from rlightning_aio.attempts.spec import EpisodeKey
 
-E = TypeVar("E")
+__all__ = ["ResultsFile"]
 
 
-class EpisodeFile(abc.ABC, Generic[E]):
-    """A file of episodes of one kind.
+class ResultsFile:
+    """Attempts as JSON lines, for this process alone; `play` and `evaluate` continue from it.
+
+    A line holds an attempt after its last try, as of `Attempt.to_json`, or, with ``failed_try``,
+    the outcome of a try after which there may be another. Cancelled attempts are not written: with
+    ``Rules(first=…)`` a task is done when as many others are in the file.
+
+    ::
+
+        with ResultsFile("results.jsonl", {"policy": "act-1"}) as results:
+            evaluate(group, policy, episodes, results=results)
 
     Args:
         path: the file, created if it is missing; a link is followed.
-        subject: what is played, as JSON values: the first line of the file. A file with another
-            subject is refused.
+        subject: what plays, as JSON values: the first line of the file. A file with another subject
+            is refused.
         label: what messages call the file.
 
     Attributes:
-        played: the episodes in the file.
+        played: the attempts in the file.
 
     Raises:
         ConfigError: the file can't be read and written, another process has it open, it belongs
@@ -44,12 +55,18 @@ class EpisodeFile(abc.ABC, Generic[E]):
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], subject: Mapping[str, Any], *, label: str
+        self,
+        path: str | os.PathLike[str],
+        subject: Mapping[str, Any] | None = None,
+        *,
+        label: str = "results file",
     ) -> None:
-        self._name, self.played = f"{label} {os.fspath(path)}", list[E]()
+        self._name = f"{label} {os.fspath(path)}"
+        self.played: list[Attempt] = []
+        self._failures: dict[tuple[EpisodeKey, int, int], list[Outcome]] = {}
         try:
-            # As it is read again: lists for tuples, texts for the keys of dicts.
-            about: dict[str, Any] = json.loads(json.dumps({**subject}, allow_nan=False))
+            # Converted as reading does it: lists for tuples, texts for the keys of dicts.
+            about: dict[str, Any] = json.loads(json.dumps({**(subject or {})}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise ConfigError(
                 f"{self._name}: its subject can't be written as JSON: {error}"
@@ -65,20 +82,46 @@ class EpisodeFile(abc.ABC, Generic[E]):
             self._file.close()
             raise
 
-    @abc.abstractmethod
-    def _encode(self, episode: E) -> dict[str, Any]:
-        """Return an episode as JSON values, without NaN and infinity."""
+    # -- attempts ---------------------------------------------------------------------
 
-    @abc.abstractmethod
-    def _decode(self, value: dict[str, Any]) -> E | None:
-        """Return the episode of a line, or None if the line only belongs to one.
+    def add(self, attempt: Attempt) -> None:
+        """Save an attempt after its last try.
 
-        Raises TypeError, ValueError or KeyError if it is neither.
+        Raises:
+            ConfigError: it can't be written; the file is unchanged.
         """
+        self._write(attempt.to_json())
+        self._note(attempt)
 
-    @abc.abstractmethod
-    def _check(self, played: list[E]) -> None:
-        """Raise ValueError if the episodes of a file can't be those of one evaluation."""
+    def add_failure(self, spec: EpisodeSpec, index: int, sub_env: int, outcome: Outcome) -> None:
+        """Save how a try of an attempt has failed that may be tried again.
+
+        Raises:
+            ConfigError: it can't be written; the file is unchanged.
+        """
+        place = {**spec.to_json(), "index": index, "sub_env": sub_env}
+        self._write({**place, "failed_try": outcome.to_json()})
+        self._failures.setdefault((spec.key, index, sub_env), []).append(outcome)
+
+    def failures(self, spec: EpisodeSpec, index: int, sub_env: int = 0) -> list[Outcome]:
+        """Outcomes of the tries of an attempt that has not ended yet."""
+        return [*self._failures.get((spec.key, index, sub_env), ())]
+
+    def by_place(self) -> dict[tuple[EpisodeKey, int, int], list[Attempt]]:
+        """The attempts in the file by the `key` of their task, their index and sub-environment.
+
+        There is more than one where the same task was there several times.
+        """
+        found: dict[tuple[EpisodeKey, int, int], list[Attempt]] = {}
+        for attempt in self.played:
+            found.setdefault(_place(attempt), []).append(attempt)
+        return found
+
+    def _note(self, attempt: Attempt) -> None:
+        self.played.append(attempt)
+        self._failures.pop(_place(attempt), None)
+
+    # -- lines ------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def _writing(self) -> Generator[None]:
@@ -94,24 +137,24 @@ class EpisodeFile(abc.ABC, Generic[E]):
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise ConfigError(
-                    f"{self._name}: another eval is writing this file; wait for it to "
+                    f"{self._name}: another program is writing this file; wait for it to "
                     "end, or name another file"
                 ) from None
 
     def _read(self, subject: dict[str, Any]) -> None:
         self._file.seek(0)
-        foreign = ConfigError(f"{self._name}: is not a file written by eval")
+        foreign = ConfigError(f"{self._name}: is not a file of results")
         try:
             text, first = self._file.read(), _line_of(subject)
             if len(text) < len(first) and first.startswith(text):  # Empty, or cut in that line.
                 self._file.truncate(0)
-                self.write_line(subject)
+                self._write(subject)
                 return
             whole = text[: text.rfind(b"\n") + 1]
             values: list[Any] = [json.loads(line) for line in whole.splitlines()]
             before: dict[str, Any] = {**values[0]} if values else {}
-            decoded = [self._decode({**value}) for value in values[1:]]
-            self.played = [episode for episode in decoded if episode is not None]
+            for value in values[1:]:
+                self._read_line({**value})
         except (ValueError, TypeError, KeyError):
             raise foreign from None
         if not values or before.keys() != subject.keys():
@@ -123,28 +166,20 @@ class EpisodeFile(abc.ABC, Generic[E]):
                 if before[key] != subject[key]
             )
             raise ConfigError(
-                f"{self._name}: belongs to another evaluation ({differences}); name "
-                "another file, or use the same settings as before"
+                f"{self._name}: belongs to something else ({differences}); name another file, or "
+                "use the same settings as before"
             )
-        try:
-            self._check(self.played)
-        except ValueError as error:
-            raise ConfigError(
-                f"{self._name}: {error}, so its figures would be wrong; remove that line "
-                "and those after it, or name another file"
-            ) from None
         self._file.truncate(len(whole))
 
-    def add(self, episode: E) -> None:
-        """Save a finished episode.
+    def _read_line(self, row: dict[str, Any]) -> None:
+        if "failed_try" not in row:
+            self._note(Attempt.from_json(row))
+            return
+        outcome, spec = Outcome.from_json(row.pop("failed_try")), EpisodeSpec.taken_from(row)
+        place = spec.key, row["index"], row["sub_env"]
+        self._failures.setdefault(place, []).append(outcome)
 
-        Raises:
-            ConfigError: it can't be written; the file is unchanged.
-        """
-        self.write_line(self._encode(episode))
-        self.played.append(episode)
-
-    def write_line(self, value: dict[str, Any]) -> None:
+    def _write(self, value: dict[str, Any]) -> None:
         """Append a line; it is complete, or the file is unchanged."""
         line = _line_of(value)
         with self._writing():
@@ -165,6 +200,10 @@ class EpisodeFile(abc.ABC, Generic[E]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _place(attempt: Attempt) -> tuple[EpisodeKey, int, int]:
+    return attempt.spec.key, attempt.index, attempt.sub_env
 
 
 def _line_of(value: dict[str, Any]) -> bytes:

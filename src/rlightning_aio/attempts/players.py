@@ -62,17 +62,21 @@ class Players:
 
         Raises:
             TypeError: it is no `EpisodeSpec`.
-            ValueError: no entry can play it, or more than one can.
+            ValueError: no entry can play it, or more than one can, or its env is not there.
         """
         if not isinstance(cast("Any", spec), EpisodeSpec):
             raise TypeError(f"episodes should be EpisodeSpec, not {spec!r}")
         entries = dict.fromkeys(self.entry_of.values())
         if spec.entry not in ("", *entries):
             raise ValueError(f"there is no entry {spec.entry!r}; entries are {', '.join(entries)}")
+        if spec.env_id not in ("", *self._players):
+            raise ValueError(f"there is no env {spec.env_id!r} to play {spec}")
         able = {
             player.entry: player
-            for player in self._players.values()
-            if spec.entry in ("", player.entry) and _can_play(player, spec.task)
+            for env_id, player in self._players.items()
+            if spec.entry in ("", player.entry)
+            and spec.env_id in ("", env_id)
+            and _can_play(player, spec.task)
         }
         exact = {entry: player for entry, player in able.items() if player.task == spec.task}
         found = exact if len(exact) == 1 else able

@@ -11,26 +11,24 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections import Counter, deque
-from dataclasses import dataclass, field, replace
+from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.episode import AttemptEpisode
-from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.tasks import TaskSource
 from rlightning_aio.attempts.tries import Try, surely
-from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
-from rlightning_aio.outcomes import Outcome, is_bystanders
+from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable
 
     from rlightning_aio._core.group.api.aio import EnvGroup
-    from rlightning_aio.attempts.records import AttemptsFile
-    from rlightning_aio.attempts.spec import EpisodeSpec
+    from rlightning_aio.attempts.file import ResultsFile
+    from rlightning_aio.attempts.queue import Job, TaskInPlay
     from rlightning_aio.attempts.tries import Agent
 
 __all__ = ["play"]
@@ -46,7 +44,7 @@ async def play(
     agent: Agent,
     size: int = 1,
     rules: Rules | None = None,
-    results: AttemptsFile | None = None,
+    results: ResultsFile | None = None,
 ) -> AsyncGenerator[AttemptGroup]:
     """Have an agent attempt each task several times; yield the attempts at a task when it is done.
 
@@ -101,40 +99,6 @@ async def play(
         _ = running.cancelled() or running.exception()
 
 
-@dataclass(eq=False, slots=True)
-class _Task:
-    """A task in progress.
-
-    Attributes:
-        attempts: that have ended, by index.
-        is_settled: its group was handed over.
-    """
-
-    spec: EpisodeSpec
-    attempts: dict[int, Attempt] = field(default_factory=dict[int, Attempt])
-    is_settled: bool = False
-
-
-@dataclass(eq=False, slots=True)
-class _Job:
-    """An attempt that waits or plays.
-
-    Attributes:
-        since: when it began to wait, in monotonic seconds.
-        failures: outcomes of its tries so far; counted: how many of them use up a retry.
-    """
-
-    task: _Task
-    index: int
-    since: float = field(default_factory=time.monotonic)
-    failures: list[Outcome] = field(default_factory=list[Outcome])
-    counted: int = 0
-
-    @property
-    def spec(self) -> EpisodeSpec:
-        return self.task.spec
-
-
 class _Engine:
     """The attempts in progress.
 
@@ -150,20 +114,14 @@ class _Engine:
         agent: Agent,
         size: int,
         rules: Rules,
-        results: AttemptsFile | None,
+        results: ResultsFile | None,
     ) -> None:
         self._group, self._source, self._agent = group, source, agent
-        self._size, self._rules, self._results = size, rules, results
-        self._players = Players(group)
+        self._size, self._rules = size, rules
+        self._queue = AttemptQueue(group, rules, results)
         self._has_clients = len(group) > group.size()
-        self._free = dict.fromkeys(self._players.entry_of)
-        """Idle envs, the one that has been idle for longest first."""
-        self._waiting: dict[str, WaitingEpisodes[_Job]] = {}
-        self._playing: dict[asyncio.Task[Attempt], tuple[_Job, Try]] = {}
+        self._playing: dict[asyncio.Task[Attempt], tuple[Job, Try]] = {}
         self._ended = deque[asyncio.Task[Attempt]]()
-        self._before = {} if results is None else results.by_task()
-        self._repeats = Counter[Any]()
-        self._fault: WorkerDied | None = None
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._wake = asyncio.Event()
@@ -208,48 +166,27 @@ class _Engine:
     @property
     def _most(self) -> int:
         """Number of attempts that may play at once."""
-        envs = len(self._free) + len(self._playing)
+        envs = len(self._queue.free) + len(self._playing)
         return min(envs, self._rules.max_concurrency or envs)
 
     def _begin(self) -> None:
         """Begin attempts on idle envs, and read more tasks while envs are idle."""
+        queue = self._queue
         while True:
-            while len(self._playing) < self._most and (env_id := self._next_env()):
+            while len(self._playing) < self._most and (env_id := queue.next_env()):
                 self._start(env_id)
-            waiting = sum(map(len, self._waiting.values()))
             room = max(self._most, 1)
-            is_full = len(self.done) * self._size >= room or waiting >= room
-            if is_full or len(self._playing) >= room or not self._free:
+            is_full = len(self.done) * self._size >= room or len(queue) >= room
+            if is_full or len(self._playing) >= room or not queue.free:
                 return
             spec = self._source.next(self._wake)
             if spec is None:
                 return
-            self._add(self._players.assigned(spec))
-
-    def _next_env(self) -> str | None:
-        entry_of = self._players.entry_of
-        return next((id_ for id_ in self._free if self._waiting.get(entry_of[id_])), None)
-
-    def _add(self, spec: EpisodeSpec) -> None:
-        """Queue the attempts at a task that are not in the file."""
-        repeat = self._repeats[spec.key]
-        self._repeats[spec.key] += 1
-        task = _Task(spec)
-        for index, found in self._before.get(spec.key, {}).items():
-            if index < self._size and repeat < len(found):
-                task.attempts[index] = found[repeat]
-        if self._is_done(task):
-            return
-        waiting = self._waiting.setdefault(spec.entry, WaitingEpisodes[_Job]())
-        for index in range(self._size):
-            if index not in task.attempts:
-                waiting.add(_Job(task, index))
+            queue.add(spec, self._size)
 
     def _start(self, env_id: str) -> None:
-        del self._free[env_id]
-        job = self._players.take(env_id, self._waiting[self._players.entry_of[env_id]])
-        options = self._players.options(env_id, job.spec)
-        seed = self._rules.seed(job.spec, job.index)
+        (job,) = self._queue.take(env_id)
+        seed, options = self._queue.begin(env_id, job)
         view = AttemptEpisode(self._group.episode(env_id, seed, options), job.spec, job.index)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         task = asyncio.create_task(one.run())
@@ -264,52 +201,32 @@ class _Engine:
 
     def _end(self, ended: asyncio.Task[Attempt]) -> None:
         """Note the end of a try; its env is idle."""
+        queue = self._queue
         job, one = self._playing.pop(ended)
         attempt = ended.result()
-        outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
         if isinstance(one.error, WorkerDied):
-            self._fault = one.error
-        if not outcome.is_failure or one.env_id in self._players.refresh():
-            self._free[one.env_id] = None
-        if job.task.is_settled:
-            return
-        has_tries = is_bystanders(outcome) or job.counted < self._rules.retries
-        if self._rules.retried(outcome) and has_tries:
-            job.failures.append(outcome)
-            job.counted += not is_bystanders(outcome)
-            job.since = time.monotonic()
-            self._waiting[job.spec.entry].add(job)
-            return
-        attempt.failures = tuple(job.failures)
-        job.task.attempts[job.index] = attempt
-        if self._results is not None:
-            self._results.add(attempt)
-        if self._is_done(job.task):
+            queue.fault = one.error
+        if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
+            queue.free[one.env_id] = None
+        if queue.end(job, attempt) and queue.is_done(job.task):
             self._settle(job.task)
 
-    def _is_done(self, task: _Task) -> bool:
-        if len(task.attempts) == self._size:
-            return True
-        first = self._rules.first
-        return first is not None and _whole(task) >= first
-
-    def _settle(self, task: _Task) -> None:
+    def _settle(self, task: TaskInPlay) -> None:
         """Hand over the attempts at a task, and cancel those that are left of it."""
         task.is_settled = True
-        left: list[_Job] = []
+        left: list[Job] = []
         for job, one in self._playing.values():
             if job.task is task:
                 one.stop(_SURPLUS)
                 left.append(job)
-        waiting = self._waiting[task.spec.entry]
-        left += waiting.remove(lambda job: job.task is task)
+        left += self._queue.withdraw(task)
         for job in left:
             cancelled = Outcome("cancelled", "caller", _SURPLUS, attempt=len(job.failures))
             task.attempts[job.index] = Attempt(
                 task.spec, job.index, cancelled, failures=tuple(job.failures)
             )
         attempts = [task.attempts[index] for index in sorted(task.attempts)]
-        is_complete = _whole(task) >= self._rules.needed(self._size)
+        is_complete = task.num_whole >= self._rules.needed(self._size)
         self.done.append(AttemptGroup(task.spec, attempts, is_complete))
         self.news.set()
 
@@ -317,12 +234,13 @@ class _Engine:
 
     def _entries_without_env(self) -> list[str]:
         """Entries whose attempts wait although nothing plays; raise if that is for good."""
-        waiting = [entry for entry, jobs in self._waiting.items() if jobs]
-        left = self._free or self._playing or self._has_clients or self._source.is_at_end
-        if not left or (self._fault is not None and not self._players.can_play(waiting)):
-            raise self._fault or RLightningError("no env of this group is left that could play")
-        entry_of = self._players.entry_of
-        there = {entry_of[id_] for id_ in self._free}
+        queue = self._queue
+        if not (queue.free or self._playing or self._has_clients or self._source.is_at_end):
+            raise queue.fault or RLightningError("no env of this group is left that could play")
+        queue.check_players()
+        waiting = queue.entries()
+        entry_of = queue.players.entry_of
+        there = {entry_of[id_] for id_ in queue.free}
         there |= {job.spec.entry for job, _ in self._playing.values()} if waiting else set[str]()
         return [entry for entry in waiting if entry not in there]
 
@@ -332,10 +250,5 @@ class _Engine:
             return
         self._look_at = time.monotonic() + _LOOK_SECONDS
         busy = {one.env_id for _, one in self._playing.values()}
-        for env_id in self._players.refresh() - busy:
-            self._free.setdefault(env_id)
-
-
-def _whole(task: _Task) -> int:
-    """Number of attempts that have not failed."""
-    return sum(not attempt.outcome.is_failure for attempt in task.attempts.values())
+        for env_id in self._queue.players.refresh() - busy:
+            self._queue.free.setdefault(env_id)

@@ -1,4 +1,4 @@
-"""`Attempt`, `AttemptGroup`, and the file of attempts from which an interrupted run resumes."""
+"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task."""
 
 from __future__ import annotations
 
@@ -8,35 +8,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
 
-from rlightning_aio.attempts.file import EpisodeFile
 from rlightning_aio.attempts.spec import EpisodeSpec, plain
 from rlightning_aio.json_text import finite
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Iterator, Mapping
 
-    from rlightning_aio.attempts.spec import EpisodeKey
-
-__all__ = ["Attempt", "AttemptGroup", "AttemptsFile"]
+__all__ = ["Attempt", "AttemptGroup"]
 
 
 @dataclass(slots=True)
 class Attempt:
-    """One attempt at a task, after its last try.
+    """One attempt at a task, after its last try; or an episode of `evaluate`.
 
     Attributes:
         spec: the task.
-        index: among the attempts at the task, from 0.
+        index: among the attempts at the task, from 0; of a number of episodes for each env, that of
+            the episode.
         outcome: how it ended.
-        reward: the sum of `rewards`; None if it has failed.
-        rewards: of each step, in order.
+        reward: the undiscounted return, summed over agents; None if it has failed.
+        length: number of steps.
+        success: ``success`` or ``is_success`` of the last info; None if it has neither, or if the
+            attempt has failed.
+        sub_env: index of the sub-environment that played it; 0 if the env has only one.
+        rewards: of each step, in order; empty if a policy played several envs at once.
         columns: what the agent gave to `step` with each action, and ``action`` itself: lists with
             an element for each step, None where a step had no such column.
         first, last: copies of the observations after the reset and after the newest step; None
-            without. If `zero_copy` views are in use, an attempt that was cut during a step may have
-            the observation of that step as its last one.
+            without, and if a policy played several envs at once. If `zero_copy` views are in use,
+            an attempt that was cut during a step may have the observation of that step as its last
+            one.
         result: what the agent returned.
         failures: outcomes of earlier tries, in order.
     """
@@ -45,17 +47,15 @@ class Attempt:
     index: int
     outcome: Outcome
     reward: float | None = None
+    length: int = 0
+    success: bool | None = None
+    sub_env: int = 0
     rewards: list[float] = field(default_factory=list[float])
     columns: dict[str, list[Any]] = field(default_factory=dict[str, list[Any]])
     first: Any = None
     last: Any = None
     result: Any = None
     failures: tuple[Outcome, ...] = ()
-
-    @property
-    def length(self) -> int:
-        """Number of steps."""
-        return len(self.rewards)
 
     @property
     def env_id(self) -> str:
@@ -71,6 +71,9 @@ class Attempt:
             **self.spec.to_json(),
             "index": self.index,
             "reward": self.reward,
+            "length": self.length,
+            "success": self.success,
+            "sub_env": self.sub_env,
             "rewards": self.rewards,
             "outcome": self.outcome.to_json(),
             "failures": [outcome.to_json() for outcome in self.failures],
@@ -87,13 +90,13 @@ class Attempt:
             TypeError, ValueError, KeyError: it is not such a row.
         """
         fields = {**row}
-        names = ("task", "seed", "options", "entry")
-        spec = EpisodeSpec(**{name: fields.pop(name) for name in names})
+        spec = EpisodeSpec.taken_from(fields)
         outcome = Outcome.from_json(fields.pop("outcome"))
         failures = tuple(map(Outcome.from_json, fields.pop("failures")))
         rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
-        reward = None if outcome.is_failure else sum(rewards)
-        del fields["reward"]  # Null, too, where it is not finite.
+        reward = fields.pop("reward")
+        if reward is None and not outcome.is_failure:  # It was not finite.
+            reward = math.nan
         return cls(
             spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
         )
@@ -141,48 +144,3 @@ class AttemptGroup(Sequence[Attempt]):
 
     def __iter__(self) -> Iterator[Attempt]:
         return iter(self.attempts)
-
-
-class AttemptsFile(EpisodeFile[Attempt]):
-    """Attempts as JSON lines, for this process alone; `play` continues from it.
-
-    A line holds an attempt after its last try. Cancelled attempts are not written: with
-    ``Rules(first=…)`` a task is done when as many others are in the file.
-
-    Args:
-        path: the file, created if it is missing; a link is followed.
-        subject: what plays, as JSON values: the first line of the file. A file with another subject
-            is refused.
-
-    Attributes:
-        played: the attempts in the file.
-
-    Raises:
-        ConfigError: the file can't be read and written, another process has it open, it belongs to
-            something else, or it is damaged.
-    """
-
-    def __init__(
-        self, path: str | os.PathLike[str], subject: Mapping[str, Any] | None = None
-    ) -> None:
-        super().__init__(path, subject or {}, label="file of attempts")
-
-    def by_task(self) -> dict[EpisodeKey, dict[int, list[Attempt]]]:
-        """The attempts in the file by the `key` of their task, and by index.
-
-        There is more than one of an index where the same task was there several times.
-        """
-        found: dict[EpisodeKey, dict[int, list[Attempt]]] = {}
-        for attempt in self.played:
-            by_index = found.setdefault(attempt.spec.key, {})
-            by_index.setdefault(attempt.index, []).append(attempt)
-        return found
-
-    def _encode(self, episode: Attempt) -> dict[str, Any]:
-        return episode.to_json()
-
-    def _decode(self, value: dict[str, Any]) -> Attempt | None:
-        return Attempt.from_json(value)
-
-    def _check(self, played: list[Attempt]) -> None:
-        """Any attempt may be there again, where a task is."""

@@ -71,9 +71,9 @@ class Rules:
         if self.at_least is not None and self.first is not None:
             raise ValueError("at_least and first exclude each other")
 
-    def seed(self, spec: EpisodeSpec, index: int) -> int:
+    def seed(self, spec: EpisodeSpec, index: int) -> int | None:
         """The seed of an attempt."""
-        if self.seeds == "same":
+        if self.seeds == "same" or spec.seed is None:
             return spec.seed
         state = np.random.SeedSequence((spec.seed, index)).generate_state(1, np.uint64)
         return int(state[0]) >> _SEED_BITS

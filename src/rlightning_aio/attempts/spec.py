@@ -1,7 +1,7 @@
 """`EpisodeSpec`: an episode to play.
 
-Rule: an episode is identified by its entry, task, seed and options; the env that plays it doesn't
-matter.
+Rule: an episode is identified by its entry, task, seed and options. Which env plays it doesn't
+matter, unless it names one.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from rlightning_aio._core.group.episodes.seeds import checked_seed
 
 __all__ = ["EpisodeKey", "EpisodeSpec", "plain", "written"]
 
-EpisodeKey = tuple[str, str, int, str]
-"""Entry, task, seed and options of an episode, the last as JSON."""
+EpisodeKey = tuple[str, str, int | None, str, str]
+"""Entry, task, seed, options as JSON, and env of an episode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,10 @@ class EpisodeSpec:
 
     Attributes:
         task: name of the task; empty for the task of the config entry.
-        seed: of the reset.
+        seed: of the reset; None for an episode that can't be repeated.
         options: further options of the reset, such as the number of an initial state.
         entry: name of the config entry; empty for the one whose envs can play the task.
+        env_id: of the only env that may play it; empty for any env of the entry.
 
     Raises:
         ValueError: `seed` is no int from 0 to 2**62 - 1, a name is no str, or `options` are no dict
@@ -35,14 +36,16 @@ class EpisodeSpec:
     """
 
     task: str
-    seed: int
+    seed: int | None
     options: Mapping[str, Any] | None = None
     entry: str = ""
+    env_id: str = ""
 
     def __post_init__(self) -> None:
         """Check the fields, and convert the seed, which may be a number of NumPy."""
-        object.__setattr__(self, "seed", checked_seed(self.seed))
-        names: dict[str, Any] = {"task": self.task, "entry": self.entry}
+        if self.seed is not None:
+            object.__setattr__(self, "seed", checked_seed(self.seed))
+        names: dict[str, Any] = {"task": self.task, "entry": self.entry, "env_id": self.env_id}
         for what, name in names.items():
             if not isinstance(name, str):
                 raise ValueError(f"the {what} of an episode should be a str, not {name!r}")
@@ -59,7 +62,7 @@ class EpisodeSpec:
     @property
     def key(self) -> EpisodeKey:
         """Identity of the episode."""
-        return self.entry, self.task, self.seed, written(self.options)
+        return self.entry, self.task, self.seed, written(self.options), self.env_id
 
     def to_json(self) -> dict[str, Any]:
         """Return the episode as a row of JSON."""
@@ -68,7 +71,17 @@ class EpisodeSpec:
             "task": self.task,
             "seed": self.seed,
             "options": None if self.options is None else json.loads(written(self.options)),
+            "env_id": self.env_id,
         }
+
+    @classmethod
+    def taken_from(cls, row: dict[str, Any]) -> EpisodeSpec:
+        """Take an episode's fields out of a row that has others as well.
+
+        Raises:
+            TypeError, ValueError, KeyError: it has no such fields.
+        """
+        return cls(**{name: row.pop(name) for name in cls.__slots__})
 
 
 def written(options: Mapping[str, Any] | None) -> str:

@@ -21,7 +21,7 @@ class TaskSource:
         tasks: of `EpisodeSpec`, or of tuples (task, seed) or (task, seed, options).
 
     Attributes:
-        is_at_end: there are no more.
+        is_at_end: the iterable is at its end.
 
     Raises:
         TypeError: `tasks` is not iterable.

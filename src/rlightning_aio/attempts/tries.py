@@ -13,6 +13,7 @@ import numpy as np
 
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio.attempts.records import Attempt
+from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
@@ -188,6 +189,8 @@ class Try:
             view.index,
             replace(ended, seconds=spent),
             reward=None if ended.is_failure else sum(view.rewards),
+            length=len(view.rewards),
+            success=None if ended.is_failure else success_of(view.last.info),
             rewards=view.rewards,
             columns=view.columns,
             first=view.first,

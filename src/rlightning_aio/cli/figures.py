@@ -1,4 +1,4 @@
-"""Estimates of both kinds of evaluation, for tables and for JSON."""
+"""Estimates of an evaluation, for tables and for JSON."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio.evaluation import Estimate
-    from rlightning_aio.evaluation.episodes import Figures
+    from rlightning_aio.evaluation import Estimate, Evaluation
+
 
 __all__ = ["estimates", "with_interval"]
 
 
-def estimates(found: Figures) -> dict[str, Any]:
+def estimates(found: Evaluation) -> dict[str, Any]:
     """Return the estimates by name, as JSON values."""
     named = {"total_reward": found.total_reward, "length": found.length, "success": found.success}
     return {name: None if one is None else asdict(one) for name, one in named.items()}

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import RECORD_VIDEO
+from rlightning_aio.attempts.spec import written
 from rlightning_aio.config import VideoConfig
 from rlightning_aio.files import check_folder, file_name, finish_file
 
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable
 
+    from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.collecting.procedure import Procedure
-    from rlightning_aio.evaluation.records import EpisodeRecord
 
 __all__ = ["EpisodeVideo", "Filming"]
 
@@ -74,16 +75,16 @@ class Filming:
             yield partial(self.group[env_id].call, RECORD_VIDEO, order)
             self._filmed.add(env_id)
 
-    def end(self, env_id: str, record: EpisodeRecord) -> Procedure[None]:
+    def end(self, env_id: str, attempt: Attempt) -> Procedure[None]:
         """Stop filming an idle env, and keep or delete the film of the episode."""
         if env_id in self._filmed:
             yield partial(self.group[env_id].call, RECORD_VIDEO, None)
             self._filmed.remove(env_id)
             folder = self._folder(env_id)
-            if not self.video.failed_only or record.success is False:
+            if not self.video.failed_only or attempt.success is False:
                 # A step limit of the group ends an episode, but not its film.
                 for film in folder.glob("*-episode-0*.mp4"):
-                    finish_file(film, Path(self.video.folder, _name(record)))
+                    finish_file(film, Path(self.video.folder, _name(attempt.spec)))
             shutil.rmtree(folder, ignore_errors=True)
 
     def drop(self, env_id: str) -> None:
@@ -96,7 +97,7 @@ class Filming:
         return Path(self.video.folder, f"{file_name(env_id)}.partial").absolute()
 
 
-def _name(record: EpisodeRecord) -> str:
-    entry, task, seed, options = record.key
+def _name(spec: EpisodeSpec) -> str:
+    options = written(spec.options)
     number = f"-{zlib.crc32(options.encode()):08x}" if options else ""
-    return re.sub(r"[^\w.-]+", "_", f"{entry}-{task}-seed-{seed}{number}") + ".mp4"
+    return re.sub(r"[^\w.-]+", "_", f"{spec.entry}-{spec.task}-seed-{spec.seed}{number}") + ".mp4"

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.bench.measuring import Contender
     from rlightning_aio.cli.rollout_statistics import Course
-    from rlightning_aio.evaluation import Estimate
-    from rlightning_aio.evaluation.episodes import Figures
+    from rlightning_aio.evaluation import Estimate, Evaluation
 
 __all__ = ["check_plot", "draw_contenders", "draw_evaluation", "draw_rollout"]
 
@@ -111,7 +110,7 @@ def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
 
 
 def draw_evaluation(
-    config: str, groups: Sequence[tuple[str, Figures, Sequence[float]]], path: Path
+    config: str, groups: Sequence[tuple[str, Evaluation, Sequence[float]]], path: Path
 ) -> None:
     """Draw each episode's return and the means, and success rates where there are any, with their
     95 % intervals.

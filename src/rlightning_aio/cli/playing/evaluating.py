@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
-from dataclasses import asdict, dataclass
+import time
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.live import Live
 
 import rlightning_aio
+from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.bench.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.figures import estimates, with_interval
-from rlightning_aio.cli.option_files import check_option_file
+from rlightning_aio.cli.option_files import check_option_file, naming_option
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
-from rlightning_aio.cli.playing.evaluation_file import EvaluationFile, subject
-from rlightning_aio.cli.playing.films import Video, VideoEnvs, VideoEvery, filmed
-from rlightning_aio.cli.playing.queue_evaluating import QueueOrder, evaluate_queue
+from rlightning_aio.cli.playing.films import Video, VideoEnvs, VideoEvery, filmed, rendering
 from rlightning_aio.cli.playing.queue_options import (
     EpisodesFile,
-    MaxAttempts,
     QueueOptions,
+    Retries,
     Seeds,
     Tasks,
     VideoEpisodes,
@@ -45,35 +46,32 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.evaluation import Episode, Evaluation, evaluate
+from rlightning_aio.evaluation import Evaluation, evaluate
+from rlightning_aio.files import check_folder
+from rlightning_aio.json_text import finite
 from rlightning_aio.policies import ActionChunks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rich.table import Table
+
     from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.attempts import Attempt
     from rlightning_aio.cli.policies.policies import Policy
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
 
 __all__ = ["evaluation"]
 
 _RANDOM: Final = "random"
-
-
-_ByEntry: TypeAlias = "Sequence[tuple[EnvConfig, Evaluation]]"
-"""The entries of a config, each with the episodes of its envs."""
-
-
-@dataclass(frozen=True)
-class _Order:
-    """The options of an evaluation."""
-
-    configs: Sequence[EnvConfig]
-    episodes: int
-    seed: int | None
-    policy: Policy | None
-    played: Sequence[Episode]
-    trace: Path | None
+_NAMED: Final = 5
+"""Number of failed episodes that a message names."""
+_IN_SUBJECT: Final = (
+    "name", "backend", "task", "num_envs", "max_episode_steps", "env_kwargs",
+)  # fmt: skip
+"""Fields of an entry that affect what comes of an episode; others only where and how it runs."""
+_By: TypeAlias = Literal["entry", "task"]
 
 
 _PolicyOrModel: TypeAlias = Annotated[
@@ -111,60 +109,49 @@ _Resume: TypeAlias = Annotated[
 
 
 @dataclass(frozen=True)
-class _Output:
-    """The facts that a report repeats, and the options for it."""
+class _Whose:
+    """Whose episodes are played, and how often they are retried.
 
-    config: Path
-    policy: str
-    seed: int | None
-    episodes: int
+    Attributes:
+        named: a text that identifies the policy.
+        facts: what the command was given, for JSON.
+    """
+
+    retries: int
+    policy: Policy | None
+    named: str
+    facts: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What is to be played.
+
+    Attributes:
+        episodes: a number for each env, or a queue.
+        by: what the table has a line for; title: of the table.
+    """
+
+    configs: Sequence[EnvConfig]
+    episodes: int | Sequence[EpisodeSpec]
+    video: EpisodeVideo | None
+    whose: _Whose
+    by: _By
+    title: str
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Where results go."""
+
+    resume: Path | None
     plot: Path | None
+    trace: Path | None
     as_json: bool
 
     def __post_init__(self) -> None:
+        check_option_file("--trace", self.trace)
         check_plot(self.plot)
-
-    def report(self, configs: Sequence[EnvConfig], found: Evaluation, *, interrupted: bool) -> None:
-        """Print and draw the results."""
-        by_entry = _by_entry(configs, found)
-        notes = notes_on_returns(
-            episode.env_id for episode in found.episodes if not math.isfinite(episode.total_reward)
-        )
-        if found.lost:
-            lost = counted(found.lost, "episode")
-            notes.insert(0, f"{lost} lost with a worker and started again")
-        if self.as_json:
-            self._print_json(by_entry, found, notes, interrupted=interrupted)
-        else:
-            title = f"{self.policy}: {counted(self.episodes, 'episode')} of each env"
-            if interrupted:
-                title = f"Interrupted, so short episodes are favoured: {title}"
-            _print_table(title, by_entry)
-            for note in notes:
-                out().print(note, markup=False)
-        if self.plot is not None and found.episodes:
-            figures = [(config.name, own, own.returns) for config, own in by_entry]
-            draw_evaluation(str(self.config), figures, self.plot)
-
-    def _print_json(
-        self, by_entry: _ByEntry, found: Evaluation, notes: list[str], *, interrupted: bool
-    ) -> None:
-        print_json(
-            {
-                "config": str(self.config),
-                "policy": self.policy,
-                "seed": self.seed,
-                "episodes_each": self.episodes,
-                "interrupted": interrupted,
-                "lost": found.lost,
-                "notes": notes,
-                "entries": [
-                    {"name": config.name, "episodes": len(own.episodes), **estimates(own)}
-                    for config, own in by_entry
-                ],
-                "episodes": [asdict(episode) for episode in found.episodes],
-            }
-        )
 
 
 def evaluation(
@@ -178,7 +165,7 @@ def evaluation(
     episodes_file: EpisodesFile = None,
     tasks: Tasks = None,
     seeds: Seeds = None,
-    max_attempts: MaxAttempts = 3,
+    retries: Retries = 2,
     resume: _Resume = None,
     plot: PlotFile = None,
     video: Video = None,
@@ -193,7 +180,8 @@ def evaluation(
 
     Either each env plays a number of episodes (--episodes), or the envs share a queue: each task of
     --tasks with each of --seeds, or the episodes of --episodes-file, each once, on any free env.
-    An episode of a queue that is lost with its worker is played again.
+    An episode that is lost with its worker or by an exception is played again, up to --retries
+    times. If any has failed then, the exit code is 1.
 
     Means and success rates have 95 % intervals. The episodes that end first would not be a fair
     sample, because envs with short episodes would have more of them. Success is the value of
@@ -209,24 +197,38 @@ def evaluation(
     check_seed(seed)
     configs = load_config(config, overrides or ())
     _check_envs(config, configs)
-    check_option_file("--trace", trace)
+    files = _Files(resume, plot, trace, as_json)
     films = (video, video_every, video_failed, video_episode)
-    queue = QueueOptions(episodes_file, tasks, seeds, max_attempts, *films)
+    queue = QueueOptions(episodes_file, tasks, seeds, *films)
+    if queue.wanted:
+        _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
+    facts = {"config": str(config), "policy": policy, "seed": seed}
     with contextlib.ExitStack() as stack:
         chosen, named = _policy(policy, algo, action_steps, stack)
+        whose = _Whose(retries, chosen, named, facts)
         if queue.wanted:
-            _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
-            facts = {"config": str(config), "policy": policy}
-            evaluate_queue(
-                configs, queue, QueueOrder(chosen, named, resume, plot, trace, as_json, facts)
-            )
-            return
-        output = _Output(config, policy, seed, episodes or 10, plot, as_json)
-        about = subject(configs, named, seed)
-        configs = filmed(configs, video, video_env, video_every)
-        kept = None if resume is None else stack.enter_context(EvaluationFile(resume, about))
-        played = _within([] if kept is None else kept.played, output.episodes)
-        _play(_Order(configs, output.episodes, seed, chosen, played, trace), kept, output)
+            order = _in_queue(configs, queue, whose)
+        else:
+            configs = filmed(configs, video, video_env, video_every)
+            order = _of_each(configs, episodes or 10, whose)
+        _play(order, files, _resumed(order, resume, stack))
+
+
+def _in_queue(configs: Sequence[EnvConfig], queue: QueueOptions, whose: _Whose) -> _Order:
+    specs = queue.specs(configs)
+    video = queue.films(specs)
+    if video is not None:
+        with naming_option("--video", Path(video.folder)):
+            check_folder(video.folder)
+        configs = [rendering(config) for config in configs]
+    title = f"{whose.facts['policy']}: {counted(len(specs), 'episode')}"
+    return _Order(configs, specs, video, whose, "task", title)
+
+
+def _of_each(configs: Sequence[EnvConfig], episodes: int, whose: _Whose) -> _Order:
+    whose.facts["episodes_each"] = episodes
+    title = f"{whose.facts['policy']}: {counted(episodes, 'episode')} of each env"
+    return _Order(configs, episodes, None, whose, "entry", title)
 
 
 def _refuse(given: dict[str, Any]) -> None:
@@ -239,13 +241,27 @@ def _refuse(given: dict[str, Any]) -> None:
             )
 
 
-def _play(order: _Order, kept: EvaluationFile | None, output: _Output) -> None:
-    """Play a number of episodes of each env, and report them."""
+def _resumed(order: _Order, resume: Path | None, stack: contextlib.ExitStack) -> ResultsFile | None:
+    if resume is None:
+        return None
+    about = _subject(order.configs, order.whose.named)
+    return stack.enter_context(ResultsFile(resume, about, label="--resume"))
+
+
+def _subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:
+    """Subject of the results in a file."""
+    envs = [{name: getattr(config, name) for name in _IN_SUBJECT} for config in configs]
+    # Values that JSON can't hold are compared by their `repr`.
+    return finite(json.loads(json.dumps({"policy": policy, "envs": envs}, default=repr)))
+
+
+def _play(order: _Order, files: _Files, results: ResultsFile | None) -> None:
+    """Play the episodes, and report them."""
     group = rlightning_aio.build_env_group(order.configs, mixed_actions=True)
     interrupted, stopped = True, False
-    with _Watch(group, order, kept) as watch:
+    with _Watch(group, order) as watch:
         try:
-            run_interruptible(_evaluate(group, order, watch))
+            run_interruptible(_evaluate(group, order, files.trace, results, watch))
             interrupted = False
         except KeyboardInterrupt:
             stopped = True
@@ -253,8 +269,39 @@ def _play(order: _Order, kept: EvaluationFile | None, output: _Output) -> None:
         finally:
             # After an error, too: the episodes until then may be useful.
             watch.stop()
-            if stopped or watch.found.episodes:
-                output.report(order.configs, watch.found, interrupted=interrupted)
+            if stopped or watch.found.attempts:
+                _report(order, files, watch.found, interrupted=interrupted)
+    if watch.found.failed:
+        raise typer.Exit(1)
+
+
+async def _evaluate(
+    group: EnvGroup,
+    order: _Order,
+    trace: Path | None,
+    results: ResultsFile | None,
+    watch: _Watch,
+) -> None:
+    # The random actions of the saved episodes must not be drawn again.
+    before = 0 if results is None else len(results.played)
+    base: int | None = order.whose.facts["seed"]
+    seed = None if base is None else base + before
+    async with playing(group, order.whose.policy, seed, trace, watch.draw) as policy:
+        try:
+            evaluated = evaluate(
+                group,
+                policy,
+                order.episodes,
+                seed=base,
+                retries=order.whose.retries,
+                results=results,
+                video=order.video,
+                on_episode=watch.note,
+            )
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        watch.ready(group)
+        await evaluated
 
 
 def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
@@ -289,115 +336,139 @@ def _policy(
     return ActionChunks(policy, steps), f"{name}{played}"
 
 
-def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:
-    """Leave out saved episodes beyond the present number."""
-    return [episode for episode in played if episode.number < episodes]
-
-
-async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
-    # The random actions of the saved episodes must not be drawn again.
-    seed = None if order.seed is None else order.seed + len(order.played)
-    async with playing(group, order.policy, seed, order.trace, watch.draw) as policy:
-        watch.ready(sum(meta.num_envs for meta in group.metas) * order.episodes)
-        watch.found = await evaluate(
-            group,
-            policy,
-            order.episodes,
-            seed=order.seed,
-            played=order.played,
-            on_episode=watch.note,
-        )
-
-
+@dataclass
 class _Watch:
-    """The figures so far, and the live line on stderr."""
+    """The episodes so far, and the live table on stderr."""
 
-    def __init__(self, group: EnvGroup, order: _Order, kept: EvaluationFile | None) -> None:
-        self.found = Evaluation(list(order.played))
-        self._kept = kept
-        self._console = err()
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=16),
-            TextColumn("{task.completed:.0f} of {task.total:.0f} episodes"),
-            TextColumn("{task.fields[figures]}"),
-            TimeRemainingColumn(),
-            console=self._console,
-            auto_refresh=False,
-            transient=True,
-        )
-        starting = f"starting {counted(len(group), 'env')}"
-        self._task = self._progress.add_task(
-            starting, total=1, completed=len(order.played), figures=""
-        )
-        self._starting = starting
+    group: EnvGroup
+    order: _Order
+    found: Evaluation = field(default_factory=Evaluation)
+    _total: int = 0
+    _before: int = 0
+    _begun: float = 0.0
+    _recent: dict[str, None] = field(default_factory=dict[str, None])
+    """Lines of the table in the order of their last episodes."""
 
     def __enter__(self) -> Self:
+        self._console = err()
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._console.print(f"starting {counted(len(self.group), 'env')}")
         if self._console.is_terminal:
-            self._progress.start()
-            self._progress.refresh()
-        else:
-            self._console.print(self._starting)
+            self._live.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.stop()
 
     def stop(self) -> None:
-        """End the live line."""
+        """End the live table."""
         if self._console.is_terminal:
-            self._progress.stop()
+            self._live.stop()
 
-    def ready(self, total: int) -> None:
+    def ready(self, group: EnvGroup) -> None:
         """Show that all envs have started, with the number of episodes."""
-        done = len(self.found.episodes)
-        if self._console.is_terminal:
-            self._progress.update(self._task, description="", total=total)
-        else:
-            before = f", {count(done)} of them played before" if done else ""
-            self._console.print(f"playing {counted(total, 'episode')}{before}")
+        episodes = self.order.episodes
+        self._total = (
+            sum(meta.num_envs for meta in group.metas) * episodes
+            if isinstance(episodes, int)
+            else len(episodes)
+        )
+        self._begun, self._before = time.monotonic(), len(self.found.attempts)
+        before = f", {count(self._before)} of them played before" if self._before else ""
+        self._console.print(f"playing {counted(self._total, 'episode')}{before}")
 
-    def note(self, episode: Episode) -> None:
-        """Count a finished episode."""
-        self.found.episodes.append(episode)
-        if self._kept is not None:
-            self._kept.add(episode)
+    def note(self, attempt: Attempt) -> None:
+        """Count an episode."""
+        self.found.attempts.append(attempt)
+        name = getattr(attempt.spec, self.order.by)
+        self._recent.pop(name, None)
+        self._recent[name] = None
 
     def draw(self) -> None:
-        """Draw the live line."""
-        if self._console.is_terminal:
-            reward = self.found.total_reward
-            figures = f"return {number(reward and reward.mean)}"
-            done = len(self.found.episodes)
-            self._progress.update(self._task, completed=done, figures=figures)
-            self._progress.refresh()
+        """Draw the live table, with the lines that had the last episodes if there are many."""
+        if not self._console.is_terminal:
+            return
+        done = len(self.found.attempts)
+        new = done - self._before
+        seconds = time.monotonic() - self._begun
+        left = f", {(self._total - done) * seconds / new:,.0f} s left" if new else ""
+        parts = _parts(self.found, self.order.by)
+        rows = max(4, self._console.height - 6)
+        recent = {name: parts[name] for name in parts if name in [*self._recent][-rows:]}
+        title = f"{count(done)} of {counted(self._total, 'episode')}{left}"
+        self._live.update(_table(title, self.order.by, recent, self.found), refresh=True)
 
 
 # -- output ------------------------------------------------------------------------------
 
 
-def _by_entry(configs: Sequence[EnvConfig], found: Evaluation) -> _ByEntry:
-    return [
-        (config, found.of_envs(f"{config.name}-{k}" for k in range(config.num_workers)))
-        for config in configs
-    ]
+def _parts(found: Evaluation, by: _By) -> dict[str, Evaluation]:
+    """Split an evaluation into the lines of the table."""
+    parts: dict[str, Evaluation] = {}
+    for attempt in sorted(found.attempts, key=lambda attempt: getattr(attempt.spec, by)):
+        parts.setdefault(getattr(attempt.spec, by), Evaluation()).attempts.append(attempt)
+    return parts
 
 
-def _print_table(title: str, by_entry: _ByEntry) -> None:
+def _table(title: str, by: _By, parts: dict[str, Evaluation], found: Evaluation) -> Table:
     table = named_columns(
-        title,
-        "entry", "envs", "episodes", "mean\nreturn", "\n95 %", "mean\nlength", "\n95 % ",
-        "success\nrate", "\n95 %  ",
+        title, by, "episodes", "success\nrate", "\n95 %  ", "mean\nreturn", "\n95 %",
+        "mean\nlength", "\n95 % ", "failed",
     )  # fmt: skip
-    for config, found in by_entry:
-        success = found.success
+    for name, own in [*parts.items()] if len(parts) < 2 else [*parts.items(), ("all", found)]:
         table.add_row(
-            config.name,
-            count(config.num_workers * config.num_envs),
-            count(len(found.episodes)),
-            *with_interval(found.total_reward, number),
-            *with_interval(found.length, number),
-            *with_interval(success, lambda share: f"{share:.1%}"),
+            name or "-",
+            count(len(own.attempts)),
+            *with_interval(own.success, lambda share: f"{share:.1%}"),
+            *with_interval(own.total_reward, number),
+            *with_interval(own.length, number),
+            count(len(own.failed)),
         )
-    print_table(out(), table, ("\n95 % ", "envs"))
+    return table
+
+
+def _report(order: _Order, files: _Files, found: Evaluation, *, interrupted: bool) -> None:
+    """Print and draw the results."""
+    parts = _parts(found, order.by)
+    notes = _notes(found)
+    if files.as_json:
+        each = [{"name": name, **_figures(own)} for name, own in parts.items()]
+        about = {**order.whose.facts, "interrupted": interrupted, "notes": notes, **_figures(found)}
+        attempts = [attempt.to_json() for attempt in found.attempts]
+        print_json({**about, "by": order.by, "parts": each, "attempts": attempts})
+    else:
+        title = order.title
+        if interrupted:
+            title = f"Interrupted, so short episodes are favoured: {title}"
+        print_table(out(), _table(title, order.by, parts, found), ("\n95 % ", "\n95 %"))
+        for note in notes:
+            out().print(note, markup=False)
+    if files.plot is not None and found.played:
+        figures = [(name, own, own.returns) for name, own in parts.items() if own.played]
+        draw_evaluation(order.whose.facts["config"], figures, files.plot)
+
+
+def _figures(found: Evaluation) -> dict[str, Any]:
+    return {
+        "episodes": len(found.attempts), "failed": len(found.failed),
+        "failures": dict(found.failures), **estimates(found),
+    }  # fmt: skip
+
+
+def _notes(found: Evaluation) -> list[str]:
+    notes: list[str] = []
+    if failures := found.failures:
+        kinds = ", ".join(f"{count(failures[kind])} {kind}" for kind in sorted(failures))
+        notes.append(f"tries that failed, by the kind of their outcome: {kinds}")
+    notes += notes_on_returns(
+        attempt.env_id for attempt in found.played if not math.isfinite(attempt.reward or 0.0)
+    )
+    failed = found.failed
+    for attempt in failed[:_NAMED]:
+        spec = attempt.spec
+        options = "" if spec.options is None else f", options {json.dumps(spec.options)}"
+        where = f"task {spec.task!r}, seed {spec.seed}{options}, on env {attempt.env_id!r}"
+        notes.append(f"failed: {where}: {attempt.outcome.kind}: {attempt.outcome.cause}")
+    if len(failed) > _NAMED:
+        notes.append(f"and {count(len(failed) - _NAMED)} more failed; --json has all")
+    return notes

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EpisodesFile",
-    "MaxAttempts",
     "QueueOptions",
+    "Retries",
     "Seeds",
     "Tasks",
     "VideoEpisodes",
@@ -47,10 +47,10 @@ Seeds: TypeAlias = Annotated[
     str | None,
     typer.Option(metavar="FIRST:END|SEED,…", help="Play each task once with each of these seeds."),
 ]
-MaxAttempts: TypeAlias = Annotated[
+Retries: TypeAlias = Annotated[
     int,
     typer.Option(
-        min=1, help="An episode of a queue has failed once it was lost with its worker this often."
+        min=0, help="How often an episode is played again that was lost, before it has failed."
     ),
 ]
 VideoFailed: TypeAlias = Annotated[
@@ -75,7 +75,6 @@ class QueueOptions:
     episodes_file: Path | None
     tasks: Sequence[str] | None
     seeds: str | None
-    max_attempts: int
     video: Path | None
     video_every: int | None
     video_failed: bool

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.timeline.records import Mark, Span, TracedResults
+    from rlightning_aio.outcomes import Outcome
 
 __all__ = ["SENDING", "HostTrack", "Timeline", "events"]
 
@@ -200,7 +201,7 @@ class _Events:
             if not mark.began:
                 yield (
                     f'{{"name":"{mark.name}","ph":"i","s":"t","pid":{pid},"tid":{tid},'
-                    f'"ts":{(mark.at - self._base) / 1e3}{_cause(mark.text)}}}'
+                    f'"ts":{(mark.at - self._base) / 1e3}{_cause(mark.text, mark.outcome)}}}'
                 )
             elif on_env:
                 one = _Slice(mark.name, mark.began, mark.at, mark.text)
@@ -247,8 +248,11 @@ def _pid(host_id: Any) -> Any:
     return host_id + _TRAINER + 1
 
 
-def _cause(text: str) -> str:
-    return f',"args":{{"cause":{json.dumps(text)}}}' if text else ""
+def _cause(text: str, outcome: Outcome | None = None) -> str:
+    args: dict[str, str] = {"cause": text} if text else {}
+    if outcome is not None:
+        args = {"kind": outcome.kind, "blame": outcome.blame, "cause": outcome.cause}
+    return f',"args":{json.dumps(args)}' if args else ""
 
 
 def _process(pid: int, name: str) -> Iterator[str]:

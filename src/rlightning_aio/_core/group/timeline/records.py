@@ -14,6 +14,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from rlightning_aio.outcomes import Outcome
+
 __all__ = ["KEPT", "Mark", "Records", "Span", "TracedResults"]
 
 KEPT: Final = 1 << 18
@@ -43,6 +45,7 @@ class Mark(NamedTuple):
         at: its time or end; began: its start, 0 for an event without a duration.
         host_id: of its host; slot: of its env, or -1.
         text: its cause.
+        outcome: of an episode that was lost.
     """
 
     name: str
@@ -51,6 +54,7 @@ class Mark(NamedTuple):
     slot: int = -1
     began: int = 0
     text: str = ""
+    outcome: Outcome | None = None
 
 
 class TracedResults(NamedTuple):

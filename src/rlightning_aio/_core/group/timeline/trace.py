@@ -13,7 +13,7 @@ import json
 import os
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.observed import Fate
     from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.outcomes import Outcome
 
 __all__ = ["Trace"]
 
@@ -138,7 +139,11 @@ class Trace(Scope):
         for name, flag in flags.items():
             for row in np.flatnonzero(flag if flag is not None else ()).tolist():
                 slot, done = part.slots.item(row), part.times.item(row, 0)
-                self._mark(name, done, self._core.requests.hosts.item(slot), slot)
+                host_id, lost = self._core.requests.hosts.item(slot), part.out_of_band.get(row)
+                outcome: Outcome | None = None
+                if isinstance(lost, dict):
+                    outcome = cast("dict[str, Any]", lost["info"]).get("outcome")
+                self._mark(name, done, host_id, slot, outcome=outcome)
 
     def _mark(self, name: str, at: int, host_id: int, slot: int = -1, **more: Any) -> None:
         self._records.marks.append(Mark(name, at, host_id, slot, **more))

@@ -1,0 +1,250 @@
+"""`AttemptQueue`: which attempts wait, which env plays what next, and what is tried again.
+
+Rule: it plays nothing and waits for nothing. `play` plays its attempts with agents, and `evaluate`
+with a policy for all envs at once. Every attempt ends once: after its last try, or by withdrawal.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.waiting import WaitingEpisodes
+from rlightning_aio.outcomes import is_bystanders
+
+if TYPE_CHECKING:
+    from rlightning_aio.attempts.file import ResultsFile
+    from rlightning_aio.attempts.records import Attempt
+    from rlightning_aio.attempts.rules import Rules
+    from rlightning_aio.attempts.spec import EpisodeSpec
+    from rlightning_aio.errors import WorkerDied
+    from rlightning_aio.outcomes import Outcome
+
+__all__ = ["AttemptQueue", "Job", "TaskInPlay"]
+
+
+@dataclass(eq=False, slots=True)
+class TaskInPlay:
+    """A task in progress.
+
+    Attributes:
+        size: number of attempts at it.
+        attempts: that have ended, by index.
+        is_settled: nothing more is wanted of it.
+    """
+
+    spec: EpisodeSpec
+    size: int = 1
+    attempts: dict[int, Attempt] = field(default_factory=dict[int, "Attempt"])
+    is_settled: bool = False
+
+    @property
+    def num_whole(self) -> int:
+        """Number of attempts that have not failed."""
+        return sum(not attempt.outcome.is_failure for attempt in self.attempts.values())
+
+
+@dataclass(eq=False, slots=True)
+class Job:
+    """An attempt that waits or plays.
+
+    Attributes:
+        sub_env: of the env that it waits for.
+        since: when it began to wait, in monotonic seconds.
+        failures: outcomes of its tries so far; counted: how many of them use up a retry.
+    """
+
+    task: TaskInPlay
+    index: int
+    sub_env: int = 0
+    since: float = field(default_factory=time.monotonic)
+    failures: list[Outcome] = field(default_factory=list["Outcome"])
+    counted: int = 0
+
+    @property
+    def spec(self) -> EpisodeSpec:
+        """The task."""
+        return self.task.spec
+
+
+class AttemptQueue:
+    """See the module.
+
+    Args:
+        group: initialised, with nothing `pending`.
+        rules: of the attempts.
+        results: a file with attempts that are not played again; others are added to it.
+
+    Attributes:
+        players: the envs.
+        free: idle envs, the one that has been idle for longest first.
+        fault: the last error of a worker that ended.
+    """
+
+    def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
+        self._rules, self._results = rules, results
+        self.players = Players(group)
+        self.free = dict.fromkeys(self.players.entry_of)
+        self.fault: WorkerDied | None = None
+        self._waiting: dict[str, WaitingEpisodes[Job]] = {}
+        # Jobs that only one env may play: of each of its sub-environments, in order.
+        self._pinned: dict[str, dict[int, deque[Job]]] = {}
+        self._before = {} if results is None else results.by_place()
+        self._repeats = Counter[Any]()
+
+    # -- what waits -------------------------------------------------------------------
+
+    def add(self, spec: EpisodeSpec, size: int = 1) -> TaskInPlay:
+        """Queue the attempts at a task that are not in the file.
+
+        Raises:
+            TypeError, ValueError: see `Players.assigned`.
+        """
+        task = TaskInPlay(self.players.assigned(spec), size)
+        missing = [job for index in range(size) if not self._is_known(job := Job(task, index))]
+        if not self.is_done(task):
+            for job in missing:
+                self._wait(job)
+        return task
+
+    def pin(self, spec: EpisodeSpec, index: int, sub_env: int) -> TaskInPlay:
+        """Queue episode `index` of a sub-environment, unless it is in the file."""
+        task = TaskInPlay(self.players.assigned(spec))
+        if not self._is_known(job := Job(task, index, sub_env)):
+            self._wait(job)
+        return task
+
+    def _is_known(self, job: Job) -> bool:
+        """Add what the file has of an attempt; True if it has ended there."""
+        place = job.spec.key, job.index, job.sub_env
+        repeat = self._repeats[place]
+        self._repeats[place] += 1
+        found = self._before.get(place, ())
+        if repeat < len(found):
+            job.task.attempts[job.index] = found[repeat]
+            return True
+        if self._results is not None and repeat == len(found):
+            for outcome in self._results.failures(*_written_as(job)):
+                self._note_failure(job, outcome)
+        return False
+
+    def _wait(self, job: Job) -> None:
+        spec = job.spec
+        if not spec.env_id:
+            self._waiting.setdefault(spec.entry, WaitingEpisodes[Job]()).add(job)
+            return
+        queue = self._pinned.setdefault(spec.env_id, {}).setdefault(job.sub_env, deque())
+        if queue and queue[0].index > job.index:  # It is tried again.
+            queue.appendleft(job)
+        else:
+            queue.append(job)
+
+    def __len__(self) -> int:
+        """The number of attempts that wait."""
+        pinned = sum(len(queue) for queues in self._pinned.values() for queue in queues.values())
+        return pinned + sum(map(len, self._waiting.values()))
+
+    def withdraw(self, task: TaskInPlay) -> list[Job]:
+        """Remove the attempts at a task that wait, and return them."""
+        removed: list[Job] = []
+        if (waiting := self._waiting.get(task.spec.entry)) is not None:
+            removed += waiting.remove(lambda job: job.task is task)
+        for queue in self._pinned.get(task.spec.env_id, {}).values():
+            removed += [job for job in queue if job.task is task]
+            kept = [job for job in queue if job.task is not task]
+            queue.clear()
+            queue.extend(kept)
+        return removed
+
+    # -- what is played next ----------------------------------------------------------
+
+    def next_env(self) -> str | None:
+        """The next idle env that an attempt waits for; None if there is none."""
+        return next(filter(self._has_job, self.free), None)
+
+    def _has_job(self, env_id: str) -> bool:
+        pinned = self._pinned.get(env_id)
+        return bool(pinned and any(pinned.values())) or bool(
+            self._waiting.get(self.players.entry_of[env_id])
+        )
+
+    def take(self, env_id: str) -> list[Job]:
+        """Remove what an idle env plays next, which it begins now: one of each sub-environment.
+
+        Episodes of sub-environments begin together. After a loss they may have played different
+        numbers, so those begin that have played the fewest.
+        """
+        del self.free[env_id]
+        pinned = [queue for queue in self._pinned.get(env_id, {}).values() if queue]
+        if pinned:
+            first = min(queue[0].index for queue in pinned)
+            return [queue.popleft() for queue in pinned if queue[0].index == first]
+        return [self.players.take(env_id, self._waiting[self.players.entry_of[env_id]])]
+
+    def take_next(self, env_id: str, sub_env: int) -> Job | None:
+        """Remove what a sub-environment plays next that resets itself; None if nothing."""
+        queue = self._pinned.get(env_id, {}).get(sub_env)
+        return queue.popleft() if queue else None
+
+    def begin(self, env_id: str, job: Job) -> tuple[int | None, dict[str, Any] | None]:
+        """Seed and options of the reset that begins an attempt on an env."""
+        seed = self._rules.seed(job.spec, job.index)
+        return seed, self.players.options(env_id, job.spec)
+
+    # -- what has ended ---------------------------------------------------------------
+
+    def end(self, job: Job, attempt: Attempt) -> bool:
+        """Queue an attempt again that has failed, or note it; True if it is noted."""
+        outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
+        if job.task.is_settled:
+            return False
+        has_tries = is_bystanders(outcome) or job.counted < self._rules.retries
+        if self._rules.retried(outcome) and has_tries:
+            self._note_failure(job, outcome)
+            if self._results is not None:
+                self._results.add_failure(*_written_as(job), outcome)
+            job.since = time.monotonic()
+            self._wait(job)
+            return False
+        attempt.failures = tuple(job.failures)
+        job.task.attempts[job.index] = attempt
+        if self._results is not None:
+            self._results.add(attempt)
+        return True
+
+    def _note_failure(self, job: Job, outcome: Outcome) -> None:
+        job.failures.append(outcome)
+        job.counted += not is_bystanders(outcome)
+
+    def is_done(self, task: TaskInPlay) -> bool:
+        """A task needs no further attempts."""
+        first = self._rules.first
+        return len(task.attempts) == task.size or (first is not None and task.num_whole >= first)
+
+    # -- envs that are gone -----------------------------------------------------------
+
+    def entries(self) -> list[str]:
+        """The entries that attempts wait for."""
+        entries = [entry for entry, waiting in self._waiting.items() if waiting]
+        return [*entries, *(self.players.entry_of[env_id] for env_id in self._pinned_to())]
+
+    def _pinned_to(self) -> list[str]:
+        return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
+
+    def check_players(self) -> None:
+        """Raise the last fault if attempts wait that no env is left for.
+
+        Raises:
+            WorkerDied: its worker is not replaced.
+        """
+        if self.fault is not None:
+            gone = not self.players.gone.isdisjoint(self._pinned_to())
+            if gone or not self.players.can_play(self.entries()):
+                raise self.fault
+
+
+def _written_as(job: Job) -> tuple[EpisodeSpec, int, int]:
+    return job.spec, job.index, job.sub_env

@@ -1,0 +1,317 @@
+"""`PolicyPlay`: plays the attempts of a queue with a policy for all envs at once.
+
+Rule: results are stepped first come, first served. What an env loses with its worker, or by an
+exception, goes back to the queue. Sub-environments begin together; those that reset themselves go
+on with their next episodes until all are played.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio.attempts.records import Attempt
+from rlightning_aio.attempts.success import success_of
+from rlightning_aio.batch.contents import all_agents, summed_rewards
+from rlightning_aio.errors import EnvFault, WorkerDied
+from rlightning_aio.evaluation.endless import EndlessEpisodes
+from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
+from rlightning_aio.outcomes import Outcome, own_end
+from rlightning_aio.policies.answers import answers_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.attempts.queue import AttemptQueue, Job
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.collecting.procedure import Procedure
+    from rlightning_aio.evaluation.evaluation import Evaluation
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["Options", "PolicyPlay"]
+
+_log = logging.getLogger("rlightning_aio")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """The options of an evaluation; see `evaluate`."""
+
+    min_results: int | None
+    video: EpisodeVideo | None
+    on_episode: Callable[[Attempt], None] | None
+
+
+class PolicyPlay:
+    """An evaluation in progress. Arrays have an element for each sub-environment of the group.
+
+    Args:
+        group: an initialised group.
+        policy: see `evaluate`.
+        queue: of the episodes.
+        found: what comes of the episodes is added to it.
+        options: see `Options`.
+    """
+
+    def __init__(
+        self,
+        group: Any,
+        policy: Callable[[BatchedData], Any],
+        queue: AttemptQueue,
+        found: Evaluation,
+        options: Options,
+    ) -> None:
+        self._group, self._policy, self._queue = group, policy, queue
+        self._found, self._options = found, options
+        metas: list[EnvMeta] = group.metas
+        self._metas = {meta.env_id: meta for meta in metas}
+        ends = np.cumsum([meta.num_envs for meta in metas]).tolist()
+        self._places = {
+            meta.env_id: range(end - meta.num_envs, end)
+            for meta, end in zip(metas, ends, strict=True)
+        }
+        # Results of different shapes don't stack.
+        self._separate = len({(meta.num_envs, meta.agents) for meta in metas}) > 1
+        self._jobs: dict[int, Job] = {}  # By place.
+        self._counts = np.zeros(ends[-1], np.bool_)
+        """An episode of the queue is going on; False before the result of its reset."""
+        self._reward = np.zeros(ends[-1])
+        self._length = np.zeros(ends[-1], np.int64)
+        self._pending: set[str] = set()
+        """Envs with a request in flight."""
+        self._begun: set[str] = set()
+        """Those of them that a reset begins."""
+        self._ended: deque[tuple[Job, Attempt]] = deque()
+        """Episodes that the last results ended, to be noted."""
+        self._endless = EndlessEpisodes()
+        self._has_warned = False
+        self._filming = None if options.video is None else Filming(group, options.video)
+
+    # -- the loop ---------------------------------------------------------------------
+
+    def to_the_end(self) -> Procedure[Evaluation]:
+        """Play all episodes."""
+        while True:
+            yield from self._begin_episodes()
+            self._queue.check_players()
+            if not self._pending:
+                return self._found
+            try:
+                batch: BatchedData
+                batch, _ = yield lambda: self._group.collect_async(
+                    min_results=self._options.min_results
+                )
+            except EnvFault as fault:
+                self._note_fault(fault)
+            else:
+                yield from self._continue(batch)
+
+    def _begin_episodes(self) -> Procedure[None]:
+        """Note ended episodes, and begin others in idle envs."""
+        while True:
+            while self._ended:
+                yield from self._keep(*self._ended.popleft())
+            env_id = self._queue.next_env()
+            if env_id is None:
+                return
+            jobs = self._queue.take(env_id)
+            first = self._places[env_id].start
+            self._jobs.update((first + job.sub_env, job) for job in jobs)
+            try:
+                yield from self._begin(env_id, jobs[0])
+            except WorkerDied as fault:
+                self._note_fault(fault)
+
+    def _begin(self, env_id: str, job: Job) -> Procedure[None]:
+        if self._filming is not None:
+            yield from self._filming.begin(env_id, job.spec)
+        seed, options = self._queue.begin(env_id, job)
+        seeds = None if seed is None else {env_id: seed - job.sub_env}
+        self._group.reset_async(seed=seeds, options=options, env_ids=[env_id])
+        self._pending.add(env_id)
+        self._begun.add(env_id)
+
+    def _keep(self, job: Job, attempt: Attempt) -> Procedure[None]:
+        """Note what came of an episode."""
+        if self._filming is not None and not attempt.outcome.is_failure:
+            try:
+                yield from self._filming.end(attempt.env_id, attempt)
+            except WorkerDied as fault:
+                self._filming.drop(attempt.env_id)
+                self._note_fault(fault)
+        if not self._queue.end(job, attempt):
+            return
+        if attempt.outcome.is_failure and not self._has_warned:
+            self._has_warned = True
+            _log.warning(
+                "an episode has failed: %s: %s; the figures leave such episodes out, and `failed` "
+                "of the evaluation has them",
+                attempt.spec,
+                attempt.outcome.cause,
+            )
+        self.note(attempt)
+
+    def note(self, attempt: Attempt) -> None:
+        """Add an episode that has ended, now or in the file."""
+        self._found.attempts.append(attempt)
+        if self._options.on_episode is not None:
+            self._options.on_episode(attempt)
+
+    def _continue(self, batch: BatchedData) -> Procedure[None]:
+        """Add results to their episodes, and begin others or step their envs."""
+        env_ids = batch.env_ids()
+        self._pending.difference_update(env_ids)
+        for part in batch.by_entry().values() if self._separate else (batch,):
+            self._record(part)
+        self._begun.difference_update(env_ids)
+        yield from self._begin_episodes()
+        rows = [
+            row
+            for row, env_id in enumerate(env_ids)
+            if env_id not in self._pending and self._plays(env_id)
+        ]
+        if rows:
+            stepped = batch if len(rows) == len(batch) else batch.take(rows)
+            answer = yield lambda: self._policy(stepped)
+            space = self._metas[env_ids[rows[0]]].action_space
+            for part in answers_of(stepped, answer, lambda: space):
+                self._step(part)
+
+    def _plays(self, env_id: str) -> bool:
+        return any(place in self._jobs for place in self._places[env_id])
+
+    def _step(self, batch: BatchedData) -> None:
+        """Send a step to each env whose worker was not given up."""
+        gone = self._queue.players.gone
+        while len(batch):
+            try:
+                self._group.step_async(batch)
+            except WorkerDied as fault:
+                self._note_fault(fault)
+                env_ids = batch.env_ids()
+                batch = batch.take([k for k, id_ in enumerate(env_ids) if id_ not in gone])
+            else:
+                self._pending.update(batch.env_ids())
+                return
+
+    # -- results ----------------------------------------------------------------------
+
+    def _record(self, batch: BatchedData) -> None:
+        """Add results to their episodes."""
+        env_ids, shape = batch.env_ids(), batch.is_reset.shape
+        if batch.restarted.any():
+            self._note_losses(batch)
+        places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
+        stepped = self._counts[places] & ~begins
+        rewards = np.where(stepped, summed_rewards(batch.reward).reshape(-1), 0.0)
+        with np.errstate(over="ignore", invalid="ignore"):  # The return shows it.
+            self._reward[places] += rewards
+        self._length[places] += stepped
+        self._endless.look(self._length[places].reshape(shape), env_ids)
+        done = all_agents(batch.done)
+        ended = stepped & done.reshape(-1)
+        if ended.any():
+            self._note_ends(batch, ended.reshape(len(batch), -1))
+        begins |= self._begun_again(env_ids, done).reshape(-1)
+        begins &= ~batch.restarted.reshape(-1)  # They are reset once more.
+        if begins.any():
+            self._note_begins(env_ids, begins.reshape(len(batch), -1))
+
+    def _begun_again(self, env_ids: list[str], done: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of sub-environments that have begun the next episode in the step that ended one."""
+        same_step = np.array([self._metas[id_].autoreset == "same_step" for id_ in env_ids])
+        return (done.T & same_step).T
+
+    def _note_begins(self, env_ids: list[str], begins: NDArray[np.bool_]) -> None:
+        """Begin to count the episodes of the queue; others may begin in sub-environments."""
+        for row in np.flatnonzero(begins.any(axis=1)).tolist():
+            env_id = env_ids[row]
+            for sub_env in np.flatnonzero(begins[row]).tolist():
+                place = self._places[env_id][sub_env]
+                if place not in self._jobs and env_id not in self._begun:
+                    self._take_next(env_id, sub_env)
+                self._counts[place] = place in self._jobs
+                self._reward[place] = self._length[place] = 0
+
+    def _take_next(self, env_id: str, sub_env: int) -> None:
+        """Give a sub-environment that resets itself its next episode."""
+        if self._metas[env_id].autoreset != "disabled":
+            job = self._queue.take_next(env_id, sub_env)
+            if job is not None:
+                self._jobs[self._places[env_id][sub_env]] = job
+
+    def _note_ends(self, batch: BatchedData, ended: NDArray[np.bool_]) -> None:
+        rows = np.flatnonzero(ended.any(axis=1)).tolist()
+        env_ids = batch.env_ids()
+        terminated = all_agents(batch.terminated).reshape(len(batch), -1)
+        for row, info in zip(rows, batch.take(rows).info(), strict=True):
+            env_id = env_ids[row]
+            for sub_env in np.flatnonzero(ended[row]).tolist():
+                outcome = own_end(env_id, info, terminated=bool(terminated[row, sub_env]))
+                self._end(env_id, sub_env, outcome, success_of(info, sub_env))
+                self._take_next(env_id, sub_env)
+            self._release(env_id)
+
+    def _end(
+        self, env_id: str, sub_env: int, outcome: Outcome, success: bool | None = None
+    ) -> None:
+        """Note that the episode of a sub-environment has ended, if it was one of the queue."""
+        place = self._places[env_id][sub_env]
+        job = self._jobs.pop(place, None)
+        if job is None:
+            return
+        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
+        if not outcome.is_failure:
+            attempt.reward, attempt.success = float(self._reward[place]), success
+            attempt.length = int(self._length[place])
+        self._counts[place] = False
+        self._ended.append((job, attempt))
+
+    def _release(self, env_id: str) -> None:
+        """Let an env begin other episodes if it plays none."""
+        if not self._plays(env_id) and env_id not in self._queue.players.gone:
+            self._queue.free[env_id] = None
+
+    # -- faults -----------------------------------------------------------------------
+
+    def _note_losses(self, batch: BatchedData) -> None:
+        """Note what envs have lost whose workers were replaced."""
+        rows = np.flatnonzero(batch.restarted.reshape(len(batch), -1).any(axis=1)).tolist()
+        env_ids = batch.env_ids()
+        for row, info in zip(rows, batch.take(rows).info(), strict=True):
+            self._lose(env_ids[row], info["outcome"])
+
+    def _lose(self, env_id: str, outcome: Outcome) -> None:
+        """Note that an env has lost its episodes."""
+        if self._filming is not None:
+            self._filming.drop(env_id)
+        for sub_env in range(len(self._places[env_id])):
+            self._end(env_id, sub_env, outcome)
+        self._release(env_id)
+
+    def _note_fault(self, fault: EnvFault) -> None:
+        """Note the episodes that an error ended; envs that are not replaced leave."""
+        struck, blamed = {fault.env_id}, {fault.env_id}
+        if isinstance(fault, WorkerDied):
+            self._queue.fault = fault
+            blamed.update(fault.suspects)
+            # The env at fault may be another one, whose own request a replacement answers.
+            struck = {*fault.env_ids}
+            self._queue.players.refresh()
+        self._pending -= struck
+        gone = self._queue.players.gone
+        # A ready result of an env that is gone can still be collected.
+        for env_id in (struck | gone) - self._pending:
+            outcome = replace(fault.outcome, env_id=env_id)
+            if env_id not in blamed:
+                outcome = replace(outcome, kind="env_died", blame="infrastructure")
+            self._begun.discard(env_id)
+            self._lose(env_id, outcome)
+        for env_id in gone:
+            self._queue.free.pop(env_id, None)
