@@ -66,7 +66,7 @@ async def rollouts(
     from tinker_cookbook.rl.rollouts import do_group_rollout
 
     kind = getattr(rollout_strategy, strategy)
-    entry: dict[str, Any] = {"envs_per_process": 1, "step_timeout": 1, "num_workers": num_workers}
+    entry: dict[str, Any] = {"envs_per_process": 1, "step_timeout": 10, "num_workers": num_workers}
     async with rl.build_env_group(Digits, name="digits", **entry) as group:
         groups = EnvGroups(group, encode, decode)
         builder = groups.builder(seed=5, size=4)
@@ -109,6 +109,6 @@ async def test_without_retries_the_error_has_the_outcome() -> None:
 
 async def test_a_time_limit_of_the_cookbook_reaches_the_env() -> None:
     """A step that hangs is cancelled with its rollout."""
-    found, _ = await rollouts("7", "RetryOnFailure", max_retries=1, per_rollout_timeout=0.5)
+    found, _ = await rollouts("7", "RetryOnFailure", max_retries=1, per_rollout_timeout=5)
     assert found.get_total_rewards() == [3.0] * 4
     assert [error.error_type for error in found.rollout_errors] == ["TimeoutError"]

@@ -30,7 +30,7 @@ def test_two_steps_with_a_hung_tool_and_a_killed_env(tmp_path: Path) -> None:
         [("wait", {"seconds": 3600}), ("add", {"number": 2})],
         [("die", {})],
     ]
-    with Environments(Adder, num_envs=4, step_timeout=1) as environments:
+    with Environments(Adder, num_envs=4, step_timeout=10) as environments:
         trainer = trainer_of(rows, script, tmp_path, 2, environment_factory=environments)
         environments.join(trainer)
         seen: list[Any] = []
