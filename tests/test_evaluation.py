@@ -323,6 +323,32 @@ def test_an_episode_may_be_for_one_env() -> None:
     assert sorted(one.spec.seed or 0 for one in found.of_envs(["env-1"]).attempts)[:3] == [0, 1, 2]
 
 
+def test_an_episode_for_one_env_that_resets_itself_has_its_own_seed() -> None:
+    """It begins with a reset, not where the env goes on by itself."""
+    make = scripted(lambda seed: seed % 2 == 0)
+    own = lambda: SyncVectorEnv([make], autoreset_mode=AutoresetMode.NEXT_STEP)  # noqa: E731
+    queue = [EpisodeSpec("", seed, env_id="env-0") for seed in range(3)]
+    with group_of(own) as group:
+        found = evaluate(group, nothing, queue)
+    lengths = [(one.spec.seed, one.length) for one in found.played]
+    assert lengths == [(0, SHORT), (1, LONG), (2, SHORT)]
+
+
+def test_an_env_that_was_given_up_before_plays_nothing() -> None:
+    """Others play the queue; what only that env may play is an error."""
+    env = scripted(lambda _: True)
+    group = group_of(env, env, placement="process", envs_per_process=1, on_worker_death="raise")
+    with group, group.auto_reset(100):
+        batch, _ = group.reset(seed=0)
+        with pytest.raises(rl.WorkerDied):
+            group.step(batch.respond(action=[1, 0]))
+        found = evaluate(group, nothing, [EpisodeSpec("", seed) for seed in range(4)], retries=0)
+        assert {one.env_id for one in found.played} == {"env-1"}
+        assert not found.failed
+        with pytest.raises(rl.RLightningError, match="no env of this group is left"):
+            evaluate(group, nothing, [EpisodeSpec("", 0, env_id="env-0")])
+
+
 def test_it_is_printed_as_a_table() -> None:
     """With a line for each task, and one for all."""
     found = evaluated(group_of(*HALF_SUCCEED), [EpisodeSpec("", seed) for seed in range(8)])

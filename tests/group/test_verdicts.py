@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
-from rlightning_aio.evaluation.outcomes import success_of
+from rlightning_aio.attempts.success import success_of
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:

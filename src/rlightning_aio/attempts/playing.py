@@ -208,6 +208,8 @@ class _Engine:
             queue.fault = one.error
         if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
             queue.free[one.env_id] = None
+        for env_id in queue.players.gone:
+            queue.free.pop(env_id, None)
         if queue.end(job, attempt) and queue.is_done(job.task):
             self._settle(job.task)
 
@@ -238,11 +240,7 @@ class _Engine:
         if not (queue.free or self._playing or self._has_clients or self._source.is_at_end):
             raise queue.fault or RLightningError("no env of this group is left that could play")
         queue.check_players()
-        waiting = queue.entries()
-        entry_of = queue.players.entry_of
-        there = {entry_of[id_] for id_ in queue.free}
-        there |= {job.spec.entry for job, _ in self._playing.values()} if waiting else set[str]()
-        return [entry for entry in waiting if entry not in there]
+        return queue.lacking({one.env_id for _, one in self._playing.values()})
 
     def _look(self) -> None:
         """Look for clients that have come, or come back, a few times in a second."""

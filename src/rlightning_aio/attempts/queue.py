@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.waiting import WaitingEpisodes
+from rlightning_aio.errors import RLightningError
 from rlightning_aio.outcomes import is_bystanders
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class AttemptQueue:
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
         self._rules, self._results = rules, results
         self.players = Players(group)
-        self.free = dict.fromkeys(self.players.entry_of)
+        self.free = {id_: None for id_ in self.players.entry_of if id_ not in self.players.gone}
         self.fault: WorkerDied | None = None
         self._waiting: dict[str, WaitingEpisodes[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
@@ -185,9 +186,14 @@ class AttemptQueue:
         return [self.players.take(env_id, self._waiting[self.players.entry_of[env_id]])]
 
     def take_next(self, env_id: str, sub_env: int) -> Job | None:
-        """Remove what a sub-environment plays next that resets itself; None if nothing."""
+        """Remove what a sub-environment plays next that resets itself.
+
+        None if nothing waits for it, or if that needs a reset with a seed or options.
+        """
         queue = self._pinned.get(env_id, {}).get(sub_env)
-        return queue.popleft() if queue else None
+        if not queue or queue[0].spec.seed is not None or queue[0].spec.options is not None:
+            return None
+        return queue.popleft()
 
     def begin(self, env_id: str, job: Job) -> tuple[int | None, dict[str, Any] | None]:
         """Seed and options of the reset that begins an attempt on an env."""
@@ -231,6 +237,14 @@ class AttemptQueue:
         entries = [entry for entry, waiting in self._waiting.items() if waiting]
         return [*entries, *(self.players.entry_of[env_id] for env_id in self._pinned_to())]
 
+    def lacking(self, busy: set[str]) -> list[str]:
+        """The entries of attempts that wait for envs of which none is free or `busy`."""
+        entry_of, there = self.players.entry_of, {*self.free, *busy}
+        entries = {entry_of[env_id] for env_id in there}
+        found = [entry for entry, waiting in self._waiting.items() if waiting]
+        found = [entry for entry in found if entry not in entries]
+        return [*found, *(entry_of[id_] for id_ in self._pinned_to() if id_ not in there)]
+
     def _pinned_to(self) -> list[str]:
         return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
 
@@ -239,11 +253,11 @@ class AttemptQueue:
 
         Raises:
             WorkerDied: its worker is not replaced.
+            RLightningError: that was known before.
         """
-        if self.fault is not None:
-            gone = not self.players.gone.isdisjoint(self._pinned_to())
-            if gone or not self.players.can_play(self.entries()):
-                raise self.fault
+        gone = not self.players.gone.isdisjoint(self._pinned_to())
+        if gone or not self.players.can_play(self.entries()):
+            raise self.fault or RLightningError("no env of this group is left that could play")
 
 
 def _written_as(job: Job) -> tuple[EpisodeSpec, int, int]:

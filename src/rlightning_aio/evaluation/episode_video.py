@@ -36,7 +36,7 @@ class EpisodeVideo:
 
     Attributes:
         folder: for ``<entry>-<task>-seed-<seed>.mp4``; created if missing. Options of the episode
-            add a number to the name.
+            add a number to the name, and an episode for one env adds that and its own number.
         wants: returns True for an episode to film; None films all.
         failed_only: keep the films of episodes whose success is False, and delete the others.
     """
@@ -84,7 +84,7 @@ class Filming:
             if not self.video.failed_only or attempt.success is False:
                 # A step limit of the group ends an episode, but not its film.
                 for film in folder.glob("*-episode-0*.mp4"):
-                    finish_file(film, Path(self.video.folder, _name(attempt.spec)))
+                    finish_file(film, Path(self.video.folder, _name(attempt)))
             shutil.rmtree(folder, ignore_errors=True)
 
     def drop(self, env_id: str) -> None:
@@ -97,7 +97,10 @@ class Filming:
         return Path(self.video.folder, f"{file_name(env_id)}.partial").absolute()
 
 
-def _name(spec: EpisodeSpec) -> str:
+def _name(attempt: Attempt) -> str:
+    spec = attempt.spec
     options = written(spec.options)
     number = f"-{zlib.crc32(options.encode()):08x}" if options else ""
+    if spec.env_id:
+        number += f"-{spec.env_id}-episode-{attempt.index}"
     return re.sub(r"[^\w.-]+", "_", f"{spec.entry}-{spec.task}-seed-{spec.seed}{number}") + ".mp4"

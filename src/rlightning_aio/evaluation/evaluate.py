@@ -86,9 +86,11 @@ def evaluate(
             seed ``seed + n * N + k``; of sub-environments that reset themselves, only the first.
         min_results: results to wait for; None is half of the envs.
         retries: how often an episode is played again that was lost with its worker or by an
-            exception: with its seed, and by any env that may play it. It isn't counted if another
-            env of the worker is at fault. After that it has failed, and the others are played.
-        results: the file to save episodes in; those that it has are not played again.
+            exception, unless policy or caller alone are to blame: with its seed, and by any env
+            that may play it. It isn't counted if another env of the worker is at fault. After that
+            it has failed, and the others are played.
+        results: the file to save episodes in; those that it has are not played again. One file for
+            each `seed`, since episodes without a seed are only known by their number.
         video: the episodes to film.
         on_episode: called with each episode: first with those in the file, then as others end.
 

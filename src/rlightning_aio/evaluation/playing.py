@@ -139,7 +139,9 @@ class PolicyPlay:
 
     def _keep(self, job: Job, attempt: Attempt) -> Procedure[None]:
         """Note what came of an episode."""
-        if self._filming is not None and not attempt.outcome.is_failure:
+        if self._filming is not None and attempt.outcome.is_failure:
+            self._filming.drop(attempt.env_id)
+        elif self._filming is not None:
             try:
                 yield from self._filming.end(attempt.env_id, attempt)
             except WorkerDied as fault:
@@ -241,7 +243,7 @@ class PolicyPlay:
 
     def _take_next(self, env_id: str, sub_env: int) -> None:
         """Give a sub-environment that resets itself its next episode."""
-        if self._metas[env_id].autoreset != "disabled":
+        if self._filming is None and self._metas[env_id].autoreset != "disabled":
             job = self._queue.take_next(env_id, sub_env)
             if job is not None:
                 self._jobs[self._places[env_id][sub_env]] = job

@@ -245,6 +245,8 @@ def _resumed(order: _Order, resume: Path | None, stack: contextlib.ExitStack) ->
     if resume is None:
         return None
     about = _subject(order.configs, order.whose.named)
+    if isinstance(order.episodes, int):
+        about["seed"] = order.whose.facts["seed"]
     return stack.enter_context(ResultsFile(resume, about, label="--resume"))
 
 

@@ -142,7 +142,7 @@ class Trace(Scope):
                 host_id, lost = self._core.requests.hosts.item(slot), part.out_of_band.get(row)
                 outcome: Outcome | None = None
                 if isinstance(lost, dict):
-                    outcome = cast("dict[str, Any]", lost["info"]).get("outcome")
+                    outcome = cast("dict[str, Any]", lost).get("info", {}).get("outcome")
                 self._mark(name, done, host_id, slot, outcome=outcome)
 
     def _mark(self, name: str, at: int, host_id: int, slot: int = -1, **more: Any) -> None:
