@@ -6,10 +6,16 @@ import argparse
 import sys
 import time
 from collections import Counter
+from typing import Final
 
 from simulator.coverage import FAULTS, report
 from simulator.program import draw
 from simulator.runs import WORLDLY, prepare, run, run_many, run_twice, shown, shrunk
+
+KNOWN: Final = {
+    4355: "after restores that timed out, an env shows a state with the step count of another",
+}
+"""Seeds that fail, and why: open defects. One that passes has to be removed."""
 
 
 def main() -> int:
@@ -32,11 +38,18 @@ def main() -> int:
         print(shown(found := again(program)))
         return bool(found.error)
     began, counts, hours, failed = time.perf_counter(), Counter[str](), 0.0, []
+    plain = not (arguments.real or without)
     seeds = range(arguments.first, arguments.first + arguments.seeds)
     for found in run_many(seeds, without, real=arguments.real, once=arguments.once):
         counts += found.counts
         hours += found.hours
-        if found.error:
+        known = KNOWN.get(found.program.seed) if plain else None
+        if known is not None:
+            print(f"seed {found.program.seed}, an open defect: {known}", flush=True)
+            if not found.error:
+                print("it passes: remove it from KNOWN")
+                return 1
+        elif found.error:
             failed.append(found)
             print(f"seed {found.program.seed}: {found.kind}", flush=True)
             if arguments.stop:

@@ -707,6 +707,10 @@ class Model:
             for state in after:  # It may have been done with it.
                 state.play(request)
             env.loose += after
+            if env.entry.on_error == "restart" and self._raising(env, request):
+                # It may have raised, and was interrupted in the reset after it was rebuilt.
+                env.loose += [env.fresh(), env.fresh()]
+                env.loose[-1].play(Request("reset"))
             env.dirty = True
             return
         if request.resets and env.since_save:
