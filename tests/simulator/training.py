@@ -21,6 +21,7 @@ from rlightning_aio.errors import (
     EnvFault,
     EnvRaised,
     NothingPending,
+    RLightningError,
     WorkerDied,
 )
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
@@ -326,6 +327,12 @@ class Evaluations(InContext):
         except WorkerDied as fault:
             self.count(fault)
             self.lose(fault)
+        except RLightningError as error:  # An evaluation before has heard of it.
+            self.count(error)
+            given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
+            require(given_up, "no env is left", repr(error))
+            for env_id in given_up:
+                self.by_id[env_id].gone = True
 
     async def drain(self) -> None:
         """Take what an evaluation has left that did not end."""
