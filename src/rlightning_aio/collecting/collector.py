@@ -183,7 +183,7 @@ class Collector(Generic[G, R]):
         self._started = self._start_cut_off = self._start_raised = False
         self._start_fault: EnvFault | None = None
         self._newest: Newest = newest_of(self._group)
-        self._newest.keeps = True
+        self._newest.begin_keeping()
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
         # Results in order of progress: received, not yet stored, not yet answered.

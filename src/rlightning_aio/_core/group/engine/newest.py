@@ -72,6 +72,10 @@ class Newest:
         self._kept = {}
         return [batch.take(own) for batch, own in rows.values()]
 
+    def begin_keeping(self) -> None:
+        """Keep what resets and restores return from now on, and nothing of before."""
+        self.keeps, self._kept = True, {}
+
     def take_all_returned(self) -> BatchedData | None:
         """Return the newest results of all envs, if one call has returned them to the program."""
         if not self._kept:
