@@ -130,14 +130,15 @@ def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
 
 
 class Lives(gym.Env[Any, Any]):
-    """Its observation is its number among all that were made, and its steps; action 1 raises.
+    """Its observation is its number among all that were made, and its steps; action 1 raises,
+    and so does action 2, as Ctrl-C does.
 
     Attributes:
         made: how many were made in this process; closed: of them, the numbers of those closed.
     """
 
     observation_space = gym.spaces.Box(0, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(3)
     made: ClassVar[int] = 0
     closed: ClassVar[list[int]] = []
 
@@ -151,7 +152,7 @@ class Lives(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> Any:
         if action:
-            raise KeyError("a bug")
+            raise KeyError("a bug") if action == 1 else KeyboardInterrupt
         self.steps += 1
         return self._observed(), 1.0, self.steps == 4, False, {}
 
@@ -224,6 +225,21 @@ def test_the_env_is_closed_and_rebuilt_wherever_it_lives(
         assert batch.observation[-1].tolist() == [first[-1] + fault, 1]
     made, closed = group.call("e-0", "lives")
     assert (made, closed) == (len(batch) + 2, [first[-1], first[-1] + 1])
+
+
+@pytest.mark.parametrize("task", [Lives, AwaitedLives])
+@on_one_driver
+def test_an_env_is_not_rebuilt_after_ctrl_c(build: Start, task: type) -> None:
+    """That is no error of the env, so it goes on with the episode."""
+    Lives.made = 0
+    group = build({"name": "e", "task": task, "placement": "process", "on_env_error": "restart"})
+    group.init()
+    batch, _ = group.reset(seed=1)
+    with pytest.raises(EnvRaised, match="KeyboardInterrupt"):
+        group.step(batch.respond(action=np.array([2])))
+    assert group.call("e-0", "lives") == (1, [])
+    batch, _ = group.step(batch.respond(action=np.array([0])))
+    assert batch.observation.tolist() == [[1, 1]]
 
 
 @on_one_driver

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from rlightning_aio.outcomes import BLAMES
+from rlightning_aio.protocol.entries import answers_with_value
 
 __all__ = ["ErrorText"]
 
@@ -28,6 +29,13 @@ class ErrorText:
     def summary(self) -> str:
         """The last line of the traceback: the type, and the text if there is one."""
         return f"{self.type_name}: {self.text}" if self.text else self.type_name
+
+    def ends_env(self, op: int) -> bool:
+        """Return True if an env that raised this in an operation may be unusable.
+
+        A method call leaves it as usable as before, and Ctrl-C is no error of the env.
+        """
+        return not (answers_with_value(op) or self.type_name == "KeyboardInterrupt")
 
     @classmethod
     def of(cls, error: BaseException) -> ErrorText:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rlightning_aio.protocol.entries import Operation, answers_with_value
+from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,9 +41,8 @@ class EnvErrors:
 
     def ends_env(self, slot: int, error: ErrorText) -> bool:
         """Return True if an env that has raised this is rebuilt before its next request."""
-        is_call = answers_with_value(self._group.requests.numbering.op(slot))
-        is_interrupt = error.type_name == "KeyboardInterrupt"
-        return not (self._record(slot).error_policy.raises or is_call or is_interrupt)
+        op = self._group.requests.numbering.op(slot)
+        return not self._record(slot).error_policy.raises and error.ends_env(op)
 
     def restarts(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
         """Count an exception that has ended an env; True if an episode begins at once for it.

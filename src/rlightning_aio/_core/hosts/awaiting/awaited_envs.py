@@ -37,7 +37,7 @@ from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvHung, WorkerDied
 from rlightning_aio.outcomes import Loss, Outcome
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
@@ -296,9 +296,11 @@ class AwaitedEnvs:
         record = self._records[env.index]
         if error is None and op_of(entry) == Operation.STEP:
             record.losses = 0
-        if self._renews and error is not None and not answers_with_value(op_of(entry)):
-            cause = f"raised {ErrorText.of(error).summary}"
-            self._put_away(record, env, Loss(cause, "env_raised", "either", record.name))
+        if self._renews and error is not None:
+            text = ErrorText.of(error)
+            if text.ends_env(op_of(entry)):
+                why = Loss(f"raised {text.summary}", "env_raised", "either", record.name)
+                self._put_away(record, env, why)
         self._finish(record, completion_of(self._host_id, env.runner, entry, outcome, error))
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self._inline and isinstance(error, KeyboardInterrupt):

@@ -143,7 +143,7 @@ class InlineHost:
         try:
             return self._watcher.interruptible(runner.step)
         except BaseException as error:
-            runner.note_error(_STEP, error)
+            runner.note_error(_STEP, ErrorText.of(error))
             raise
 
     def close(self) -> None:

@@ -65,8 +65,9 @@ def completion_of(
         error: what the env has raised instead.
     """
     if error is not None:
-        runner.note_error(op_of(entry), error)
-        return Raised(host_id, entry, ErrorText.of(error))
+        text = ErrorText.of(error)
+        runner.note_error(op_of(entry), text)
+        return Raised(host_id, entry, text)
     if answers_with_value(op_of(entry)):
         return Value(host_id, entry, outcome)
     return None if outcome is None else Result(host_id, entry, outcome)

@@ -43,7 +43,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
-from rlightning_aio.protocol.entries import Operation, answers_with_value
+from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
@@ -271,10 +271,9 @@ class EnvRunner:
         self._on_stepped = stepped
         return self.fast_path.on_stepped(stepped)
 
-    def note_error(self, op: int, error: BaseException) -> None:
-        """Record that a request has raised; Ctrl-C is no error of the env."""
-        is_its_own = not (answers_with_value(op) or isinstance(error, KeyboardInterrupt))
-        self._is_spent |= is_its_own and self._rebuild is not None
+    def note_error(self, op: int, error: ErrorText) -> None:
+        """Record what a request has raised."""
+        self._is_spent |= self._rebuild is not None and error.ends_env(op)
 
     def _renew(self) -> None:
         """Close the env, which has raised, and make another in its place.
