@@ -107,17 +107,21 @@ def both_do(ours: Any, theirs: Any, mode: AutoresetMode, actions: Any) -> None:
             assert_alike(found, expected)
 
 
+_DIE, _TERMINATE, _TRUNCATE, _STEP = 0, 2, 3, 4
+SINGLE_AND_TOGETHER = np.array(
+    [
+        [_STEP, _STEP, _STEP], [_DIE, _STEP, _STEP], [_DIE, _STEP, _TERMINATE],
+        [_DIE, _STEP, _DIE], [_STEP, _DIE, _STEP], [_STEP, _STEP, _STEP], [_DIE, _DIE, _DIE],
+        [_STEP, _DIE, _STEP], [_TERMINATE, _STEP, _TRUNCATE], [_DIE, _TRUNCATE, _STEP],
+        [_STEP, _STEP, _DIE],
+    ]
+)  # fmt: skip
+"""Actions of three envs: single losses, several in a row, and losses of all."""
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_a_death_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) -> None:
     """Also to Gymnasium's wrappers; single deaths, several in a row, and with ignored actions."""
-    die, terminate, truncate, step = 0, 2, 3, 4
-    actions = np.array(
-        [
-            [step, step, step], [die, step, step], [die, step, terminate], [die, step, die],
-            [step, die, step], [step, step, step], [die, die, die], [step, die, step],
-            [terminate, step, truncate], [die, truncate, step], [step, step, die],
-        ]
-    )  # fmt: skip
 
     def wrap(envs: Any) -> Any:
         if mode == AutoresetMode.NEXT_STEP:
@@ -129,7 +133,7 @@ def test_a_death_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) ->
         return wrappers.NormalizeReward(wrappers.RecordEpisodeStatistics(envs))
 
     ours, theirs = wrap(mortals(mode, dies=True)), wrap(mortals(mode, dies=False))
-    both_do(ours, theirs, mode, actions)
+    both_do(ours, theirs, mode, SINGLE_AND_TOGETHER)
     ours.close()
 
 
@@ -139,16 +143,8 @@ def test_an_exception_looks_like_an_episode_that_is_cut_short(
     mode: AutoresetMode, place: dict[str, Any]
 ) -> None:
     """With ``on_env_error: restart``; others of the same process go on."""
-    die, terminate, truncate, step = 0, 2, 3, 4
-    actions = np.array(
-        [
-            [step, step, step], [die, step, step], [die, step, terminate], [die, step, die],
-            [step, die, step], [step, step, step], [die, die, die], [step, die, step],
-            [terminate, step, truncate], [die, truncate, step], [step, step, die],
-        ]
-    )  # fmt: skip
     ours, theirs = raising(mode, place), mortals(mode, dies=False)
-    both_do(ours, theirs, mode, actions)
+    both_do(ours, theirs, mode, SINGLE_AND_TOGETHER)
     ours.close()
 
 
