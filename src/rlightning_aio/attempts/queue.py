@@ -232,18 +232,16 @@ class AttemptQueue:
 
     # -- envs that are gone -----------------------------------------------------------
 
-    def entries(self) -> list[str]:
-        """The entries that attempts wait for."""
-        entries = [entry for entry, waiting in self._waiting.items() if waiting]
-        return [*entries, *(self.players.entry_of[env_id] for env_id in self._pinned_to())]
-
     def lacking(self, busy: set[str]) -> list[str]:
         """The entries of attempts that wait for envs of which none is free or `busy`."""
         entry_of, there = self.players.entry_of, {*self.free, *busy}
         entries = {entry_of[env_id] for env_id in there}
-        found = [entry for entry, waiting in self._waiting.items() if waiting]
-        found = [entry for entry in found if entry not in entries]
+        found = [entry for entry in self._entries() if entry not in entries]
         return [*found, *(entry_of[id_] for id_ in self._pinned_to() if id_ not in there)]
+
+    def _entries(self) -> list[str]:
+        """The entries of attempts that any of their envs may play."""
+        return [entry for entry, waiting in self._waiting.items() if waiting]
 
     def _pinned_to(self) -> list[str]:
         return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
@@ -256,7 +254,7 @@ class AttemptQueue:
             RLightningError: that was known before.
         """
         gone = not self.players.gone.isdisjoint(self._pinned_to())
-        if gone or not self.players.can_play(self.entries()):
+        if gone or not self.players.can_play(self._entries()):
             raise self.fault or RLightningError("no env of this group is left that could play")
 
 

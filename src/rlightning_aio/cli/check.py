@@ -80,7 +80,7 @@ def check(
     findings: list[_Finding] = []
     run_interruptible(_look(configs, findings, steps))
     if as_json:
-        print_json({"config": str(config), "entries": [_as_json(found) for found in findings]})
+        print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
         return
     for found in findings:
         for line in _lines(found):
@@ -139,11 +139,6 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
         found.steps = _STEPS
         if steps:
             found.trial = await try_out(group, steps)
-
-
-def _as_json(found: _Finding) -> dict[str, Any]:
-    trial = None if found.trial is None else found.trial._asdict()
-    return {**asdict(found), "trial": trial}
 
 
 def _has_no_samples(space: Any) -> bool:

@@ -221,12 +221,13 @@ def in_words(error: RLightningError) -> str:
     return text
 
 
-def named_columns(title: str, *names: str) -> Table:
-    """Return an empty table: the first column is text, all others are figures."""
+def named_columns(title: str, *names: str, texts: Sequence[str] = ()) -> Table:
+    """Return an empty table: the first column and `texts` are text, all others are figures."""
     table = _empty(title)
     for position, name in enumerate(names):
+        is_text = position == 0 or name in texts
         table.add_column(
-            name, justify="right" if position else "left", overflow="fold", vertical="bottom"
+            name, justify="left" if is_text else "right", overflow="fold", vertical="bottom"
         )
     return table
 

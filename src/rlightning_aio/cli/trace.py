@@ -13,9 +13,16 @@ from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
-from rich.table import Table
 
-from rlightning_aio.cli.terminal import count, counted, out, print_json
+from rlightning_aio._core.group.timeline.file import TRAINER
+from rlightning_aio.cli.terminal import (
+    count,
+    counted,
+    named_columns,
+    out,
+    print_json,
+    print_table,
+)
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -23,7 +30,6 @@ if TYPE_CHECKING:
 
 __all__ = ["trace"]
 
-_TRAINER: Final = 1
 _WAITING: Final = frozenset({"collect_async", "step", "reset", "restore"})
 """Calls that wait for envs; they return results in "hand out", which counts by itself."""
 _NUM_SHOWN: Final = 10
@@ -174,7 +180,7 @@ class _Reader:
         found: Counter[str] = Counter()
         lanes: dict[int, list[_Slice]] = defaultdict(list)
         for one in self._slices:
-            if one.pid == _TRAINER:
+            if one.pid == TRAINER:
                 lanes[one.tid].append(one)
         for slices in lanes.values():
             around: list[_Slice] = []
@@ -191,7 +197,7 @@ class _Reader:
         found = {
             place: _Env(name, self._processes[place[0]])
             for place, name in self._tracks.items()
-            if place[0] != _TRAINER and place not in self._own
+            if place[0] != TRAINER and place not in self._own
         }
         for one in self._slices:
             if "request" in one.args:
@@ -207,7 +213,7 @@ class _Reader:
         found = {
             pid: _Worker(name, places[pid])
             for pid, name in self._processes.items()
-            if pid != _TRAINER
+            if pid != TRAINER
         }
         turns: dict[int, list[tuple[float, float]]] = defaultdict(list)
         for one in self._slices:
@@ -215,7 +221,7 @@ class _Reader:
                 found[one.pid].replaced += one.seconds
             elif one.name == "waiting for work":
                 found[one.pid].idle += one.seconds
-            elif one.pid != _TRAINER and (one.pid, one.tid) not in self._own:
+            elif one.pid != TRAINER and (one.pid, one.tid) not in self._own:
                 turns[one.pid].append((one.began, one.ended))
         for pid, times in turns.items():
             found[pid].busy = _covered(times)
@@ -226,7 +232,7 @@ class _Reader:
 
     def _slowest(self) -> list[dict[str, Any]]:
         steps = [one for one in self._slices if "request" in one.args or "," in one.name]
-        steps = [one for one in steps if one.pid != _TRAINER]
+        steps = [one for one in steps if one.pid != TRAINER]
         steps.sort(key=lambda one: -one.seconds)
         return [
             {
@@ -352,12 +358,8 @@ def _text(worker: _Worker) -> str:
 def _table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
     if not rows:
         return
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(
-            column, justify="left" if column in ("", "worker", "events", "cause") else "right"
-        )
+    table = named_columns(title, *columns, texts=("", "worker", "events", "cause"))
     for row in rows:
         table.add_row(*row)
     out().print()
-    out().print(table)
+    print_table(out(), table)

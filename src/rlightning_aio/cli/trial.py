@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 import os
 import pickle
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio._core.group.supervision.hint import BRIEF_US, TINY_US
 from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
 
 if TYPE_CHECKING:
@@ -28,11 +30,10 @@ _REPEATED: Final = 100
 """Most steps that are done twice with the same seed."""
 _SLACK_MB: Final = 16.0
 """Memory that caches may take between the second episode and the last."""
-_TINY_US, _BRIEF_US = 30.0, 200.0
-"""Steps that cost less than the way to a worker and back, and than to wake one."""
 
 
-class Trial(NamedTuple):
+@dataclass
+class Trial:
     """What was found.
 
     Attributes:
@@ -127,8 +128,8 @@ def _leaks(samples: list[dict[str, float]]) -> list[str]:
 def _advice(step_us: float) -> str:
     if not math.isfinite(step_us):
         return "no step was timed"
-    if step_us < _TINY_US:
+    if step_us < TINY_US:
         return "steps are so short that placement: inline may be fastest; `bench` measures it"
-    if step_us < _BRIEF_US:
+    if step_us < BRIEF_US:
         return "steps are short: let envs share workers (envs_per_process: 8, say)"
     return "steps are long enough for workers: envs_per_process auto, one worker to a core"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
@@ -13,7 +13,7 @@ from rlightning_aio.outcomes import is_bystanders
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["Evaluation"]
+__all__ = ["Evaluation", "parts_of"]
 
 
 @dataclass(slots=True)
@@ -70,10 +70,7 @@ class Evaluation:
 
     def by_task(self) -> dict[str, Evaluation]:
         """Split by task, in alphabetical order."""
-        found: dict[str, Evaluation] = {}
-        for attempt in sorted(self.attempts, key=lambda attempt: attempt.spec.task):
-            found.setdefault(attempt.spec.task, Evaluation()).attempts.append(attempt)
-        return found
+        return parts_of(self, "task")
 
     def of_envs(self, env_ids: Iterable[str]) -> Evaluation:
         """Select the episodes of some envs."""
@@ -92,6 +89,14 @@ class Evaluation:
             for row in rows
         )
         return "\n".join(line.rstrip() for line in lines)
+
+
+def parts_of(found: Evaluation, name: Literal["entry", "task"]) -> dict[str, Evaluation]:
+    """Split by a field of the episodes' specs, in alphabetical order."""
+    parts: dict[str, Evaluation] = {}
+    for attempt in found.attempts:
+        parts.setdefault(getattr(attempt.spec, name), Evaluation()).attempts.append(attempt)
+    return dict(sorted(parts.items()))
 
 
 def _row(task: str, found: Evaluation) -> tuple[str, ...]:

@@ -47,6 +47,7 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import Evaluation, evaluate
+from rlightning_aio.evaluation.evaluation import parts_of
 from rlightning_aio.files import check_folder
 from rlightning_aio.json_text import finite
 from rlightning_aio.policies import ActionChunks
@@ -394,7 +395,7 @@ class _Watch:
         new = done - self._before
         seconds = time.monotonic() - self._begun
         left = f", {(self._total - done) * seconds / new:,.0f} s left" if new else ""
-        parts = _parts(self.found, self.order.by)
+        parts = parts_of(self.found, self.order.by)
         rows = max(4, self._console.height - 6)
         recent = {name: parts[name] for name in parts if name in [*self._recent][-rows:]}
         title = f"{count(done)} of {counted(self._total, 'episode')}{left}"
@@ -402,14 +403,6 @@ class _Watch:
 
 
 # -- output ------------------------------------------------------------------------------
-
-
-def _parts(found: Evaluation, by: _By) -> dict[str, Evaluation]:
-    """Split an evaluation into the lines of the table."""
-    parts: dict[str, Evaluation] = {}
-    for attempt in sorted(found.attempts, key=lambda attempt: getattr(attempt.spec, by)):
-        parts.setdefault(getattr(attempt.spec, by), Evaluation()).attempts.append(attempt)
-    return parts
 
 
 def _table(title: str, by: _By, parts: dict[str, Evaluation], found: Evaluation) -> Table:
@@ -431,7 +424,7 @@ def _table(title: str, by: _By, parts: dict[str, Evaluation], found: Evaluation)
 
 def _report(order: _Order, files: _Files, found: Evaluation, *, interrupted: bool) -> None:
     """Print and draw the results."""
-    parts = _parts(found, order.by)
+    parts = parts_of(found, order.by)
     notes = _notes(found)
     if files.as_json:
         each = [{"name": name, **_figures(own)} for name, own in parts.items()]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.timeline.records import Mark, Span, TracedResults
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["SENDING", "HostTrack", "Timeline", "events"]
+__all__ = ["SENDING", "TRAINER", "HostTrack", "Timeline", "events"]
 
 SENDING: Final = frozenset({"step", "step_async", "reset", "reset_async", "restore"})
 """Names of spans that send requests with results."""
@@ -34,7 +34,8 @@ _NAMES: Final = {
     int(Operation.RESET): "reset",
     int(Operation.JOIN): "joined",
 }
-_TRAINER: Final = 1
+TRAINER: Final = 1
+"""Number of the trainer among the processes; those of hosts follow."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ class _Events:
         yield from self._named()
         spans = self._spans()
         for lane, slices in sorted(spans.items()):
-            yield from self._slices(_TRAINER, lane + 1, slices)
+            yield from self._slices(TRAINER, lane + 1, slices)
         yield from self._steps()
         yield from self._host_slices()
         yield from self._marks()
@@ -114,9 +115,9 @@ class _Events:
     # -- names ------------------------------------------------------------------------
 
     def _named(self) -> Iterator[str]:
-        yield from _process(_TRAINER, "trainer")
+        yield from _process(TRAINER, "trainer")
         for lane, name in enumerate(self._timeline.lanes):
-            yield from _thread(_TRAINER, lane + 1, name)
+            yield from _thread(TRAINER, lane + 1, name)
         for host_id, host in enumerate(self._timeline.hosts):
             pid, track = _pid(host_id), self._host_tracks[host_id]
             yield from _process(pid, host.name)
@@ -234,18 +235,16 @@ class _Events:
                 continue
             head = f'"name":"request","cat":"request","id":{number}'
             sender = sends[place][2] + 1
-            yield f'{{{head},"ph":"s","pid":{_TRAINER},"tid":{sender},"ts":{ts}}}'
+            yield f'{{{head},"ph":"s","pid":{TRAINER},"tid":{sender},"ts":{ts}}}'
             yield f'{{{head},"ph":"t","pid":{pid},"tid":{tid},"ts":{step_ts}}}'
-            yield (
-                f'{{{head},"ph":"f","bp":"e","pid":{_TRAINER},"tid":{lane + 1},"ts":{taken_ts}}}'
-            )
+            yield (f'{{{head},"ph":"f","bp":"e","pid":{TRAINER},"tid":{lane + 1},"ts":{taken_ts}}}')
 
     def _us(self, times: NDArray[np.int64]) -> list[float]:
         return ((times - self._base) / 1e3).tolist()
 
 
 def _pid(host_id: Any) -> Any:
-    return host_id + _TRAINER + 1
+    return host_id + TRAINER + 1
 
 
 def _cause(text: str, outcome: Outcome | None = None) -> str:
