@@ -253,7 +253,7 @@ class WorkerDied(EnvFault):
 
     Attributes:
         exit_code: of the process; negative for a signal; None if unknown.
-        stderr_tail: the last lines it wrote to stderr.
+        stderr_tail: the end of what it wrote to stdout, then of what it wrote to stderr.
         env_ids: the envs whose requests this error answers: outstanding ones, or new ones that it
             refuses.
         suspects: the envs that owed a reply to a process in which no env's code was running; empty

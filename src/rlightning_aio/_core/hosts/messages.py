@@ -167,7 +167,7 @@ class Death:
     Attributes:
         cause: one clause, such as "was killed by SIGKILL".
         exit_code: negative for a signal; None if unknown.
-        stderr_tail: its last lines on stderr.
+        stderr_tail: the end of what it wrote to stdout and then of what it wrote to stderr.
         requests: entries, beginning with those that it may have been executing; they may be
             answered already, or be 0. Where envs are awaitable, the first is the one whose code
             ran, or 0 if all envs waited.

@@ -99,8 +99,11 @@ class _Child:
     pid: int
     outputs: list[_Output]
     channel: int
-    tail: bytearray = field(default_factory=bytearray)
     kill_at: float | None = None
+
+    def tail(self) -> str:
+        """The end of what it wrote to stdout, then the end of what it wrote to stderr."""
+        return "".join(output.tail.decode(errors="replace") for output in self.outputs)
 
 
 @dataclass
@@ -109,6 +112,7 @@ class _Output:
 
     reader: int
     outlet: _Outlet
+    tail: bytearray = field(default_factory=bytearray)
     silent: bool = False
 
 
@@ -319,9 +323,9 @@ class _ForkServer:
         for child in self._children.values():
             for output in child.outputs:
                 if output.reader == descriptor:
-                    self._drain(child, output)
+                    self._drain(output)
 
-    def _drain(self, child: _Child, output: _Output, most: int = _CHUNK_BYTES) -> None:
+    def _drain(self, output: _Output, most: int = _CHUNK_BYTES) -> None:
         try:
             data = os.read(output.reader, most)
         except BlockingIOError:
@@ -330,8 +334,8 @@ class _ForkServer:
             output.silent = True
             self._choose_readable()
             return
-        child.tail += data
-        del child.tail[:-_TAIL_BYTES]
+        output.tail += data
+        del output.tail[:-_TAIL_BYTES]
         was_full = output.outlet.full
         output.outlet.write(data)
         if output.outlet.full != was_full:
@@ -347,12 +351,12 @@ class _ForkServer:
             for output in child.outputs:
                 # Only what is in the pipe now: a process that it started may continue to write.
                 if unread := _unread(output.reader):
-                    self._drain(child, output, unread)
+                    self._drain(output, unread)
                 with contextlib.suppress(KeyError):
                     self._poll.unregister(output.reader)
                 os.close(output.reader)
-            tail = bytes(child.tail).decode(errors="replace")
-            self._trainer.send(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
+            exit_code = os.waitstatus_to_exitcode(status)
+            self._trainer.send(Exited(child.host_id, exit_code, child.tail()))
             os.close(child.channel)
 
     def _end_all(self) -> None:
