@@ -113,6 +113,8 @@ def become_macos() -> None:
     _remove(os, "sched_getscheduler", "sched_setscheduler", "sched_rr_get_interval", "getrandom")
     _remove(os, "posix_fadvise", "posix_fallocate", "splice", "copy_file_range", "O_TMPFILE")
     _remove(os, "unshare", "setns", "getresuid", "getresgid", "setresuid", "setresgid")
+    # Since Python 3.13, it asks sched_getaffinity where that was when `os` was imported.
+    vars(os).update(process_cpu_count=os.cpu_count)
     _remove(select, "epoll", "EPOLL", "POLLRDHUP", "POLLMSG")
     _remove(signal, "SIGRTM", "SIGPWR", "SIGSTKFLT", "SIGPOLL", "SIGCLD")
     _remove(signal, "sigtimedwait", "sigwaitinfo", "pidfd_send_signal")

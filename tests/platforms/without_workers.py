@@ -160,14 +160,12 @@ def remote() -> None:
     thread.join()
 
     async def main() -> None:
-        async with rl.build_env_group(server) as group:
-            client = asyncio.to_thread(serve, group["server-0"].address)
-            running = asyncio.ensure_future(client)
+        async with asyncio.TaskGroup() as clients, rl.build_env_group(server) as group:
+            clients.create_task(asyncio.to_thread(serve, group["server-0"].address))
             batch, _ = await group.reset(seed=0)
             for _ in range(5):
                 batch, _ = await group.step(batch.respond(action=[0] * len(batch)))
             assert batch.reward.sum() == 1
-        await running
 
     rl.run(main())
     asyncio.run(main())
