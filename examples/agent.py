@@ -16,7 +16,7 @@ import json
 import os
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from model import Model
@@ -24,10 +24,15 @@ from openai import AsyncOpenAI
 from shop import TASKS, TOOLS
 
 import rlightning_aio as rl
-from rlightning_aio.attempts import Attempt, AttemptEpisode, EpisodeSpec, Rules, play
+from rlightning_aio.attempts import AttemptEpisode, AttemptGroup, EpisodeSpec, Rules, play
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 SEEDS, GROUP_SIZE = 4, 8
 TOKENS = ("prompt_tokens", "completion_tokens", "token_ids", "logprobs")
+FIELDS = {"observation_field": "observation", "action_field": "action"}
+FIELDS |= {"truncated_field": "truncated"}  # Of the shop, served as an OpenEnv environment.
 
 
 async def converse(model: Any, episode: AttemptEpisode) -> None:
@@ -37,47 +42,28 @@ async def converse(model: Any, episode: AttemptEpisode) -> None:
         await episode.step(**reply)
 
 
-def rollout_of(attempt: Attempt) -> dict[str, Any]:
-    """A line of the file."""
-    prompt, messages = messages_of(attempt.first), messages_of(attempt.last)
-    outcome = attempt.outcome
-    return {
-        "prompt": prompt,
-        "completion": messages[len(prompt) :],
-        "messages": messages,
-        "task": (attempt.spec.options or {})["task"],
-        "seed": attempt.spec.seed,
-        "reward": attempt.reward,
-        "advantage": None,
-        "tools": TOOLS,
-        "is_truncated": outcome.kind == "truncated",
-        "outcome": outcome.to_json(),
-        "error": outcome.cause if outcome.is_failure else None,
-        **{name: attempt.columns.get(name, []) for name in TOKENS},
-    }
-
-
-def messages_of(observation: Any) -> Any:
-    """An OpenEnv server sends them as a field; an attempt that did not start has none."""
-    found = observation["observation"] if isinstance(observation, dict) else observation
-    return found or []
-
-
-async def over_openenv(model: Model, observation: Any) -> dict[str, Any]:
-    """The columns of a step whose action is a field, too."""
-    reply = await model(messages_of(observation))
-    return {**reply, "action": {"action": reply["action"]}}
-
-
-def compare(group: list[dict[str, Any]]) -> None:
-    """GRPO's advantage: the reward minus the mean of the group, over the standard deviation.
-
-    Rollouts that failed have none, and count neither for the mean nor for the deviation.
-    """
-    whole = [rollout for rollout in group if rollout["reward"] is not None]
-    rewards = np.array([rollout["reward"] for rollout in whole])
-    for rollout in whole:
-        rollout["advantage"] = (rollout["reward"] - rewards.mean()) / (rewards.std() + 1e-4)
+def rollouts_of(attempts: AttemptGroup) -> Iterator[dict[str, Any]]:
+    """Lines of the file. GRPO's advantages compare the attempts that have a reward."""
+    rewards = np.array(attempts.rewards)
+    for attempt in attempts:
+        prompt, messages, outcome = attempt.first or [], attempt.last or [], attempt.outcome
+        advantage = None
+        if attempt.reward is not None:
+            advantage = (attempt.reward - rewards.mean()) / (rewards.std() + 1e-4)
+        yield {
+            "prompt": prompt,
+            "completion": messages[len(prompt) :],
+            "messages": messages,
+            "task": (attempt.spec.options or {})["task"],
+            "seed": attempt.spec.seed,
+            "reward": attempt.reward,
+            "advantage": advantage,
+            "tools": TOOLS,
+            "is_truncated": outcome.kind == "truncated",
+            "outcome": outcome.to_json(),
+            "error": outcome.cause if outcome.is_failure else None,
+            **{name: attempt.columns.get(name, []) for name in TOKENS},
+        }
 
 
 async def main() -> None:
@@ -93,26 +79,18 @@ async def main() -> None:
     args = parser.parse_args()
     key = os.environ.get("OPENAI_API_KEY", "none")
     client = AsyncOpenAI(base_url=args.base_url, api_key=key, max_retries=0)
-    request = {"model": args.model, "stream": args.stream, "extra_body": args.body}
-    if args.stream:
-        request["stream_options"] = {"include_usage": True}
-    model: Any = Model(client, args.patience, **request)
+    model = Model(client, args.patience, args.stream, model=args.model, extra_body=args.body)
     tasks = [EpisodeSpec("", seed, {"task": task}) for task in TASKS for seed in range(SEEDS)]
-    entry = {"name": "shop", "backend": "shop", "task": "-", "placement": "loop"}
-    entry |= {"num_workers": len(tasks) * GROUP_SIZE, "step_timeout": 60}
-    if args.openenv is not None:
-        entry |= {"backend": "openenv", "task": args.openenv}
-        entry |= {"env_kwargs": {"truncated_field": "truncated"}}
-        model = partial(over_openenv, model)
-    groups: list[list[dict[str, Any]]] = []
-    async with client, rl.build_env_group(entry) as group:
+    shop: dict[str, Any] = {"backend": "shop", "task": "-", "placement": "loop"}
+    if args.openenv:
+        shop |= {"backend": "openenv", "task": args.openenv, "env_kwargs": FIELDS}
+    lines: list[dict[str, Any]] = []
+    shop |= {"name": "shop", "num_workers": len(tasks) * GROUP_SIZE, "step_timeout": 60}
+    async with client, rl.build_env_group(shop) as group:
         rules, agent = Rules(retries=args.retries), partial(converse, model)
         async for attempts in play(group, tasks, agent, GROUP_SIZE, rules):
-            groups.append([rollout_of(attempt) for attempt in attempts])
-            compare(groups[-1])
-    lines = [line for found in groups for line in found]
-    with args.out.open("w") as file:
-        file.writelines(json.dumps(line) + "\n" for line in lines)
+            lines += rollouts_of(attempts)
+    args.out.write_text("".join(json.dumps(line) + "\n" for line in lines))
     failed = [line["error"] for line in lines if line["error"]]
     right = sum(line["reward"] or 0.0 for line in lines)
     print(f"{len(lines)} episodes, {right:.0f} right, {len(failed)} failed", *failed[:1], sep=": ")

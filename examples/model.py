@@ -33,10 +33,15 @@ class Model:
     Args:
         client: of the server, with `max_retries=0`.
         patience: seconds after the first failure of a request in which it is sent again.
+        streamed: have the replies streamed.
         request: fields of every request.
     """
 
-    def __init__(self, client: AsyncOpenAI, patience: float, **request: Any) -> None:
+    def __init__(
+        self, client: AsyncOpenAI, patience: float, streamed: bool, **request: Any
+    ) -> None:
+        if streamed:
+            request |= {"stream": True, "stream_options": {"include_usage": True}}
         self._client, self._patience, self._request = client, patience, request
         self._away_since = 0.0  # The first of the failures after which no answer came.
         self._is_said = False
@@ -64,7 +69,7 @@ class Model:
             messages=messages, tools=TOOLS, **self._request
         )
         token_ids: list[int] = []
-        if self._request["stream"]:
+        if "stream" in self._request:
             state = ChatCompletionStreamState()
             # A stream that is left before its end is closed late, and with complaints.
             for chunk in [chunk async for chunk in answer]:

@@ -226,6 +226,7 @@ async def test_envs_of_a_dead_server_move_to_another() -> None:
     ("kwargs", "message"),
     [
         ({"columns": {"a": {"shap": [3]}}}, "columns.a"),
+        ({"columns": {"a": 5}, "observation_field": "b"}, "exclude each other"),
         ({"url": "x"}, "Known fields: urls"),
         ({"session": "kept"}, "session"),
     ],

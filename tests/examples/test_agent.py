@@ -113,7 +113,7 @@ def test_64_concurrent_episodes_become_groups_of_rollouts(stream: bool, tmp_path
     # In asyncio's debug mode the server would take most of the time.
     server = asyncio.run(played(), debug=False)
     assert server.most == 64
-    assert {bool(body["stream"]) for body in server.requests} == {stream}
+    assert {bool(body.get("stream")) for body in server.requests} == {stream}
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     groups = [list(g) for _, g in groupby(lines, lambda line: (line["task"], line["seed"]))]
     groups.sort(key=lambda group: group[0]["task"], reverse=True)
@@ -172,7 +172,7 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
     tasks = [EpisodeSpec("", 0, {"task": "any"})]
     async with rl.build_env_group(config) as group:
         playing = play(group, tasks, partial(agent.converse, model), 3, Rules(retries=0))
-        rollouts = [agent.rollout_of(one) async for attempts in playing for one in attempts]
+        rollouts = [line async for attempts in playing for line in agent.rollouts_of(attempts)]
     ends = {rollout["error"]: rollout["reward"] for rollout in rollouts}
     assert ends == {
         "RuntimeError('no model')": None,

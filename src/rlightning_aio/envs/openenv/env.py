@@ -11,11 +11,11 @@ import asyncio
 import time
 import uuid
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 import numpy as np
 from gymnasium import spaces
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.openenv.secret_headers import check_headers
@@ -51,6 +51,10 @@ class OpenEnvOptions(BaseModel):
     columns: dict[str, Any] = Field(default_factory=dict)
     """Fields of the observation that become columns: a Gymnasium space, a number n for
     ``Discrete(n)``, or ``{shape: […], dtype: …, low: …, high: …}`` for a ``Box``."""
+    observation_field: str | None = None
+    """The only field of the observation that counts: its value is the observation."""
+    action_field: str | None = None
+    """The only field of an action: an action is its value."""
     truncated_field: str | None = None
     """Field of the metadata or the observation that says that a done episode was only cut."""
     reset: dict[str, Any] = Field(default_factory=dict)
@@ -68,12 +72,19 @@ class OpenEnvOptions(BaseModel):
         check_headers(headers)
         return headers
 
+    @model_validator(mode="after")
+    def _check_fields(self) -> Self:
+        if self.columns and self.observation_field is not None:
+            raise ValueError("columns and observation_field exclude each other")
+        return self
+
 
 class OpenEnv(BaseEnv):
     """One session; see the module and docs/agents.md.
 
     An observation is a dict of the fields that the server sends. With ``columns`` it is a dict of
-    these, and of all other fields as ``rest``. An action is a dict of the action's fields.
+    these, and of all other fields as ``rest``. An action is a dict of the action's fields. With
+    ``observation_field`` or ``action_field`` it is the value of that field.
     """
 
     def __init__(
@@ -106,13 +117,13 @@ class OpenEnv(BaseEnv):
         return self._servers[self._server]
 
     def get_observation_space(self) -> gym.Space[Any]:
-        """A dict for each row, or columns with the ``rest``."""
+        """A value for each row, or columns with the ``rest``."""
         if not self._columns:
             return Anything()
         return spaces.Dict({**self._columns, "rest": Anything()})
 
     def get_action_space(self) -> gym.Space[Any]:
-        """Dicts of an action's fields."""
+        """Dicts of an action's fields, or values of its only one."""
         return Anything()
 
     async def reset(
@@ -159,6 +170,8 @@ class OpenEnv(BaseEnv):
             ServerRefused: the server's environment has raised, or does not know the action.
         """
         action = self._preprocess_fn(policy_resp)
+        if self._options.action_field is not None:
+            action = {self._options.action_field: action}
         if not isinstance(action, Mapping):
             raise BadAction(
                 f"an action of env {self.env_id!r} is a dict of its fields, not {action!r}"
@@ -228,7 +241,8 @@ class OpenEnv(BaseEnv):
             }
             self._last = {**columns, "rest": fields}
         else:
-            self._last = fields
+            field = self._options.observation_field
+            self._last = fields if field is None else fields[field]
         return info
 
     def _is_cut(self, data: dict[str, Any], info: dict[str, Any]) -> bool:
