@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 SEEDS, GROUP_SIZE = 4, 8
 TOKENS = ("prompt_tokens", "completion_tokens", "token_ids", "logprobs")
-FIELDS = {"observation_field": "observation", "action_field": "action"}
-FIELDS |= {"truncated_field": "truncated"}  # Of the shop, served as an OpenEnv environment.
+FIELDS = {f"{name}_field": name for name in ("observation", "action", "truncated")}  # If served.
 
 
 async def converse(model: Any, episode: AttemptEpisode) -> None:
@@ -46,8 +45,9 @@ def rollouts_of(attempts: AttemptGroup) -> Iterator[dict[str, Any]]:
     """Lines of the file. GRPO's advantages compare the attempts that have a reward."""
     rewards = np.array(attempts.rewards)
     for attempt in attempts:
-        prompt, messages, outcome = attempt.first or [], attempt.last or [], attempt.outcome
-        advantage = None
+        prompt: list[Any] = attempt.first or []
+        messages: list[Any] = attempt.last or []
+        outcome, advantage = attempt.outcome, None
         if attempt.reward is not None:
             advantage = (attempt.reward - rewards.mean()) / (rewards.std() + 1e-4)
         yield {

@@ -41,7 +41,7 @@ class Model:
         self, client: AsyncOpenAI, patience: float, streamed: bool, **request: Any
     ) -> None:
         if streamed:
-            request |= {"stream": True, "stream_options": {"include_usage": True}}
+            request.update(stream=True, stream_options={"include_usage": True})
         self._client, self._patience, self._request = client, patience, request
         self._away_since = 0.0  # The first of the failures after which no answer came.
         self._is_said = False
