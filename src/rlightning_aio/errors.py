@@ -118,7 +118,8 @@ class NotInitialised(GroupClosed):
 class SnapshotError(RLightningError, ValueError):
     """A snapshot can't be restored, because it is damaged or of other envs; nothing was changed.
 
-    Or it can't be taken, because envs are robots or clients, or were never reset.
+    Or it can't be taken, because envs are robots or clients, were never reset, or have lost their
+    episode in a restore that failed or in an abort.
     """
 
 

@@ -20,6 +20,7 @@ from rlightning_aio._core.group.episodes.continuity import (
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.outcomes import Loss
+from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
@@ -181,3 +182,25 @@ def test_an_env_that_was_not_built_anew_does_not_resume() -> None:
     continuity.lose([0], KILLED)
     _, seeds = continuity.report_losses(SLOT, STEP)
     assert seeds.tolist() == [NO_SEED]
+
+
+def test_an_env_that_was_not_built_anew_saves_nothing_before_its_reset() -> None:
+    """Its state is not that of the episode whose steps are known."""
+    continuity = in_phase(LossPhase.INTACT)
+    continuity.lose([0], KILLED)
+    assert continuity.lost(SLOT) == [KILLED]
+    continuity.report_losses(SLOT, STEP)
+    continuity.save(0, b"somewhere", 2, before=True, is_step=False)
+    assert continuity.checkpoints([0]) == (b"state",)
+
+
+def test_a_restore_that_was_given_up_leaves_no_checkpoint() -> None:
+    """Also if a reset is answered after it."""
+    continuity = in_phase(LossPhase.INTACT)
+    continuity.save(0, b"elsewhere", entry(2, 0, Operation.RESTORE), before=False, is_step=False)
+    continuity.lose([0], KILLED)
+    continuity.report_losses(SLOT, STEP)
+    reset = entry(3, 0, Operation.RESET)
+    continuity.save(0, b"a reset", reset, before=False, is_step=False)
+    continuity.drop_unfinished([0], {reset})
+    assert continuity.checkpoints([0]) == (b"state",)

@@ -365,10 +365,13 @@ def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
         batch, _ = group.step(batch.respond(action=[0, 1]))
         with pytest.raises(EnvRaised, match=r"env 'e-1'.*restore.*the disk is gone"):
             group.restore(snapshot)
+        with pytest.raises(SnapshotError, match=r"env 'e-1' .*lost \(could not be put back\)"):
+            group.snapshot()  # Of its state nobody knows how many steps led there.
         batch, _ = group.step(batch.respond(action=[0, 0]))
         assert batch.observation.tolist() == [[2], [0]]
         assert batch.restarted.tolist() == [False, True]
         assert batch.info()[1]["worker_restarted"] == "could not be put back"
+        group.snapshot()
 
 
 def test_an_env_that_was_never_reset_has_no_state_after_a_restore_that_failed() -> None:

@@ -12,9 +12,7 @@ from simulator.coverage import FAULTS, report
 from simulator.program import draw
 from simulator.runs import WORLDLY, prepare, run, run_many, run_twice, shown, shrunk
 
-KNOWN: Final = {
-    4355: "after restores that timed out, an env shows a state with the step count of another",
-}
+KNOWN: Final[dict[int, str]] = {}
 """Seeds that fail, and why: open defects. One that passes has to be removed."""
 
 

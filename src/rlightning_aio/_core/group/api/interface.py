@@ -222,7 +222,7 @@ class GroupInterface(Facade):
         Raises:
             EnvBusy: an env has a reply outstanding; nothing was sent.
             UnknownEnv: no env of this group has that id.
-            SnapshotError: an env is a robot's, or was never reset.
+            SnapshotError: an env is a robot's, or was never reset, or has lost its episode.
             NotImplementedError: an env is a client's.
             EnvRaised: an env can't give its state; the message says why.
             WorkerDied, EnvHung: a worker ended meanwhile.

@@ -69,11 +69,10 @@ class Snapshots:
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         self._check_restorable(slots)
         snapshots, _ = yield from self._take(now, slots)
-        for snapshot, was_reset in snapshots:
-            if not was_reset:
+        for snapshot, why_not in snapshots:
+            if why_not:
                 raise SnapshotError(
-                    f"env {snapshot.env_id!r} has no state yet: reset it before its snapshot is "
-                    "taken"
+                    f"env {snapshot.env_id!r} {why_not}: reset it before its snapshot is taken"
                 )
         return pack([snapshot for snapshot, _ in snapshots])
 
@@ -89,24 +88,32 @@ class Snapshots:
 
     def _take(
         self, now: float, slots: NDArray[np.intp]
-    ) -> Procedure[tuple[list[tuple[EnvSnapshot, bool]], float]]:
-        """Take one snapshot per env, and say whether it was ever reset; return the time, too."""
+    ) -> Procedure[tuple[list[tuple[EnvSnapshot, str]], float]]:
+        """Take one snapshot per env; return the time, too.
+
+        Each comes with why it is of no episode, or "". Its env itself can go back to it even so.
+        """
         op, nothing = Operation.SNAPSHOT, [()] * len(slots)
         positions: list[Position] = []
+        losses: list[Loss | None] = []
 
         def send(ticket: Ticket) -> None:
             self._calls.send(now, slots, op, nothing, "nothing", ticket)
             # A worker that has replied may die before others reply.
             positions.extend(self._continuity.positions(slots))
+            losses.extend(self._continuity.lost(slots))
 
         ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
         each: list[int] = slots.tolist()
-        replies = zip(each, positions, values_of([ticket]), strict=True)
-        snapshots: list[tuple[EnvSnapshot, bool]] = []
-        for slot, (num_steps, is_cut), (versions, was_reset, state) in replies:
+        replies = zip(each, positions, losses, values_of([ticket]), strict=True)
+        snapshots: list[tuple[EnvSnapshot, str]] = []
+        for slot, (num_steps, is_cut), loss, (versions, was_reset, state) in replies:
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
             env_id = self._envs.env_ids[slot]
-            snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
+            why_not = "" if was_reset else "has no state yet"
+            if was_reset and loss is not None:
+                why_not = f"has a state whose episode was lost ({loss.cause})"
+            snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), why_not))
         return snapshots, later
 
     def restore(

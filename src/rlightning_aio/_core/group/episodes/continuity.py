@@ -521,6 +521,14 @@ class Continuity:
                 found.append(Position(self._num_steps.item(slot), self._cut.item(slot)))
         return found
 
+    def lost(self, slots: NDArray[np.intp]) -> list[Loss | None]:
+        """Return why each of `slots`, all idle, lost its episode; None if its position is right."""
+        losses = [(slot, self._losses.get(slot)) for slot in slots.tolist()]
+        return [
+            None if loss is None or (loss.from_checkpoint and self._checkpoint(slot)) else loss.why
+            for slot, loss in losses
+        ]
+
     # -- checkpoints ------------------------------------------------------------------
 
     def save(self, slot: int, content: bytes, entry: int, *, before: bool, is_step: bool) -> None:
@@ -536,10 +544,13 @@ class Continuity:
         """
         answered = self._pending.pop(slot, None)
         if before:
+            loss = self._losses.get(slot)
+            if loss is not None and not loss.from_checkpoint:
+                return  # It is in a state of no known episode.
             num_steps = self.positions(np.array([slot]))[0].num_steps
             self._checkpoints[slot] = _Checkpoint(content, entry, num_steps)
             return
-        if answered is not None:
+        if answered is not None and op_of(answered.entry) != Operation.RESTORE:
             self._checkpoints[slot] = answered
         num_steps = self._num_steps.item(slot) + 1 if is_step else 0
         self._pending[slot] = _Checkpoint(content, entry, num_steps)
