@@ -186,6 +186,67 @@ class Finishing(Stub):
         Path(self.options["closed_file"]).touch()
 
 
+class Casting(gym.Env[Any, Any]):
+    """Returns observations whose dtypes are not those of their space, except one."""
+
+    observation_space = gym.spaces.Dict(
+        {
+            "pose": gym.spaces.Box(-1, 1, (2,)),
+            "goal": gym.spaces.Box(-1, 1, (2,)),
+            "count": gym.spaces.Box(0, 99, (1,), np.int32),
+            "list": gym.spaces.Box(-1, 1, (2,)),
+            "number": gym.spaces.Discrete(9),
+        }
+    )
+    action_space = gym.spaces.Discrete(2)
+
+    def _observed(self) -> Any:
+        return {
+            "pose": np.full(2, 0.1),
+            "goal": np.full(2, 0.5, np.float32),
+            "count": np.full(1, self.steps),
+            "list": [0.5, 0.5],
+            "number": 3,
+        }, {}
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.steps = 0
+        return self._observed()
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        observation, info = self._observed()
+        return observation, 1.0, self.steps == 5, False, info
+
+
+class AwaitedCasting:
+    """The same, awaited."""
+
+    observation_space, action_space = Casting.observation_space, Casting.action_space
+
+    def __init__(self) -> None:
+        self.env = Casting()
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return self.env.reset(seed=seed, options=options)
+
+    async def step(self, action: Any) -> Any:
+        return self.env.step(action)
+
+
+class Narrow(gym.Env[Any, Any]):
+    """Returns one array of float64 where its space has float32."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return np.full(2, 0.5), {}
+
+    def step(self, action: Any) -> Any:
+        return np.full(2, 0.5), 1.0, False, False, {}
+
+
 class Careless(gym.Env[Any, Any]):
     """Draws from a generator that nobody seeds, forgets files, and divides by zero."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
 from cli.stub_envs import Careless, Stub
 
@@ -73,3 +74,34 @@ def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
     assert "differ from the reset on" in seed
     assert any("more open descriptors after" in leak for leak in leaks)
     assert "problem: none found" in text
+
+
+@pytest.mark.parametrize(
+    ("env", "placement"),
+    [("Casting", "inline"), ("Casting", "process"), ("AwaitedCasting", "loop")],
+)
+def test_check_names_observations_that_are_cast(env: str, placement: str, tmp_path: Path) -> None:
+    """It says which part, from what to what, and whether numbers were rounded."""
+    entry = {"name": "c", "backend": "callable", "task": f"cli.stub_envs:{env}"}
+    config = write_config(tmp_path, {**entry, "placement": placement})
+    (found,) = invoke_json("check", config, "--steps", "20")["entries"]
+    casts = {cast.pop("part"): cast for cast in found["trial"]["casts"]}
+    narrow = {"found": "float64", "expected": "float32", "rounds": True}
+    assert casts == {
+        "observation['pose']": narrow,
+        "observation['count']": {"found": "int64", "expected": "int32", "rounds": False},
+        "observation['list']": {"found": "list", "expected": "float32", "rounds": False},
+    }
+    assert found["trial"]["problems"] == []
+
+
+def test_check_says_casts_in_words(tmp_path: Path) -> None:
+    """An env whose dtypes are right has no such line."""
+    entry = {"name": "c", "backend": "callable", "task": "cli.stub_envs:Narrow"}
+    narrow = {**entry, "placement": "inline", "max_episode_steps": 5}
+    lines = invoke("check", write_config(tmp_path, INLINE, narrow), "--steps", "9").stdout
+    (line,) = [line for line in lines.splitlines() if "cast" in line]
+    assert line == (
+        "  cast: observation from float64 to float32: no number changes, but it takes time; "
+        "return arrays of float32, or declare a space of another dtype"
+    )

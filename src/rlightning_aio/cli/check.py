@@ -22,6 +22,7 @@ from rlightning_aio.registry import ENVS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["check"]
@@ -175,6 +176,15 @@ def _lines(found: _Finding) -> list[str]:
 def _lines_of(trial: Trial) -> list[str]:
     return [
         f"  {counted(trial.episodes, 'episode')}; a step takes {trial.step_us:.0f} µs",
+        *[f"  cast: {_words_of(cast)}" for cast in trial.casts],
         *[f"  problem: {problem}" for problem in trial.problems or ["none found"]],
         f"  {trial.advice}",
     ]
+
+
+def _words_of(cast: Cast) -> str:
+    loss = "numbers are rounded" if cast.rounds else "no number changes, but it takes time"
+    return (
+        f"{cast.part} from {cast.found} to {cast.expected}: {loss}; return arrays of "
+        f"{cast.expected}, or declare a space of another dtype"
+    )

@@ -1,8 +1,9 @@
 """`try_out`: plays episodes of one env with random actions, and says what is wrong with it.
 
-It looks for rewards that are no numbers, for results that a seed doesn't repeat, for descriptors,
-threads, processes and memory that each episode leaves behind, and for a setting that suits the time
-of a step. Left out: what a group refuses anyway, such as observations outside their space.
+It looks for rewards that are no numbers, for observations of another dtype than their space, for
+results that a seed doesn't repeat, for descriptors, threads, processes and memory that each episode
+leaves behind, and for a setting that suits the time of a step. Left out: what a group refuses
+anyway, such as observations outside their space.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 import os
 import pickle
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,10 +20,12 @@ import numpy as np
 
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio._core.group.supervision.hint import BRIEF_US, TINY_US
+from rlightning_aio._core.hosts.messages import CASTS
 from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
 
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio.batch import BatchedData
 
 __all__ = ["Trial", "try_out"]
@@ -39,19 +43,23 @@ class Trial:
     Attributes:
         episodes: that have ended.
         step_us: median time of a step in its env.
+        casts: of parts of the observation.
         problems: in words, each with what to do.
         advice: on the settings of its entry.
     """
 
     episodes: int
     step_us: float
+    casts: list[Cast]
     problems: list[str]
     advice: str
 
 
 async def try_out(group: EnvGroup, steps: int) -> Trial:
     """Play so many steps of the only env of a group, and some of them once more."""
-    (worker,) = group.get_workers()
+    (worker,), (meta,) = group.get_workers(), group.metas
+    noted_casts = partial(group[meta.env_id].call, CASTS)
+    await noted_casts()
     pid, samples, problems = worker["pid"] or "self", list[dict[str, float]](), list[str]()
     bad = 0
     respond = responder(group, Roster(group), None, 0)
@@ -75,7 +83,7 @@ async def try_out(group: EnvGroup, steps: int) -> Trial:
         )
     problems += _leaks(samples)
     step_us = group.get_stats()["latency_us"]["step"]["p50"]
-    return Trial(len(samples), step_us, problems, _advice(step_us))
+    return Trial(len(samples), step_us, await noted_casts(), problems, _advice(step_us))
 
 
 async def _played(group: EnvGroup, steps: int) -> list[bytes]:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio.types import ClientTraits, EnvMeta
 
 __all__ = [
+    "CASTS",
     "NO_ACTION",
     "RECORD_VIDEO",
     "STEP_IN_ROW",
@@ -72,6 +73,8 @@ STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 """The action and the extras of a step that has no arguments out of band."""
 RECORD_VIDEO: Final = "rlightning_aio.record_video"
 """The name of a call to the runner instead of the env; no method can have this name."""
+CASTS: Final = "rlightning_aio.casts"
+"""Another one: it returns the casts of observations that were noted since the first such call."""
 OutOfBand: TypeAlias = dict[str, Any]
 """The part of a result that has no place in its row. Keys: ``observation``, ``info``, ``extra``
 (the result's ``_extra``), ``ret`` (the whole result)."""

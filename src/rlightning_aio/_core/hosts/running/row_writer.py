@@ -21,7 +21,7 @@ from rlightning_aio._core.hosts.running.episodes import EpisodeSums
 from rlightning_aio.envs.base import result_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.protocol import kernel
-from rlightning_aio.protocol.columns import fitted_tree, row_reader, row_writer
+from rlightning_aio.protocol.columns import fitted, fitted_tree, row_reader, row_writer
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.types import EnvRet
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput
     from rlightning_aio.envs.fast_path import BareResult, BareStep
+    from rlightning_aio.protocol.columns import Fit
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset, MultiAgentEnvRet
 
@@ -101,11 +102,7 @@ class RowWriter:
         self._stays_here = stays_here
         layout = slab.layout
         self._hands_over = layout.observations_out_of_band
-        self._write_observation: Callable[[Any], None] | None = None
-        if slab.observation is not None:
-            self._write_observation = row_writer(
-                layout.observation_space, slab.observation, row, "observation"
-            )
+        self.convert_by(fitted)
         self._infos = InfoWriter(memoryview(slab.info[row]), announce)
         self._last_out_of_band: OutOfBand = {}
         self.whole: Any = None
@@ -117,6 +114,14 @@ class RowWriter:
         self._is_reset = slab.is_reset[row, ...]
         self.partial_results = partial_of > 0
         self._sums = _sums(slab, row, autoreset, partial_of)
+
+    def convert_by(self, fit: Fit) -> None:
+        """Convert observations by `fit` from now on; call `short_stepper` again."""
+        self._fit = fit
+        self._write_observation: Callable[[Any], None] | None = None
+        space, column = self._slab.layout.observation_space, self._slab.observation
+        if column is not None:
+            self._write_observation = row_writer(space, column, self._row, "observation", fit=fit)
 
     def write_step(
         self,
@@ -338,7 +343,7 @@ class RowWriter:
             observation = as_numpy(observation)
         if self._hands_over:
             space = self._slab.layout.observation_space
-            observation = fitted_tree(space, observation, "observation")
+            observation = fitted_tree(space, observation, "observation", fit=self._fit)
             return self._kept({"observation": observation, "info": info}, is_fresh=is_fresh)
         out_of_band: OutOfBand = {}
         if self._write_observation is None:

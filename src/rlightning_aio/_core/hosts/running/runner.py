@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 import numpy as np
 
 from rlightning_aio._core.hosts.messages import (
+    CASTS,
     NO_ACTION,
     RECORD_VIDEO,
     STEP_IN_ROW,
@@ -27,6 +28,7 @@ from rlightning_aio._core.hosts.messages import (
     OutOfBand,
     Saved,
 )
+from rlightning_aio._core.hosts.running.casts import Casts
 from rlightning_aio._core.hosts.running.checkpoint import Checkpoints, Saver
 from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.env_steps import followed, step_in_halves
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.filming.camera import Camera
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
+    from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio._core.hosts.running.checkpoint import Send
     from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio.config import VideoConfig
@@ -138,6 +141,7 @@ class EnvRunner:
         self._read_action: Callable[[], Any] = _no_action
         self.checkpoints: Checkpoints
         self._saver: Saver | None = None
+        self._casts: Casts | None = None
         self._attach_again: Callable[[], None]
         self._adopt(env)
 
@@ -192,6 +196,8 @@ class EnvRunner:
             partial_of=num_envs if num_envs > self.meta.num_envs else 0,
             stays_here=self._inline,
         )
+        if self._casts is not None:
+            self._writer.convert_by(self._casts.fitted)
         self.checkpoints = Checkpoints(self.env, slab, row, self._writer)
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
@@ -255,6 +261,8 @@ class EnvRunner:
             return partial(self._restore, *arguments), _outcome
         if arguments[0] == RECORD_VIDEO:
             return partial(self._record_video, *arguments[1]), _outcome
+        if arguments[0] == CASTS:
+            return self._noted_casts, _outcome
         return partial(call_env, self.env, *arguments), _outcome
 
     def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
@@ -265,6 +273,14 @@ class EnvRunner:
         if self._saver is not None:
             # Where nothing is to be shown, it goes back to where the trainer knows it to be.
             self._saver.save(before=not show)
+
+    def _noted_casts(self) -> list[Cast]:
+        """Return what was converted since the first call, which begins to note it."""
+        if self._casts is None:
+            self._casts = Casts()
+            self._writer.convert_by(self._casts.fitted)
+            self._bind()
+        return self._casts.found()
 
     def on_stepped(self, stepped: Callable[[], None]) -> bool:
         """Have the env call `stepped`, see `FastPath.on_stepped`; also one that is rebuilt."""
