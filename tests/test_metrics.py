@@ -109,14 +109,25 @@ def test_tensorboard_takes_the_numbers_as_they_are(group: sync.EnvGroup, tmp_pat
 
 def test_the_page_tells_who_starves(tmp_path: Path) -> None:
     """In each of its runs, the number that it names is the one that is large."""
+    shares, printed = [0], ""
+    for _ in range(20):
+        printed = run_programs(blocks("python", "metrics.md")[1:4], tmp_path)
+        shares = [int(share) for share in re.findall(r"^(\d+)% of", printed, re.MULTILINE)]
+        assert len(shares) == 5
+        if min(shares) > 50:
+            break  # On a busy machine, all may wait for a core instead.
+    assert min(shares) > 50
+    (seconds,) = re.findall(r"slowest: Uneven-2, (\S+) s", printed)
+    assert float(seconds) >= 0.1
+
+
+def test_the_programs_of_the_page_run(tmp_path: Path) -> None:
+    """Deaths are counted by entry, and the exporters give the page's names."""
     pytest.importorskip("prometheus_client")
     pytest.importorskip("opentelemetry.sdk.metrics")
     pytest.importorskip("tensorboardX")
-    printed = run_programs(blocks("python", "metrics.md"), tmp_path)
-    shares = [int(share) for share in re.findall(r"^(\d+)% of", printed, re.MULTILINE)]
-    assert len(shares) == 5
-    assert min(shares) > 50
-    assert "slowest: Uneven-2, 0.1" in printed
+    first, *_starving, fails, board, prometheus, telemetry = blocks("python", "metrics.md")
+    printed = run_programs([first, fails, board, prometheus, telemetry], tmp_path)
     assert "sound: 0 restarts, 0 episodes lost" in printed
     assert re.search(r"fragile: [4-9] restarts, [4-9] episodes lost", printed)
     for name in ("rl_sample_episodes_total", '"rl.environment.time"', "envs/steps_per_second"):

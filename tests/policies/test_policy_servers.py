@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 import socket
 import threading
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import HANG
 from policies.counting import QUEUE, Counting, check, group_of
 from policies.servers import OpenPiServer, VlaEvalServer, packed, serving
 
@@ -17,7 +19,8 @@ import rlightning_aio as rl
 from rlightning_aio.errors import PolicyServerError
 from rlightning_aio.evaluation import evaluate
 from rlightning_aio.policies import ActionChunks
-from rlightning_aio.policy_servers import OpenPiPolicy, VlaEvalPolicy
+from rlightning_aio.policy_servers import OpenPiPolicy, VlaEvalPolicy, client
+from rlightning_aio.policy_servers.connection import Address, connected
 
 
 def evaluated(policy: Any, workers: int = 2, **fields: Any) -> Any:
@@ -196,9 +199,25 @@ def test_a_missing_server_is_named() -> None:
         evaluated(policy)
 
 
+def test_a_server_that_opens_no_connection_is_named() -> None:
+    """The system has accepted the connection, and nobody speaks WebSocket there."""
+    with (
+        socket.create_server(("127.0.0.1", 0)) as silent,
+        OpenPiPolicy(f"ws://127.0.0.1:{silent.getsockname()[1]}", timeout=0.2) as policy,
+        pytest.raises(PolicyServerError, match=r"can't be reached: .*; start it"),
+    ):
+        evaluated(policy)
+
+
 @pytest.mark.parametrize("kind", [OpenPiPolicy, VlaEvalPolicy])
-def test_a_silent_server_is_an_error(kind: Any) -> None:
+def test_a_silent_server_is_an_error(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """After the time for an answer; before or after the first frames."""
+
+    def patiently(address: Address) -> Any:
+        """Connect; on a busy machine, that takes longer than the answer may take here."""
+        return connected(dataclasses.replace(address, timeout=HANG))
+
+    monkeypatch.setattr(client, "connected", patiently)
 
     def handler(connection: Any) -> None:
         for _ in connection:
