@@ -121,7 +121,7 @@ def _is_other(item: pytest.Item) -> bool:
     if not ON_RAY:
         return place is AWAITING and item.path.stem != "test_stepping"
     on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
-    return place is None or (on_asyncio and not place.synchronous)
+    return not isinstance(place, Place) or (on_asyncio and not place.synchronous)
 
 
 if ON_RAY:
