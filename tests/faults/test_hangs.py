@@ -75,8 +75,13 @@ def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hangs: list
 
 
 @kinds_on_both_drivers("hangs", [*STACKS, "stop"])
-def test_hung_step_is_answered_by_its_replacement(start: Start, hangs: list[str]) -> None:
-    """Each env that owed a reply gets one marked result; then every env replies again."""
+def test_hung_step_is_answered_by_its_replacement(
+    start: Start, hangs: list[str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each env that owed a reply gets one marked result; then every env replies again.
+
+    The stacks, which no error has, are on stderr.
+    """
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     for hang in hangs:
         batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
@@ -88,6 +93,9 @@ def test_hung_step_is_answered_by_its_replacement(start: Start, hangs: list[str]
         for _ in range(3):
             batch, _ = group.step(tokens.steps(group.group.env_ids))
         tokens.check(batch)
+    written = capfd.readouterr().err
+    for hang in hangs:
+        assert STACKS.get(hang, "") in written
 
 
 def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:

@@ -4,7 +4,8 @@ A `Host` starts, accepts requests, and ends. It reports everything by completion
 to the queue of its group (see `messages`). The other protocols are optional: a host with a
 descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
 executes in the thread of the caller is `Executing`, one that can end single requests is `Aborting`,
-and a host whose envs join and leave has `Membership`. The core checks for these protocols, never
+one that can say where its envs stand is `Inspectable`, and a host whose envs join and leave has
+`Membership`. The core checks for these protocols, never
 for a class of hosts.
 Left out on purpose: waiting. Neither side ever waits.
 """
@@ -32,6 +33,7 @@ __all__ = [
     "Executing",
     "Host",
     "HostFactory",
+    "Inspectable",
     "Killable",
     "Measured",
     "Membership",
@@ -196,6 +198,22 @@ class Killable(Protocol):
         """Kill it and the process that it depends on, if `kill` had no effect.
 
         `Died` follows, also for other hosts that depend on that process.
+        """
+        ...
+
+
+@runtime_checkable
+class Inspectable(Protocol):
+    """A host that can say where its envs stand."""
+
+    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+        """Find out where the code of an env stands, without blocking.
+
+        Args:
+            slot: of the env.
+            answer: gets the calls that it is in, from the outermost in (empty if that is not
+                known), and the stacks of all threads. Called now or soon, while the driver reads,
+                unless the host dies before.
         """
         ...
 

@@ -214,12 +214,14 @@ def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
 
 def _advice(name: str, together: int, best: int, spent: Spent) -> str:
     share = spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
+    step_ms = spent.busy_ns / spent.results / 1e6
     factor = min(together / best, 1 / max(share, 1e-9))
     return (
         f"entry {name!r}: {together} envs share each worker, where only one is stepped at a time, "
-        f"and their steps wait ({100 * share:.0f} % of their time keeps a core busy); to have them "
-        f"wait at the same time, up to {factor:.1f} times as fast, set envs_per_process: {best} "
-        f"(in VectorEnv, envs_per_process={best})"
+        f"and their steps wait (one takes {step_ms:.3g} ms, and keeps a "
+        f"core busy for {100 * share:.0f} % of that); to have them wait at the same time, up to "
+        f"{factor:.1f} times as fast, set envs_per_process: {best} (in VectorEnv, "
+        f"envs_per_process={best})"
     )
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Patient
+from rlightning_aio._core.hosts.base import Inspectable
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -73,11 +74,25 @@ class Overdue:
                 due = min(due, expires)
                 continue
             self._watched &= envs.names.entries != envs.names.entries[slot]
-            _log.warning(
-                "%s has owed a result for %.0f s, and nothing ends what it does: set %s of its "
-                "entry, in seconds, to have it replaced; group.get_workers() tells who owes what",
-                envs.describe(slot),
-                now - expires + OWED_SECONDS,
-                name,
-            )
+            self._name(slot, now - expires + OWED_SECONDS, name)
         self._look_at(due)
+
+    def _name(self, slot: int, seconds: float, setting: str) -> None:
+        """Log that an env owes a result, and where it stands if its host can say so."""
+        group = self._group
+        text = (
+            f"{group.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
+            f"what it does: set {setting} of its entry, in seconds, to have it replaced; "
+        )
+
+        def log(where: str, stacks: str) -> None:
+            stands = f"it stands in {where}; " if where else ""
+            _log.warning("%s%sgroup.get_workers() tells who owes what", text, stands)
+            if stacks:
+                _log.debug("the stacks of %s:\n%s", group.envs.env_ids[slot], stacks)
+
+        host = group.records[group.requests.hosts.item(slot)].host
+        if isinstance(host, Inspectable):
+            host.inspect(slot, log)
+        else:
+            log("", "")

@@ -270,7 +270,7 @@ class AwaitedEnvs:
             if record.fault is not None:
                 # Not at once: a completion never comes before its request was handed over.
                 fault = Failed(self._host_id, entry, copy(record.fault), for_good=True)
-                self._loop.call_soon(self._post_unless_ending, fault)
+                self._loop.call_soon(lambda it=fault: None if self._ending else self._post(it))
                 continue
             self.num_busy += 1
             record.entry, record.arguments = entry, arguments
@@ -278,10 +278,6 @@ class AwaitedEnvs:
                 self._restore(record)
             else:
                 self._give(record, record.env)
-
-    def _post_unless_ending(self, completion: Completion) -> None:
-        if not self._ending:
-            self._post(completion)
 
     def _give(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Have an env execute the request in its record."""
@@ -364,6 +360,11 @@ class AwaitedEnvs:
             message += f" while it waited in {waits_in}"
         self._put_away(record, env, hung(f"hung in a {doing} and was cancelled", op, record.name))
         self._restore(record, message)
+
+    def waits_in(self, slot: int) -> str:
+        """Name the calls in which an env waits, from the outermost in; empty if it doesn't."""
+        env = self._records[slot - self._first_slot].env
+        return "" if env is None else awaited_calls(env.answering)
 
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""

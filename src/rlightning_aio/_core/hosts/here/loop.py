@@ -20,7 +20,7 @@ from rlightning_aio._core.hosts.running.runner import attach_all
 from rlightning_aio.protocol.rings import WorkerBell, bell_size
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Sequence
+    from collections.abc import Callable, Coroutine, Sequence
 
     from numpy.typing import NDArray
 
@@ -31,7 +31,7 @@ __all__ = ["LoopHost"]
 
 
 class LoopHost:
-    """See `base.Host`, and `Aborting`, `Polled` and `SharesThread` there. It has no descriptor."""
+    """See `base.Host`, `Aborting`, `Inspectable`, `Polled` and `SharesThread`. No descriptor."""
 
     shares_thread = True
 
@@ -100,6 +100,11 @@ class LoopHost:
         """See `base.Aborting`."""
         for entry in entries.tolist():
             self._envs.abort(entry)
+
+    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+        """Name the calls that the env awaits; the trainer's own stack says nothing of it."""
+        waits_in = self._envs.waits_in(slot)
+        answer(waits_in, waits_in)
 
     # -- completions --------------------------------------------------------------
 

@@ -26,6 +26,7 @@ __all__ = [
     "Exited",
     "Fork",
     "Forked",
+    "Inspect",
     "Kill",
     "Message",
     "MessageSocket",
@@ -33,6 +34,7 @@ __all__ = [
     "Preload",
     "Ready",
     "Received",
+    "Stacks",
 ]
 
 
@@ -68,10 +70,25 @@ class Forked:
 
 @dataclass(frozen=True)
 class Kill:
-    """Kill worker `host_id`; with `dump`, it writes its stacks to stderr first."""
+    """Kill worker `host_id`; with `dump`, the last of its output is its stacks."""
 
     host_id: int
     dump: bool
+
+
+@dataclass(frozen=True)
+class Inspect:
+    """Have worker `host_id` write its stacks; `Stacks` follows."""
+
+    host_id: int
+
+
+@dataclass(frozen=True)
+class Stacks:
+    """The stacks of the threads of worker `host_id`; empty if it is stopped."""
+
+    host_id: int
+    text: str
 
 
 @dataclass(frozen=True)
@@ -91,7 +108,7 @@ class NotForked:
     why: str
 
 
-Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited
+Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited | Inspect | Stacks
 
 REFUSED: Final = b"!"
 """First byte of the only packet of a fork server that can't import its code; a text follows."""

@@ -31,11 +31,13 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     Forked,
+    Inspect,
     Kill,
     MessageSocket,
     NotForked,
     Preload,
     Ready,
+    Stacks,
 )
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 
@@ -81,6 +83,7 @@ _CHUNK_BYTES: Final = 1 << 16
 _GRACE_SECONDS: Final = 1.2
 """Time for workers to notice that the trainer is gone, and to stop a robot."""
 _DUMP_SECONDS: Final = 0.3
+"""Time for a worker to write its stacks."""
 _ERROR_CHARACTERS: Final = 60_000
 _OUTLET_BYTES: Final = 1 << 20
 _READ_SECONDS: Final = 0.2
@@ -92,7 +95,8 @@ _STDERR: Final = 2
 @dataclass
 class _Child:
     """A worker. Its end of the channel stays open here until its exit is handled, so that it can be
-    shut down when the trainer is gone.
+    shut down when the trainer is gone. The last of its outputs has the stacks that it writes
+    on request, which are forwarded to stderr only before it is killed.
     """
 
     host_id: int
@@ -100,10 +104,11 @@ class _Child:
     outputs: list[_Output]
     channel: int
     kill_at: float | None = None
+    tell_at: float | None = None
 
     def tail(self) -> str:
-        """The end of what it wrote to stdout, then the end of what it wrote to stderr."""
-        return "".join(output.tail.decode(errors="replace") for output in self.outputs)
+        """The end of what it wrote to stdout, of what it wrote to stderr, and of its stacks."""
+        return "".join(output.text() for output in self.outputs)
 
 
 @dataclass
@@ -111,9 +116,16 @@ class _Output:
     """What a worker writes to stdout, to stderr, or to both if they are the same file here."""
 
     reader: int
-    outlet: _Outlet
+    outlet: _Outlet | None
     tail: bytearray = field(default_factory=bytearray)
     silent: bool = False
+
+    @property
+    def is_held_up(self) -> bool:
+        return self.outlet is not None and self.outlet.full
+
+    def text(self) -> str:
+        return self.tail.decode(errors="replace")
 
 
 class _Outlet:
@@ -199,15 +211,18 @@ class _ForkServer:
         signal.set_wakeup_fd(wakeup.fileno(), warn_on_full_buffer=False)
         signal.signal(signal.SIGCHLD, _on_child)
         self._poll.register(self._wakeup, select.POLLIN)
+        # A worker that can't write its stacks yet doesn't die of the request.
+        signal.signal(DUMP_SIGNAL, signal.SIG_IGN)
 
     def serve(self) -> None:
         """Serve until the trainer is gone; then end all workers."""
-        while self._step(self._next_kill()):
+        while self._step(self._next_due()):
             pass
         self._end_all()
 
-    def _next_kill(self) -> float | None:
-        times = [child.kill_at for child in self._children.values() if child.kill_at is not None]
+    def _next_due(self) -> float | None:
+        children = self._children.values()
+        times = [at for one in children for at in (one.kill_at, one.tell_at) if at is not None]
         return min(times) if times else None
 
     def _step(self, until: float | None) -> bool:
@@ -223,6 +238,7 @@ class _ForkServer:
                     return False
             else:
                 self._attend(descriptor)
+        self._tell_due()
         self._kill_due()
         self._handle_exits()
         return True
@@ -250,6 +266,8 @@ class _ForkServer:
             self._fork(received.message, received.descriptors)
         elif isinstance(received.message, Kill):
             self._kill(received.message)
+        elif isinstance(received.message, Inspect):
+            self._inspect(received.message)
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
@@ -258,7 +276,7 @@ class _ForkServer:
         try:
             if len(descriptors) < 2:
                 raise OSError("its descriptors didn't arrive: too many are open")
-            for _ in self._outlets:
+            for _ in (*self._outlets, None):
                 pipes += os.pipe()
             pid = os.fork()
         except OSError as error:
@@ -274,7 +292,8 @@ class _ForkServer:
             os.close(descriptor)
         for reader in readers:
             os.set_blocking(reader, False)
-        outputs = [_Output(*both) for both in zip(readers, self._outlets, strict=True)]
+        outlets = (*self._outlets, None)
+        outputs = [_Output(*both) for both in zip(readers, outlets, strict=True)]
         self._children[pid] = _Child(order.place.host_id, pid, outputs, channel)
         self._choose_readable()
         self._trainer.send(Forked(order.place.host_id, pid))
@@ -296,9 +315,25 @@ class _ForkServer:
         for child in self._children.values():
             if child.host_id == order.host_id:
                 if order.dump:
+                    child.outputs[-1].outlet = self._outlets[-1]  # The log shows them.
                     os.kill(child.pid, DUMP_SIGNAL)
                 child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
         self._choose_readable()
+
+    def _inspect(self, order: Inspect) -> None:
+        for child in self._children.values():
+            if child.host_id == order.host_id:
+                os.kill(child.pid, DUMP_SIGNAL)
+                child.tell_at = time.monotonic() + _DUMP_SECONDS
+
+    def _tell_due(self) -> None:
+        now = time.monotonic()
+        for child in self._children.values():
+            if child.tell_at is not None and child.tell_at <= now:
+                child.tell_at = None
+                stacks = child.outputs[-1]
+                self._trainer.send(Stacks(child.host_id, stacks.text()))
+                stacks.tail.clear()
 
     def _kill_due(self) -> None:
         now = time.monotonic()
@@ -311,7 +346,7 @@ class _ForkServer:
         """Read from all workers; if too much output waits, only from those about to be killed."""
         for child in self._children.values():
             for output in child.outputs:
-                is_read = not output.outlet.full or child.kill_at is not None
+                is_read = not output.is_held_up or child.kill_at is not None
                 if is_read and not output.silent:
                     self._poll.register(output.reader, select.POLLIN)
                 else:
@@ -336,9 +371,10 @@ class _ForkServer:
             return
         output.tail += data
         del output.tail[:-_TAIL_BYTES]
-        was_full = output.outlet.full
-        output.outlet.write(data)
-        if output.outlet.full != was_full:
+        was_held_up = output.is_held_up
+        if output.outlet is not None:
+            output.outlet.write(data)
+        if output.is_held_up != was_held_up:
             self._choose_readable()
 
     def _handle_exits(self) -> None:
@@ -402,9 +438,10 @@ def _run_worker(
     """Run a worker in a forked child; never returns."""
     code = 1
     try:
-        os.dup2(outputs[0], _STDOUT)
-        os.dup2(outputs[-1], _STDERR)
-        for output in outputs:
+        *printed, stacks = outputs
+        os.dup2(printed[0], _STDOUT)
+        os.dup2(printed[-1], _STDERR)
+        for output in printed:
             os.close(output)
         # What an env prints comes at once, and isn't lost if the worker is killed.
         cast("TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
@@ -413,7 +450,7 @@ def _run_worker(
         if os.getppid() != parent:
             os._exit(1)
         faulthandler.enable(all_threads=True)
-        faulthandler.register(DUMP_SIGNAL, all_threads=True)
+        faulthandler.register(DUMP_SIGNAL, stacks, all_threads=True)
         # Not at the top: the fork server sends messages before imports that may fail.
         from rlightning_aio._core.hosts.process import worker  # noqa: PLC0415
 

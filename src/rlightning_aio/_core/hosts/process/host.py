@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import signal
 import socket
 import subprocess
@@ -23,11 +24,13 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     Forked,
+    Inspect,
     Kill,
     MessageSocket,
     NotForked,
     Preload,
     Ready,
+    Stacks,
 )
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
@@ -41,7 +44,7 @@ from rlightning_aio.protocol.rings import rings_size
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -55,6 +58,9 @@ if TYPE_CHECKING:
 __all__ = ["ForkServerHandle", "ProcessHost", "ending"]
 
 _STDERR: Final = 2
+_PACKAGE: Final = str(Path(__file__).parents[3])
+_FRAME: Final = re.compile(r'^  File "(.+)", line (\d+) in (.+)$', re.MULTILINE)
+_MOST_CALLS: Final = 3
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -152,6 +158,13 @@ class ForkServerHandle:
             messages.send(Kill(host.host_id, dump))
             self._watcher.watch_writable(self, messages.waiting)
 
+    def inspect(self, host: ProcessHost) -> None:
+        """Have the worker of `host` write its stacks; `host.on_stacks` follows."""
+        if self._server is not None and self._ready:
+            messages = self._server.messages
+            messages.send(Inspect(host.host_id))
+            self._watcher.watch_writable(self, messages.waiting)
+
     def note_used(self) -> None:
         """Note that the envs of all workers were built."""
         self._is_used = True
@@ -184,8 +197,7 @@ class ForkServerHandle:
         return server
 
     def _started(self) -> RunningForkServer:
-        package = str(Path(__file__).parents[3])
-        command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, package]
+        command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, _PACKAGE]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             process = subprocess.Popen(
@@ -222,6 +234,8 @@ class ForkServerHandle:
             host.on_exit(message.exit_code, message.stderr_tail)
         elif isinstance(message, NotForked):
             self._hosts.pop(message.host_id).on_refused(message.why)
+        elif isinstance(message, Stacks):
+            self._hosts[message.host_id].on_stacks(message.text)
 
     def _lost(self) -> None:
         """Handle the exit of the fork server; the kernel killed its workers."""
@@ -270,7 +284,10 @@ def _surroundings(config: EnvConfig) -> tuple[object, ...]:
 
 
 class ProcessHost:
-    """The trainer's handle on one worker process; see `base.Host`, `Killable` and `Polled`."""
+    """The trainer's handle on one worker process.
+
+    See `base.Host`, `Inspectable`, `Killable` and `Polled`.
+    """
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -293,6 +310,7 @@ class ProcessHost:
         self._alive = False
         self._closing = False
         self._killed = ""
+        self._inspecting: list[Callable[[str, str], None]] = []
 
     # -- life ---------------------------------------------------------------------
 
@@ -329,6 +347,19 @@ class ProcessHost:
     def destroy(self) -> None:
         self._fork_server.destroy()
 
+    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+        """See `base.Inspectable`. A worker that steps one env stands where that stands."""
+        del slot
+        self._inspecting.append(answer)
+        if len(self._inspecting) == 1:
+            self._fork_server.inspect(self)
+
+    def on_stacks(self, text: str) -> None:
+        """Pass on what the worker wrote."""
+        inspecting, self._inspecting = self._inspecting, []
+        for answer in inspecting:
+            answer(calls_of_env(text), text)
+
     def close(self) -> None:
         self._closing = True
         if self._alive and self._link is not None:
@@ -342,6 +373,7 @@ class ProcessHost:
 
     def _hang_up(self) -> None:
         self._alive = False
+        self._inspecting.clear()
         if self._link is not None:
             self._link.hang_up()
             self._link = None
@@ -429,6 +461,20 @@ def _new_channel() -> tuple[socket.socket, socket.socket]:
     theirs.close()
     occupy_standard_streams()  # The program has closed some since the group was built.
     return socket.socketpair()
+
+
+def calls_of_env(stacks: str) -> str:
+    """Name the last calls that an env is in, from the outermost in; empty if it is in none.
+
+    Args:
+        stacks: as `faulthandler` writes them, that of the main thread as the current one.
+    """
+    calls: list[str] = []
+    for file, line, function in _FRAME.findall(stacks.partition("Current thread")[2]):
+        if file.startswith(_PACKAGE) or len(calls) == _MOST_CALLS:
+            break
+        calls.insert(0, f"{function}, {file}:{line}")
+    return " > ".join(calls)
 
 
 def ending(exit_code: int) -> str:
