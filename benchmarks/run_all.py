@@ -29,7 +29,7 @@ README = HERE / "README.md"
 SCRIPTS = (
     "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
     "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "pool",
-    "tracing", "filming", "serial", "loop_pause", "headline", "exchange", "awaitable",
+    "tracing", "filming", "thread_share", "loop_pause", "headline", "exchange", "awaitable",
     "openenv_sessions",
 )  # fmt: skip
 # Run only if they are named.

@@ -38,7 +38,7 @@ ASKED = {
     "pong": ["rlightning_aio"],
     "tracing": ["async half, CartPole"],
     "filming": ["compute"],
-    "serial": ["HalfCheetah x 32", "envs x 256"],
+    "thread_share": ["HalfCheetah x 32", "envs x 256"],
     "loop_pause": [],
     "headline": ["make_vec"],
     "exchange": ["sync", "bare exchange"],
@@ -57,7 +57,7 @@ TOGETHER = (
         "memory",
         "tracing",
         "filming",
-        "serial",
+        "thread_share",
         "loop_pause",
         "headline",
         "exchange",
@@ -175,7 +175,7 @@ def check_pong(report: dict[str, Any]) -> None:
         assert len(report["results"]) == 2
 
 
-def check_serial(report: dict[str, Any]) -> None:
+def check_thread_share(report: dict[str, Any]) -> None:
     """The trainer's thread is busy in a step, and more cores make the model faster."""
     found = report["results"]["make_vec, HalfCheetah x 32"]
     assert found["outside_us"] > 0
@@ -197,7 +197,7 @@ CHECKS = {
     "adapters": check_adapters,
     "pong": check_pong,
     "awaitable": check_awaitable,
-    "serial": check_serial,
+    "thread_share": check_thread_share,
 }
 
 
