@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rlightning_aio._core.group.api.aio import build_env_group
 from rlightning_aio.attempts.episode import AttemptEpisode
 from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import EnvFault, RLightningError
 from rlightning_aio.loop_thread import LoopThread
@@ -32,11 +33,11 @@ class Lending:
 
     Args:
         group: initialised. Each of its envs can play each attempt.
-        retries: how often a reset that has failed is tried again.
+        retries: how often a reset that has failed is tried again, by the rule of `Rules`.
     """
 
     def __init__(self, group: EnvGroup, retries: int) -> None:
-        self._group, self._retries, self._players = group, retries, Players(group)
+        self._group, self._rules, self._players = group, Rules(retries=retries), Players(group)
         self._idle = asyncio.Queue[str]()
         self._lent = set[AttemptEpisode]()
         for env_id in group.env_ids:
@@ -55,14 +56,14 @@ class Lending:
         Raises:
             RLightningError: no env of the group is left.
         """
-        tries = 0
+        failures: list[Outcome] = []
         while True:
             env_id = await self._idle.get()
             if not env_id:
                 self._idle.put_nowait("")
                 raise RLightningError("no env of this group is left that could play")
             playing = self._group.episode(env_id, seed, options)
-            episode = AttemptEpisode(playing, EpisodeSpec("", seed or 0, None), tries)
+            episode = AttemptEpisode(playing, EpisodeSpec("", seed, None), 0)
             self._lent.add(episode)
             try:
                 with contextlib.suppress(EnvFault):
@@ -73,9 +74,9 @@ class Lending:
             if episode.fault is None:
                 return episode
             await self.end(episode)
-            tries += 1
-            if tries > self._retries:
+            if not self._rules.tries_again(episode.fault, failures):
                 return episode.fault
+            failures.append(episode.fault)
 
     async def end(self, episode: AttemptEpisode) -> None:
         """Take the env back, unless that was done, or its worker is gone for good."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.errors import RLightningError
-from rlightning_aio.outcomes import is_bystanders
 
 if TYPE_CHECKING:
     from rlightning_aio.attempts.file import ResultsFile
@@ -55,7 +54,7 @@ class Job:
     Attributes:
         sub_env: of the env that it waits for.
         since: when it began to wait, in monotonic seconds.
-        failures: outcomes of its tries so far; counted: how many of them use up a retry.
+        failures: outcomes of its tries so far.
     """
 
     task: TaskInPlay
@@ -63,7 +62,6 @@ class Job:
     sub_env: int = 0
     since: float = field(default_factory=time.monotonic)
     failures: list[Outcome] = field(default_factory=list["Outcome"])
-    counted: int = 0
 
     @property
     def spec(self) -> EpisodeSpec:
@@ -128,8 +126,7 @@ class AttemptQueue:
             job.task.attempts[job.index] = found[repeat]
             return True
         if self._results is not None and repeat == len(found):
-            for outcome in self._results.failures(*_written_as(job)):
-                self._note_failure(job, outcome)
+            job.failures += self._results.failures(*_written_as(job))
         return False
 
     def _wait(self, job: Job) -> None:
@@ -207,9 +204,8 @@ class AttemptQueue:
         outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
         if job.task.is_settled:
             return False
-        has_tries = is_bystanders(outcome) or job.counted < self._rules.retries
-        if self._rules.retried(outcome) and has_tries:
-            self._note_failure(job, outcome)
+        if self._rules.tries_again(outcome, job.failures):
+            job.failures.append(outcome)
             if self._results is not None:
                 self._results.add_failure(*_written_as(job), outcome)
             job.since = time.monotonic()
@@ -220,10 +216,6 @@ class AttemptQueue:
         if self._results is not None:
             self._results.add(attempt)
         return True
-
-    def _note_failure(self, job: Job, outcome: Outcome) -> None:
-        job.failures.append(outcome)
-        job.counted += not is_bystanders(outcome)
 
     def is_done(self, task: TaskInPlay) -> bool:
         """A task needs no further attempts."""

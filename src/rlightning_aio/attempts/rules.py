@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from rlightning_aio.outcomes import is_bystanders
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.outcomes import Outcome
@@ -77,6 +79,11 @@ class Rules:
             return spec.seed
         state = np.random.SeedSequence((spec.seed, index)).generate_state(1, np.uint64)
         return int(state[0]) >> _SEED_BITS
+
+    def tries_again(self, outcome: Outcome, before: Sequence[Outcome]) -> bool:
+        """Return True if an attempt is tried again after a try, and those `before` that failed."""
+        counted = sum(not is_bystanders(one) for one in before)
+        return self.retried(outcome) and (is_bystanders(outcome) or counted < self.retries)
 
     def needed(self, size: int) -> int:
         """Number of attempts, of `size`, that must not fail for their group to be complete."""
