@@ -73,6 +73,7 @@ mutations: $(VENV)/installed-test ## defects that were fixed, put back one at a 
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
 	$(PY) -m pytest -m ray tests/on_ray
 	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/group
+	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/attempts
 
 # What `make test-simulators` installs; `make -j3 environments` installs three at once.
 environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed $(OPENENV)/installed $(ROBOTS)/installed $(TRAINERS)/installed

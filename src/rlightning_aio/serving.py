@@ -16,7 +16,7 @@ from collections import deque
 from functools import partial
 from http import HTTPStatus
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, cast
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -28,12 +28,15 @@ from websockets.http11 import Response
 
 from rlightning_aio.envs.openenv.session import keep_alive_by_system
 from rlightning_aio.envs.post_connection import PostConnection
-from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.errors import ConfigError, EnvFault, RLightningError
 from rlightning_aio.json_text import json_of
+from rlightning_aio.outcomes import Outcome
 from rlightning_aio.protocol.columns import as_array, is_dict, is_tuple
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
     import gymnasium as gym
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request
@@ -41,6 +44,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup, EnvHandle
 
 __all__ = ["OpenEnvServer"]
+
+T = TypeVar("T")
 
 # Of JSON-RPC, as OpenEnv's servers use them.
 _PARSE_ERROR: Final = -32700
@@ -102,6 +107,7 @@ class OpenEnvServer:
         self._server: Server
 
     async def __aenter__(self) -> Self:
+        self._ending = asyncio.get_running_loop().create_future()
         try:
             self._server = await serve(
                 self._talk,
@@ -120,6 +126,7 @@ class OpenEnvServer:
 
     async def __aexit__(self, *exc: object) -> None:
         self._server.close()
+        self._ending.set_result(None)
         await self._server.wait_closed()
         for session in list(self._sessions.values()):
             self._end(session)
@@ -273,6 +280,17 @@ class OpenEnvServer:
                 self._end(session)
 
     async def _serve(self, socket: ServerConnection, session: _Session) -> None:
+        # A kept session outlives its socket.
+        left = self._ending if session.is_kept else asyncio.ensure_future(socket.wait_closed())
+        try:
+            await self._answer_all(socket, session, left)
+        finally:
+            if left is not self._ending:
+                left.cancel()
+
+    async def _answer_all(
+        self, socket: ServerConnection, session: _Session, left: asyncio.Future[None]
+    ) -> None:
         while True:
             try:
                 message: Any = json.loads(await socket.recv())
@@ -284,7 +302,10 @@ class OpenEnvServer:
             if kind == "close":
                 return
             try:
-                reply = await self._reply(session, kind, data)
+                reply = await self._unless_left(session, self._reply(session, kind, data), left)
+            except EnvFault as fault:
+                blame = fault.outcome.blame
+                await _send_error(socket, "EXECUTION_ERROR", str(fault), blame=blame)
             except (KeyError, TypeError, ValueError, OverflowError) as error:
                 await _send_error(socket, "VALIDATION_ERROR", f"Invalid message: {error}")
             except RLightningError as error:
@@ -294,6 +315,20 @@ class OpenEnvServer:
                     await _send_error(socket, "UNKNOWN_TYPE", f"Unknown message type: {kind}")
                 else:
                     await socket.send(json_of({"type": reply[0], "data": reply[1]}))
+
+    async def _unless_left(
+        self, session: _Session, reply: Coroutine[Any, Any, T], left: asyncio.Future[None]
+    ) -> T:
+        """Wait for a reply, and abort what the env does if its client has left.
+
+        Raises:
+            EnvAborted: that was so.
+        """
+        replying = asyncio.ensure_future(reply)
+        await asyncio.wait({replying, left}, return_when=asyncio.FIRST_COMPLETED)
+        if not replying.done():
+            await self._group.abort([session.env.env_id])
+        return await replying
 
     async def _reply(
         self, session: _Session, kind: Any, data: dict[str, Any]
@@ -367,6 +402,8 @@ def _jsonable(value: Any) -> Any:
         return [_jsonable(one) for one in cast("list[Any]", value)]
     if value is None or isinstance(value, str | bool | int | float):
         return value
+    if isinstance(value, Outcome):
+        return value.to_json()
     if isinstance(value, np.ndarray | np.generic) or hasattr(value, "detach"):
         return as_array(value).tolist()
     return repr(value)

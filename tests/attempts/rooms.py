@@ -1,4 +1,4 @@
-"""Envs whose actions say what happens: a number is earned, a word is a deed."""
+"""Envs whose actions say what happens: a number is earned, a word is a deed; and their places."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ import time
 from typing import Any
 
 import gymnasium as gym
+import pytest
+import uvloop
+from group.conftest import ON_ACTORS, ON_RAY
 
+import rlightning_aio as rl
 from rlightning_aio.errors import EnvError
+from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
-__all__ = ["AwaitedRoom", "Room"]
+__all__ = ["PLACES", "AwaitedRoom", "Room", "openenv", "rooms", "serving"]
 
 
 class Room(gym.Env[Any, Any]):
@@ -77,3 +82,34 @@ class AwaitedRoom:
     async def tool(self, number: int) -> int:
         """Something to call."""
         return self.room.tool(number)
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "loop": {"task": AwaitedRoom, "placement": "loop"},
+    "awaitable in workers": {"task": AwaitedRoom, "envs_per_process": 2},
+    "workers": {"task": Room, "envs_per_process": 1},
+    "shared workers": {"task": Room, "envs_per_process": 2},
+    "inline": {"task": Room, "placement": "inline"},
+    "openenv": {},
+}
+"""Fields of entries; those of ``openenv`` name a server: see `openenv`."""
+if ON_RAY:
+    PLACES = {"ray": {"task": Room, **ON_ACTORS, "envs_per_process": 1}}
+
+
+def openenv(url: str, **kwargs: Any) -> dict[str, Any]:
+    """Sessions of a server of rooms."""
+    fields = {"action_field": "action", "truncated_field": "truncated"}
+    return {"backend": "openenv", "task": url, "env_kwargs": {**fields, **kwargs}}
+
+
+def rooms(place: dict[str, Any], num_workers: int = 4, **fields: Any) -> rl.EnvGroup:
+    """A group that was not started."""
+    return rl.build_env_group(name="room", num_workers=num_workers, **place, **fields)
+
+
+def serving(group: rl.EnvGroup) -> OpenEnvServer:
+    """A server of its envs."""
+    if isinstance(asyncio.get_running_loop(), uvloop.Loop):
+        pytest.skip("it keeps a descriptor of a server")
+    return OpenEnvServer(group, "room", "127.0.0.1", 0)

@@ -8,9 +8,11 @@ truncated, for its action may have taken effect: no action is ever sent twice.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 import uuid
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal, Self, cast
 
 import numpy as np
@@ -235,6 +237,8 @@ class OpenEnv(BaseEnv):
         fields: dict[str, Any] = dict(data.get("observation") or {})
         inner = fields.pop("metadata", None)
         info: dict[str, Any] = dict(data.get("metadata") or inner or {})
+        with contextlib.suppress(TypeError, ValueError, KeyError):  # Other servers' is no outcome.
+            info["outcome"] = replace(Outcome.from_json(info["outcome"]), env_id=self.env_id)
         if self._columns:
             columns = {
                 name: _value_in(space, fields.pop(name)) for name, space in self._columns.items()

@@ -74,11 +74,12 @@ class ServerRefused(RuntimeError):
 
     Attributes:
         code: OpenEnv's name of the error.
+        blame: that the server gives, as ours do; or None.
     """
 
-    def __init__(self, code: str, message: str) -> None:
+    def __init__(self, code: str, message: str, blame: str | None = None) -> None:
         super().__init__(f"{code}: {message}")
-        self.code = code
+        self.code, self.blame = code, blame
 
 
 class OpenEnvSession:
@@ -322,7 +323,8 @@ def _parsed(frame: str | bytes, expected: str) -> dict[str, Any]:
 def _refusal(reply: dict[str, Any]) -> ServerRefused:
     data = reply["data"]
     details = f" ({data['errors']})" if data.get("errors") else ""
-    return ServerRefused(str(data.get("code", "ERROR")), f"{data.get('message', '')}{details}")
+    code, message = str(data.get("code", "ERROR")), f"{data.get('message', '')}{details}"
+    return ServerRefused(code, message, data.get("blame"))
 
 
 def _address(url: str, scheme: str, path: str, query: str = "") -> str:

@@ -1,0 +1,44 @@
+"""The places of attempts: each host, OpenEnv's sessions, and on Ray (`make test-ray`) actors."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest_asyncio
+from attempts.rooms import PLACES, openenv, rooms, serving
+from group import conftest as on_group
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import pytest
+
+if on_group.ON_RAY:
+    ray_nodes = on_group.ray_nodes
+    nothing_left_behind = on_group.nothing_left_behind
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """On Ray, deselect what doesn't hold for every place, and one of the two loops."""
+    here = Path(__file__).parent
+    other = [item for item in items if here in item.path.parents and _is_other(item)]
+    config.hook.pytest_deselected(items=other)
+    items[:] = [item for item in items if item not in other]
+
+
+def _is_other(item: pytest.Item) -> bool:
+    params = item.callspec.params if hasattr(item, "callspec") else {}
+    on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
+    return on_group.ON_RAY and ("place" not in params or on_asyncio)
+
+
+@pytest_asyncio.fixture(params=PLACES)
+async def place(request: pytest.FixtureRequest) -> AsyncIterator[dict[str, Any]]:
+    """Fields of an entry."""
+    if request.param != "openenv":
+        yield PLACES[request.param]
+        return
+    async with rooms(PLACES["workers"]) as group, serving(group) as server:
+        yield openenv(server.url)
