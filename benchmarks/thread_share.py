@@ -167,7 +167,7 @@ def medians(rounds: list[tuple[Any, Any]]) -> tuple[float, float]:
     return outside, all_us - outside
 
 
-def serial_tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
+def tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
     """Return the measured table, and the model."""
     lines = [
         "| Trainer's µs in a step of all | make_vec | EnvPool | ratio | low to high | target | |",
@@ -220,7 +220,7 @@ def main() -> None:
         contenders, args.rounds, args.seconds, args.only, lambda found: f"{found[0]:.0f} µs"
     )
     report = {
-        "name": "serial",
+        "name": "thread_share",
         "title": "The trainer's thread in a step",
         "rounds": args.rounds,
         "machine": machine,
@@ -228,7 +228,7 @@ def main() -> None:
             name: dict(zip(("outside_us", "other_us"), medians(rounds), strict=True))
             for name, rounds in turns.items()
         },
-        "tables": serial_tables(turns),
+        "tables": tables(turns),
         "skipped": skipped,
     }
     say(report["tables"])
