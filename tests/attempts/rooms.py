@@ -44,6 +44,10 @@ class Room(gym.Env[Any, Any]):
         """Something to call."""
         return 2 * number
 
+    def stall(self) -> None:
+        """Something that does not return."""
+        time.sleep(3600)
+
     def _observed(self) -> dict[str, Any]:
         return {**self.told, "steps": self.steps}
 
@@ -82,6 +86,10 @@ class AwaitedRoom:
     async def tool(self, number: int) -> int:
         """Something to call."""
         return self.room.tool(number)
+
+    async def stall(self) -> None:
+        """Something that does not return."""
+        await asyncio.sleep(3600)
 
 
 PLACES: dict[str, dict[str, Any]] = {

@@ -7,6 +7,8 @@ import contextlib
 import itertools
 import json
 import math
+import os
+import signal
 import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,7 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.errors import EpisodeLost, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -363,6 +366,41 @@ async def test_attempts_of_a_server_that_is_lost_are_played_at_another() -> None
     ]
     failures = Counter((o.kind, o.blame) for attempt in attempts for o in attempt.failures)
     assert failures == {("env_away", "infrastructure"): 2}
+
+
+@pytest.mark.parametrize("name", ["loop", "awaitable in workers", "workers"])
+async def test_a_call_that_is_cut_off_does_not_keep_its_env(name: str) -> None:
+    """The next attempt gets the env, although the method never returns."""
+    calls = [asyncio.Event() for _ in range(3)]
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if episode.index == 0:
+            calls[episode.spec.seed].set()
+            await episode.call("stall")
+        await calls[episode.spec.seed].wait()
+
+    async with rooms(PLACES[name], 2) as group:
+        playing = played(group, tasks(3), agent, 2, Rules(first=1))
+        found = await asyncio.wait_for(playing, HANG)
+        assert group.pending == []
+    kinds = [[attempt.outcome.kind for attempt in attempts] for attempts in found]
+    assert kinds == [["cancelled", "truncated"]] * 3
+
+
+async def test_a_call_is_not_answered_by_another_episode() -> None:
+    """The env's worker has died, and was replaced."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        os.kill(episode.last.observation["pid"], signal.SIGKILL)
+        with contextlib.suppress(WorkerDied):
+            await episode.call("tool", 1)
+        with pytest.raises(EpisodeLost, match="killed by SIGKILL"):
+            await episode.call("tool", 1)
+        return "done"
+
+    async with rooms(PLACES["workers"], 1) as group:
+        ((attempt,),) = await played(group, tasks(1), agent, 1, Rules(retries=0))
+    assert (attempt.outcome.kind, attempt.reward, attempt.result) == ("env_died", None, None)
 
 
 async def test_clients_of_an_env_server_play() -> None:

@@ -188,7 +188,7 @@ def test_an_env_that_was_not_built_anew_saves_nothing_before_its_reset() -> None
     """Its state is not that of the episode whose steps are known."""
     continuity = in_phase(LossPhase.INTACT)
     continuity.lose([0], KILLED)
-    assert continuity.lost(SLOT) == [KILLED]
+    assert continuity.why_lost(0, unless_saved=True) == KILLED
     continuity.report_losses(SLOT, STEP)
     continuity.save(0, b"somewhere", 2, before=True, is_step=False)
     assert continuity.checkpoints([0]) == (b"state",)

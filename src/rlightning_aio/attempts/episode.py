@@ -97,9 +97,9 @@ class AttemptEpisode:
         return result
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call a method of the env, such as a tool; see `EnvHandle.call`."""
+        """Call a method of the env, such as a tool; see `EnvEpisode.call`."""
         self._check_open()
-        return await self._timed(self._episode.env.call(name, *args, **kwargs))
+        return await self._timed(self._episode.call(name, *args, **kwargs))
 
     async def leave(self) -> None:
         """End what is in flight; the env is idle after that."""

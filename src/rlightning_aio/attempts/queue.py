@@ -53,14 +53,14 @@ class Job:
 
     Attributes:
         sub_env: of the env that it waits for.
-        since: when it began to wait, in monotonic seconds.
+        since: when it began to wait for an env, in monotonic seconds.
         failures: outcomes of its tries so far.
     """
 
     task: TaskInPlay
     index: int
     sub_env: int = 0
-    since: float = field(default_factory=time.monotonic)
+    since: float = 0.0
     failures: list[Outcome] = field(default_factory=list["Outcome"])
 
     @property
@@ -130,7 +130,7 @@ class AttemptQueue:
         return False
 
     def _wait(self, job: Job) -> None:
-        spec = job.spec
+        spec, job.since = job.spec, time.monotonic()
         if not spec.env_id:
             self._waiting.setdefault(spec.entry, WaitingEpisodes[Job]()).add(job)
             return
@@ -208,7 +208,6 @@ class AttemptQueue:
             job.failures.append(outcome)
             if self._results is not None:
                 self._results.add_failure(*_written_as(job), outcome)
-            job.since = time.monotonic()
             self._wait(job)
             return False
         attempt.failures = tuple(job.failures)

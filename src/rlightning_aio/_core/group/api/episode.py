@@ -50,6 +50,10 @@ class Agents:
             self._serving.add_done_callback(self._on_end)
         return step, reply
 
+    def loss(self, env_id: str) -> Outcome | None:
+        """What an idle env has lost its episode by since its newest result; None if it has not."""
+        return self._steps.loss(env_id)
+
     def _on_end(self, task: asyncio.Task[None]) -> None:
         if task is self._serving and task.cancelled():
             self._steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
@@ -84,6 +88,7 @@ class EnvEpisode:
         self._reset: asyncio.Future[tuple[BatchedData, Any]] | None = None
         # Steps that were cancelled after they had been sent.
         self._given_up: list[AgentStep] = []
+        self._has_given_up_call = False
 
     async def __aenter__(self) -> Self:
         try:
@@ -102,8 +107,9 @@ class EnvEpisode:
         if self._reset is not None:
             tasks.append(self._reset)
             self._reset = None
-        in_flight = any(not task.done() for task in tasks)
+        in_flight = any(not task.done() for task in tasks) or self._has_given_up_call
         if in_flight or any(step.is_outstanding for step in self._given_up):
+            self._has_given_up_call = False
             abort: Any = self._group.abort([self.env.env_id])
             tasks.append(asyncio.ensure_future(abort))
             # However often this is cancelled, they go on, and the env is idle in the end.
@@ -136,12 +142,38 @@ class EnvEpisode:
                 self.last, self.is_over = ret, is_over
                 return ret
             outcomes: list[Outcome] = loss.outcome.ravel().tolist()
-            self.lost = outcomes[0]
-            self.is_over = True
+            self._lose(outcomes[0])
+        raise self._error(loss)
+
+    async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call a method of the env, such as a tool, and return its value.
+
+        Cancelled, it leaves the call to the end of the episode, which aborts it. Other errors are
+        those of `EnvHandle.call`, and:
+
+        Raises:
+            EpisodeLost: the env was replaced since the newest result, so the value would be that of
+                another episode.
+        """
+        if self.lost is None:
+            try:
+                value = await self.env.call(name, *args, **kwargs)
+            except asyncio.CancelledError:
+                self._has_given_up_call = True
+                raise
+            if (lost := self._agents.loss(self.env.env_id)) is None:
+                return value
+            self._lose(lost)
+        raise self._error(None)
+
+    def _lose(self, lost: Outcome) -> None:
+        self.lost, self.is_over = lost, True
+
+    def _error(self, results: BatchedData | None) -> EpisodeLost:
         assert self.lost is not None
         lost = EpisodeLost(
             f"the episode of env {self.env.env_id!r} is lost: its env {self.lost.cause}",
             env_id=self.env.env_id,
         )
-        lost.results, lost.outcome = loss, self.lost
-        raise lost
+        lost.results, lost.outcome = results, self.lost
+        return lost

@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.steps import Steps
     from rlightning_aio._core.group.engine.waiting import Waiting
-    from rlightning_aio._core.group.state.requests import Requests, Ticket
+    from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["AgentStep", "AgentSteps", "StepEnd"]
@@ -80,8 +82,9 @@ class AgentStep:
 class AgentSteps:
     """See the module; the arguments are the group's parts."""
 
-    def __init__(self, requests: Requests, steps: Steps, waiting: Waiting) -> None:
-        self._requests = requests
+    def __init__(self, tables: Tables, steps: Steps, waiting: Waiting) -> None:
+        self._tables = tables
+        self._requests = tables.requests
         self._steps = steps
         self._waiting = waiting
         self._asked: list[AgentStep] = []
@@ -101,6 +104,11 @@ class AgentSteps:
         if len(self._asked) == 1:
             self._waiting.wake_server()
         return False
+
+    def loss(self, env_id: str) -> Outcome | None:
+        """What an idle env has lost its episode by since its newest result; None if it has not."""
+        why = self._tables.continuity.why_lost(self._tables.envs.find_one(env_id))
+        return None if why is None else why.outcome(env_id)
 
     def serve(self, now: float) -> Procedure[None]:
         """Send the steps that agents ask for, and hand out their results, until none is left."""

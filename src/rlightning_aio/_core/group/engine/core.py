@@ -80,7 +80,7 @@ class Core:
         dispatch = Dispatch(tables, supervisor, poller, waiting, parts.watcher)
         self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)
         self.newest = self.steps.newest
-        self.agent_steps = AgentSteps(requests, self.steps, waiting)
+        self.agent_steps = AgentSteps(tables, self.steps, waiting)
         self.calls = Calls(tables, dispatch, intake, waiting)
         self._snapshots = Snapshots(
             envs, supervisor, dispatch, self.calls, tables.continuity, waiting

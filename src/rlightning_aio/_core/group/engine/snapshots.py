@@ -94,6 +94,7 @@ class Snapshots:
         Each comes with why it is of no episode, or "". Its env itself can go back to it even so.
         """
         op, nothing = Operation.SNAPSHOT, [()] * len(slots)
+        each: list[int] = slots.tolist()
         positions: list[Position] = []
         losses: list[Loss | None] = []
 
@@ -101,10 +102,9 @@ class Snapshots:
             self._calls.send(now, slots, op, nothing, "nothing", ticket)
             # A worker that has replied may die before others reply.
             positions.extend(self._continuity.positions(slots))
-            losses.extend(self._continuity.lost(slots))
+            losses.extend(self._continuity.why_lost(slot, unless_saved=True) for slot in each)
 
         ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
-        each: list[int] = slots.tolist()
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, str]] = []
         for slot, (num_steps, is_cut), loss, (versions, was_reset, state) in replies:

@@ -521,13 +521,12 @@ class Continuity:
                 found.append(Position(self._num_steps.item(slot), self._cut.item(slot)))
         return found
 
-    def lost(self, slots: NDArray[np.intp]) -> list[Loss | None]:
-        """Return why each of `slots`, all idle, lost its episode; None if its position is right."""
-        losses = [(slot, self._losses.get(slot)) for slot in slots.tolist()]
-        return [
-            None if loss is None or (loss.from_checkpoint and self._checkpoint(slot)) else loss.why
-            for slot, loss in losses
-        ]
+    def why_lost(self, slot: int, *, unless_saved: bool = False) -> Loss | None:
+        """Why an idle env lost its episode; None if not, or if one `unless_saved` is to go on."""
+        loss = self._losses.get(slot)
+        if loss is None or (unless_saved and loss.from_checkpoint and self._checkpoint(slot)):
+            return None
+        return loss.why
 
     # -- checkpoints ------------------------------------------------------------------
 
