@@ -46,7 +46,7 @@ ROWS: Final[dict[str, str]] = {
     "a group is used from another": ELSEWHERE + "tests/faults/test_misuse.py, in real threads",
     "a collect while nothing": "NothingPending",
     "`deadline` passes": "deadline",
-    "an agent leaves `group.episode`": ELSEWHERE + "tests/hosts/test_loop.py, which has agents",
+    "an agent leaves `group.episode`": "attempts cancelled",
     "Ctrl-C while a synchronous group waits": "Ctrl-C in a wait",
     "… while an inline environment steps": "Ctrl-C in an env",
     "… while the group sends": "Ctrl-C in a send",

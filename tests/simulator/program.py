@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from random import Random
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from simulator.model import Entry, Env, Host, State
 from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, TIMEOUT, broken
@@ -45,6 +45,12 @@ THEMES: dict[str, tuple[tuple[str, ...], ...]] = {
     "evaluations": _OF_OTHERS,
     "vectors": _OF_OTHERS,
     "sb3": _OF_OTHERS,
+    "attempts": (
+        ("cancel", "timeouts", "die", "processes", "several envs"),
+        ("awaitable", "hang", "timeouts", "cancel", "several envs", "processes"),
+        ("raise", "ends", "several envs", "several entries"),
+        *_OF_OTHERS,
+    ),
 }
 """Features that matter to each other: half of the programs of a kind have those of a theme."""
 
@@ -211,8 +217,11 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
     "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
     "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls")}),
     "sb3": (2, ROWS),
+    "attempts": (0, {"attempts": (6, None), "kill": (2, "die")}),
 }
-"""Kinds of programs: the weight of each, and its operations."""
+"""Kinds of programs: the weight of each, and its operations; see `draw` for that of attempts."""
+_ATTEMPTS: Final = 0.06
+"""The share of programs that are of attempts, in place of what else they would be."""
 
 
 def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60) -> Program:
@@ -220,8 +229,12 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     rng = Random(seed)
     share = rng.choice((0.25, 0.5, 0.5))
     kind = rng.choices([*KINDS], [weight for weight, _ in KINDS.values()])[0]
+    if Random(seed ^ 0x5EED).random() < _ATTEMPTS:  # The draws of the others stay what they were.
+        kind = "attempts"
     theme = rng.choice(THEMES[kind]) if rng.random() < 0.5 else ()
     features = frozenset(f for f in FEATURES if f in theme or rng.random() < share) - without
+    if kind == "attempts":
+        features = features - {"stacked"} | {"async"}
     plans = [_plan(rng, features, "a")]
     if "several entries" in features:
         plans += [_plan(rng, features, name) for name in "bc"[: rng.randint(1, 2)]]
@@ -239,7 +252,7 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
     # A few of them make up most of a program.
     weights = [ops_of_kind[name][0] * rng.choice((0.2, 1.0, 5.0)) for name in names]
-    most = num_ops if kind in ("group", "vectors", "sb3") else num_ops // 5
+    most = num_ops // {"attempts": 10, "training": 5, "evaluations": 5}.get(kind, 1)
     count = rng.randint(most // 4, most)
     ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]
     begins = kind in ("group", "vectors", "sb3") and rng.random() < 0.8

@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from simulator.attempting import Attempts
 from simulator.coverage import watch
 from simulator.play import Play
 from simulator.program import draw
@@ -35,6 +36,7 @@ SESSIONS: Final[dict[str, type[Session]]] = {
     "evaluations": Evaluations,
     "vectors": Vectors,
     "sb3": Singles,
+    "attempts": Attempts,
 }
 
 transitions: Counter[str] = Counter()

@@ -51,7 +51,7 @@ class Agents:
         return step, reply
 
     def loss(self, env_id: str) -> Outcome | None:
-        """What an idle env has lost its episode by since its newest result; None if it has not."""
+        """The loss of an idle env's episode since its newest result; None if it has not lost it."""
         return self._steps.loss(env_id)
 
     def _on_end(self, task: asyncio.Task[None]) -> None:

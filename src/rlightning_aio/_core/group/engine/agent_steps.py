@@ -106,7 +106,7 @@ class AgentSteps:
         return False
 
     def loss(self, env_id: str) -> Outcome | None:
-        """What an idle env has lost its episode by since its newest result; None if it has not."""
+        """The loss of an idle env's episode since its newest result; None if it has not lost it."""
         why = self._tables.continuity.why_lost(self._tables.envs.find_one(env_id))
         return None if why is None else why.outcome(env_id)
 

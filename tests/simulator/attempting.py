@@ -1,0 +1,390 @@
+"""Programs of `play`: agents that raise, hang, stop early or go on, and iterators that are left.
+
+Each agent notes what it did and how it ended. From that follows what its attempt must say; the
+rewards of the attempt must be those of a script that does the same alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import tempfile
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from simulator.model import Violation, require
+from simulator.scripted import Script, words_of
+from simulator.session import action_of
+from simulator.training import InContext
+from simulator.world import Faults
+
+from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.attempts.rules import is_retried
+from rlightning_aio.errors import BadAction, EnvFault, RLightningError, WorkerDied
+from rlightning_aio.outcomes import BLAMES, is_bystanders
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from simulator.model import Env
+    from simulator.scripted import Act
+
+    from rlightning_aio.attempts import Attempt, AttemptEpisode, AttemptGroup
+
+_LOST: Final = ("env_died", "env_hung", "env_raised", "not_started")
+_SIZED: Final = ("vector", "single", "digits", "number")
+
+
+class AgentFailed(Exception):
+    """As an agent may."""
+
+    def __init__(self, blame: str) -> None:
+        super().__init__(f"an agent that fails by {blame}")
+        self.blame = blame
+
+
+@dataclass
+class Played:
+    """What an agent did.
+
+    Attributes:
+        episode: what it got.
+        acts: of the steps that returned a result.
+        end: ``over``, ``stopped`` or ``cancelled``, or the kind of its failure.
+    """
+
+    episode: AttemptEpisode
+    acts: list[Act] = field(default_factory=list)
+    end: str = ""
+
+
+class Attempts(InContext):
+    """A run of a program that plays groups of attempts."""
+
+    def begin(self) -> None:
+        super().begin()
+        self.metas = {meta.env_id.rpartition("-")[0]: meta for meta in self.group.metas}
+        self.has_ended = False
+
+    def drawn_limit(self, rng: Random) -> float | None:
+        return rng.choice([None, None, math.inf, 3, 5])
+
+    # -- agents
+
+    async def agent(self, episode: AttemptEpisode) -> Any:
+        """Play an attempt, and note how it ended."""
+        played = Played(episode)
+        tries = self.played.setdefault((episode.spec.key, episode.index), [])
+        number = f"{self.op_seed} {episode.spec.seed} {episode.index} {len(tries)}"
+        tries.append(played)
+        try:
+            swallows = await self._play(Random(number), played)
+        except EnvFault as fault:
+            played.end = fault.outcome.kind
+            raise
+        except (AgentFailed, BadAction):
+            played.end = "agent_raised"
+            raise
+        except asyncio.CancelledError:
+            played.end = "cancelled"
+            if Random(number).random() < 0.2:
+                self.stubborn.add(asyncio.current_task())
+                await self._go_on(episode)
+            raise
+        played.end = swallows or ("over" if episode.is_over else "stopped")
+        return number
+
+    async def _go_on(self, episode: AttemptEpisode) -> None:
+        """Ignore a cancellation."""
+        await asyncio.sleep(5)
+        with self.expected(RLightningError, "a step after the end"):
+            await episode.step(None)
+
+    async def _play(self, rng: Random, played: Played) -> str:
+        """Step until the end, or fail; return the kind of a failure that is not raised."""
+        episode = played.episode
+        env = self.by_id[episode.env_id]
+        while not episode.is_over:
+            if not self.plain:
+                await self._dawdle(rng, env, episode)
+                if rng.random() < 0.1:
+                    return ""
+                if "calls" in self.features and rng.random() < 0.2:
+                    self._check_value(played, await episode.call("peek", 7))
+            elif len(played.acts) >= 4:
+                return ""
+            (act,) = self.acts(rng, env, plain=self.plain)
+            env.hangs += env.entry.form == "awaitable" and act[0].startswith("hang")
+            columns = {"tokens": [len(played.acts)]} if "extras" in self.features else {}
+            try:
+                await episode.step(action_of(env, [act]), **columns)
+            except EnvFault as fault:
+                if rng.random() < 0.3:
+                    return fault.outcome.kind
+                raise
+            played.acts.append(act)
+        return ""
+
+    async def _dawdle(self, rng: Random, env: Env, episode: AttemptEpisode) -> None:
+        """Do what agents do between two steps."""
+        if rng.random() < 0.3:
+            await asyncio.sleep(10 ** rng.uniform(-5, 0))
+        if "raise" in self.features and rng.random() < 0.05:
+            raise AgentFailed(rng.choice(["infrastructure", "env", "policy", "caller"]))
+        if "misuse" in self.features and env.entry.controls in _SIZED and rng.random() < 0.05:
+            self.counts["BadAction"] += 1
+            await episode.step(np.zeros((3, 3, 7)))
+        if self.may_hang and rng.random() < 0.05:
+            await asyncio.Event().wait()
+
+    def _check_value(self, played: Played, value: Any) -> None:
+        words, _ = value
+        right = tuple(self._script(played).words)
+        found = tuple(words[0])
+        require(_without_episode(found) == _without_episode(right), "another state", found, right)
+
+    # -- operations
+
+    plain = False
+
+    async def op_attempts(self, rng: Random) -> None:
+        if self.has_ended:
+            return
+        self.op_seed, self.played, self.stubborn = rng.getrandbits(32), {}, set()
+        specs = self._specs(rng)
+        size, rules = rng.randint(1, 4), self._rules(rng)
+        leave = self._leave(rng, len(specs))
+        leaves = leave != (None, None)
+        may_time_out = rules.attempt_timeout is not None
+        self.may_hang = may_time_out or leave[0] is not None
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "attempts" if rng.random() < 0.3 else None
+            self.has_file = path is not None
+            tasks = partial(_loaded, specs) if rng.random() < 0.3 else specs.copy
+            playing = partial(self._played, tasks, size, rules, path)
+            found = await playing(*leave)
+            if path is not None and not self.has_ended:
+                self.may_hang = may_time_out
+                await playing(None, None)
+                self._check_file(path, specs, size, rules)
+        if not (leaves or self.has_ended):
+            keys = sorted(one.spec.key for one in found)
+            require(keys == sorted(spec.key for spec in specs), "other groups", keys)
+        if self.stubborn:
+            await asyncio.wait(self.stubborn)
+
+    def _specs(self, rng: Random) -> list[EpisodeSpec]:
+        specs: list[EpisodeSpec] = []
+        for k in range(rng.randint(1, 6)):
+            name, options = rng.choice([*self.metas]), rng.choice([None, {"token": 1 + k}])
+            seed = 100 * k + rng.randrange(100)
+            specs.append(EpisodeSpec(self.metas[name].task, seed, options, name))
+        return specs
+
+    def _rules(self, rng: Random) -> Rules:
+        times = "timeouts" in self.features and rng.random() < 0.6
+        kind = rng.choice(["all", "all", "at_least", "first"])
+        return Rules(
+            attempt_timeout=10 ** rng.uniform(-3, 1) if times and not self.plain else None,
+            on_timeout=rng.choice(["fail", "end"]),
+            retries=rng.randint(0, 3),
+            at_least=rng.randint(1, 4) if kind == "at_least" else None,
+            first=rng.randint(1, 4) if kind == "first" else None,
+            max_concurrency=rng.choice([None, None, 1, 2]),
+        )
+
+    def _leave(self, rng: Random, count: int) -> tuple[float | None, int | None]:
+        """Seconds after which the iterator is cancelled, or groups after which it is closed."""
+        if self.plain or "cancel" not in self.features or rng.random() < 0.5:
+            return None, None
+        if rng.random() < 0.3:
+            return None, rng.randint(1, count)
+        return 10 ** rng.uniform(-6, 1), None
+
+    async def _played(
+        self,
+        tasks: Callable[[], Any],
+        size: int,
+        rules: Rules,
+        path: Path | None,
+        seconds: float | None,
+        most: int | None,
+    ) -> list[AttemptGroup]:
+        """Play to the end, or leave the iterator; check what it leaves behind."""
+        found: list[AttemptGroup] = []
+
+        async def taken() -> None:
+            with ResultsFile(path) if path else contextlib.nullcontext() as results:
+                groups = play(self.group, tasks(), self.agent, size, rules, results)
+                async with contextlib.aclosing(groups):
+                    async for attempts in groups:
+                        self._check_group(attempts, size, rules)
+                        found.append(attempts)
+                        if len(found) == most:
+                            return
+
+        taking = asyncio.create_task(taken())
+        await asyncio.wait({taking}, timeout=seconds)
+        if not taking.done():
+            taking.cancel()
+            await self._in_time(taking)
+        try:
+            await taking
+        except asyncio.CancelledError:
+            require(seconds is not None, "cancelled by nobody")
+            self.counts["attempts cancelled"] += 1
+        except RLightningError as error:
+            self.count(error)
+            self._end(error)
+        require(not self.group.pending, "pending after all attempts", self.group.pending)
+        ends = [one.end for tries in self.played.values() for one in tries]
+        require(all(ends), "an agent plays on", ends)
+        return found
+
+    async def _in_time(self, taking: asyncio.Task[None]) -> None:
+        """All envs are free within a second of a cancellation, unless the world is slow."""
+        faults, slow = self.program.faults, "slow" in self.features
+        is_calm = faults == Faults(deaths=faults.deaths) and not slow
+        _, late = await asyncio.wait({taking}, timeout=1.0 if is_calm else self.hang)
+        require(not late, "the envs are not free in time")
+
+    def _end(self, error: RLightningError) -> None:
+        """Check that all envs are gone that could play something."""
+        given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
+        entries = {env.entry.name for env in self.envs if env.env_id not in given_up}
+        require(given_up and entries != {*self.metas}, "no env is left", repr(error))
+        if isinstance(error, WorkerDied):
+            self.lose(error)
+        self.has_ended = True
+
+    # -- what came of them
+
+    def _check_group(self, attempts: AttemptGroup, size: int, rules: Rules) -> None:
+        indices = [one.index for one in attempts]
+        require(indices == [*range(size)], "other attempts", indices)
+        whole = len(attempts.rewards)
+        needed = min(size, rules.first or rules.at_least or size)
+        require(attempts.is_complete == (whole >= needed), "complete, or not", attempts)
+        require(rules.first is None or whole <= needed, "more than the first", attempts)
+        self.counts["groups of attempts"] += 1
+        self.counts["complete groups"] += attempts.is_complete
+        for attempt in attempts:
+            self.counts["attempts"] += 1
+            self.counts[f"attempts {attempt.outcome.kind}"] += 1
+            self.counts["attempts tried again"] += bool(attempt.failures)
+            try:
+                self._check(attempt, rules, is_full=whole >= needed)
+            except Violation as violation:
+                raise Violation(f"{violation}\n  {attempt}") from None
+
+    def _check(self, attempt: Attempt, rules: Rules, *, is_full: bool) -> None:
+        """An attempt ends as its agent and its env did, or says why it has not."""
+        outcome = attempt.outcome
+        outcomes = [*attempt.failures, outcome]
+        numbers = [one.attempt for one in outcomes]
+        require(numbers == [*range(len(outcomes))], "tries that are not counted", numbers)
+        for one in outcomes:
+            require(bool(one.cause) and one.blame in BLAMES, "without a cause", one)
+        require(all(map(is_retried, attempt.failures)), "tried again, and it should not be")
+        counted = sum(not is_bystanders(one) for one in attempt.failures)
+        require(counted <= rules.retries, "tried too often", counted)
+        may_go_on = is_bystanders(outcome) or counted < rules.retries
+        require(not (is_retried(outcome) and may_go_on), "not tried again")
+        if outcome.kind == "cancelled":
+            require(rules.first is not None and is_full, "cancelled, and no surplus")
+        require(min(outcome.seconds) >= 0, "less than no time")
+        require((attempt.reward is None) == outcome.is_failure, "a failure with a reward")
+        require(outcome.is_failure <= (attempt.success is None), "a failure that succeeds")
+        tries = self.played.get((attempt.spec.key, attempt.index), [])
+        own = [one for one in tries if one.episode.columns is attempt.columns]
+        if own:
+            self._compare(attempt, own[0], rules)
+        elif not self.has_file:
+            kinds = (*_LOST, "timed_out", "cancelled")
+            require(outcome.kind in kinds, "it has not failed, and nobody has played it")
+            require(not attempt.length, "nobody has played it, and it has a length")
+
+    def _compare(self, attempt: Attempt, played: Played, rules: Rules) -> None:
+        """Check an attempt against what its agent did, and what a script alone does."""
+        outcome, env = attempt.outcome, self.by_id[attempt.env_id]
+        require(env.entry.name == attempt.spec.entry, "an env of another entry")
+        script = self._script(played, steps=0)
+        self._check_shown(env, attempt.first, script)
+        rewards: list[float] = []
+        ended = cut = False
+        for act in played.acts:
+            reward, ended, cut, _ = script.step(*act)
+            rewards.append(reward)
+        require(attempt.rewards == rewards, "other rewards", rewards)
+        require(attempt.length == len(rewards), "another length", len(rewards))
+        sizes = {len(column) for column in attempt.columns.values()}
+        require(sizes <= {len(rewards)}, "columns of another length", sizes)
+        cut |= len(rewards) >= (self.limit or math.inf)
+        is_timeout = rules.attempt_timeout is not None
+        if played.end == "over":
+            kind = "terminated" if ended else "truncated"
+            require(ended or cut, "over, and nothing has ended it")
+            require(outcome.kind == kind, "another end", kind)
+        elif played.end == "stopped":
+            require(outcome.kind == "truncated", "another end", played.end)
+        elif played.end == "cancelled":
+            own = ["cancelled"]
+            own += ["timed_out" if rules.on_timeout == "fail" else "truncated"] * is_timeout
+            require(outcome.kind in own, "another end", own)
+        else:
+            require(outcome.kind == played.end, "another failure", played.end)
+        if outcome.kind not in _LOST and "zero_copy" not in self.features:
+            self._check_shown(env, attempt.last, script)
+        if not outcome.is_failure:
+            require(attempt.reward == sum(rewards), "another reward", sum(rewards))
+
+    def _script(self, played: Played, steps: int | None = None) -> Script:
+        """The script of an env, where some steps of an attempt lead to."""
+        env, spec = self.by_id[played.episode.env_id], played.episode.spec
+        script = Script(env.codes[0], env.entry.own_limit)
+        script.reset(spec.seed, None if spec.options is None else {**spec.options})
+        for act in played.acts[:steps]:
+            script.step(*act)
+        return script
+
+    def _check_shown(self, env: Env, observation: Any, script: Script) -> None:
+        shown = words_of(env.entry.layout, observation)
+        own = _without_episode(shown), _without_episode(script.words)
+        require(own[0] == own[1], "another observation", shown, script.words)
+
+    def _check_file(self, path: Path, specs: list[EpisodeSpec], size: int, rules: Rules) -> None:
+        """A file has each attempt once, and none is missing."""
+        with ResultsFile(path) as results:
+            places = [(one.spec.key, one.index) for one in results.played]
+            whole = [one.spec.key for one in results.played if not one.outcome.is_failure]
+        require(len({*places}) == len(places), "an attempt is twice in the file", places)
+        if self.has_ended:
+            return
+        for spec in specs:
+            count = sum(key == spec.key for key, _ in places)
+            enough = rules.first is not None and whole.count(spec.key) >= rules.first
+            require(count == size or enough, "an attempt is missing in the file", spec, count)
+
+    async def finish(self) -> None:
+        self.plain = True
+        given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
+        self.has_ended |= bool(given_up)
+        await self.op_attempts(Random(1))
+        await super().finish()
+
+
+async def _loaded(specs: list[EpisodeSpec]) -> Any:
+    for spec in specs:
+        await asyncio.sleep(0.01)
+        yield spec
+
+
+def _without_episode(words: Any) -> tuple[int, ...]:
+    """How many episodes an env has played before is not part of an episode."""
+    code, seed, _, step, mix = words
+    return code, seed, step, mix
