@@ -34,7 +34,7 @@ def _is_other(item: pytest.Item) -> bool:
     return on_group.ON_RAY and ("place" not in params or on_asyncio)
 
 
-@pytest_asyncio.fixture(params=PLACES)
+@pytest_asyncio.fixture(params=[name for name in PLACES if (name == "ray") == on_group.ON_RAY])
 async def place(request: pytest.FixtureRequest) -> AsyncIterator[dict[str, Any]]:
     """Fields of an entry."""
     if request.param != "openenv":

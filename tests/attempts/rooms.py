@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import uvloop
-from group.conftest import ON_ACTORS, ON_RAY
+from group.conftest import ON_ACTORS
 
 import rlightning_aio as rl
 from rlightning_aio.errors import EnvError
@@ -99,10 +99,9 @@ PLACES: dict[str, dict[str, Any]] = {
     "shared workers": {"task": Room, "envs_per_process": 2},
     "inline": {"task": Room, "placement": "inline"},
     "openenv": {},
+    "ray": {"task": Room, **ON_ACTORS, "envs_per_process": 1},
 }
 """Fields of entries; those of ``openenv`` name a server: see `openenv`."""
-if ON_RAY:
-    PLACES = {"ray": {"task": Room, **ON_ACTORS, "envs_per_process": 1}}
 
 
 def openenv(url: str, **kwargs: Any) -> dict[str, Any]:

@@ -35,6 +35,7 @@ class Players:
         self._group = group
         self._metas = {meta.env_id: meta for meta in group.metas}
         self._players: dict[str, _Player] = {}
+        self._kinds: dict[_Player, None] = {}  # All that differ, the newest last.
         self._task_of: dict[str, str] = {}  # That each env has, or has begun to switch to.
         self.entry_of: dict[str, str] = {}
         self.gone: set[str] = set()
@@ -53,6 +54,8 @@ class Players:
                 if meta is not None:
                     player = _Player(worker["entry"], meta.task, meta.switches_task)
                 self._players[env_id], self._task_of[env_id] = player, player.task
+                self._kinds.pop(player, None)
+                self._kinds[player] = None
                 self.entry_of[env_id] = player.entry
             self.gone.update(worker["given_up"])
         return present - self.gone
@@ -66,17 +69,16 @@ class Players:
         """
         if not isinstance(cast("Any", spec), EpisodeSpec):
             raise TypeError(f"episodes should be EpisodeSpec, not {spec!r}")
-        entries = dict.fromkeys(self.entry_of.values())
+        entries = dict.fromkeys(player.entry for player in self._kinds)
         if spec.entry not in ("", *entries):
             raise ValueError(f"there is no entry {spec.entry!r}; entries are {', '.join(entries)}")
         if spec.env_id not in ("", *self._players):
             raise ValueError(f"there is no env {spec.env_id!r} to play {spec}")
+        kinds = self._kinds if not spec.env_id else [self._players[spec.env_id]]
         able = {
             player.entry: player
-            for env_id, player in self._players.items()
-            if spec.entry in ("", player.entry)
-            and spec.env_id in ("", env_id)
-            and _can_play(player, spec.task)
+            for player in kinds
+            if spec.entry in ("", player.entry) and _can_play(player, spec.task)
         }
         exact = {entry: player for entry, player in able.items() if player.task == spec.task}
         found = exact if len(exact) == 1 else able
@@ -113,6 +115,8 @@ class Players:
 
     def can_play(self, entries: Iterable[str]) -> bool:
         """Return True unless all envs of one of these entries are gone."""
+        if not self.gone:
+            return True
         left = {entry for env_id, entry in self.entry_of.items() if env_id not in self.gone}
         return left.issuperset(entries)
 

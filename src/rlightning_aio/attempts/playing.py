@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 __all__ = ["play"]
 
+_BURST: Final = 16
+"""Most attempts that begin in one turn of the event loop, so that it is free for others."""
 _LOOK_SECONDS: Final = 0.2
 """Between looks for clients of env_servers that have come."""
 _SURPLUS: Final = "enough other attempts at its task have ended"
@@ -140,7 +142,9 @@ class _Engine:
                 self._wake.clear()
                 while self._ended:
                     self._end(self._ended.popleft())
-                self._begin()
+                if self._begin():
+                    await asyncio.sleep(0)
+                    continue
                 lacking = self._entries_without_env()
                 if not self._playing and not lacking and self._source.is_at_end:
                     return
@@ -169,19 +173,25 @@ class _Engine:
         envs = len(self._queue.free) + len(self._playing)
         return min(envs, self._rules.max_concurrency or envs)
 
-    def _begin(self) -> None:
-        """Begin attempts on idle envs, and read more tasks while envs are idle."""
-        queue = self._queue
+    def _begin(self) -> bool:
+        """Begin attempts on idle envs, and read more tasks while envs are idle.
+
+        Returns True if there are more than one turn of the event loop may begin.
+        """
+        queue, begun = self._queue, 0
         while True:
             while len(self._playing) < self._most and (env_id := queue.next_env()):
+                if begun == _BURST:
+                    return True
                 self._start(env_id)
+                begun += 1
             room = max(self._most, 1)
             is_full = len(self.done) * self._size >= room or len(queue) >= room
             if is_full or len(self._playing) >= room or not queue.free:
-                return
+                return False
             spec = self._source.next(self._wake)
             if spec is None:
-                return
+                return False
             queue.add(spec, self._size)
 
     def _start(self, env_id: str) -> None:
@@ -217,11 +227,12 @@ class _Engine:
         """Hand over the attempts at a task, and cancel those that are left of it."""
         task.is_settled = True
         left: list[Job] = []
-        for job, one in self._playing.values():
-            if job.task is task:
-                one.stop(_SURPLUS)
-                left.append(job)
-        left += self._queue.withdraw(task)
+        if len(task.attempts) < task.size:
+            for job, one in self._playing.values():
+                if job.task is task:
+                    one.stop(_SURPLUS)
+                    left.append(job)
+            left += self._queue.withdraw(task)
         for job in left:
             cancelled = Outcome("cancelled", "caller", _SURPLUS, attempt=len(job.failures))
             task.attempts[job.index] = Attempt(

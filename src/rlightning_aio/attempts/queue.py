@@ -161,7 +161,7 @@ class AttemptQueue:
 
     def next_env(self) -> str | None:
         """The next idle env that an attempt waits for; None if there is none."""
-        return next(filter(self._has_job, self.free), None)
+        return next(filter(self._has_job, self.free), None) if len(self) else None
 
     def _has_job(self, env_id: str) -> bool:
         pinned = self._pinned.get(env_id)
@@ -225,6 +225,8 @@ class AttemptQueue:
 
     def lacking(self, busy: set[str]) -> list[str]:
         """The entries of attempts that wait for envs of which none is free or `busy`."""
+        if not len(self):
+            return []
         entry_of, there = self.players.entry_of, {*self.free, *busy}
         entries = {entry_of[env_id] for env_id in there}
         found = [entry for entry in self._entries() if entry not in entries]
