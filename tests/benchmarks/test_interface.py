@@ -8,9 +8,9 @@ from pathlib import Path
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "interface.py"
 MOST = {
-    "names": 91,
-    "members": 411,
-    "arguments": 482,
+    "names": 87,
+    "members": 389,
+    "arguments": 469,
     "fields": 25,
     "commands": 9,
     "options": 31,
