@@ -118,6 +118,15 @@ def test_each_episode_runs_once_on_any_free_env() -> None:
     assert (success.mean, success.count) == (0.5, 4)
 
 
+def test_an_env_continues_with_the_task_of_an_episode_that_only_it_may_play() -> None:
+    """A switch takes time, so that it plays all that waits of this task first."""
+    pinned = EpisodeSpec("2", 0, env_id="env-0")
+    others = [EpisodeSpec(task, seed) for seed, task in enumerate("111223", start=1)]
+    seen: list[Attempt] = []
+    evaluated(group_of(1), [*others, pinned], on_episode=seen.append)
+    assert [one.spec.task for one in seen] == ["2", "2", "2", "1", "1", "1", "3"]
+
+
 def test_options_reach_the_reset() -> None:
     """They make episodes of one seed different ones."""
     options = [None, {"longer": 1}, {"longer": 2}]

@@ -36,7 +36,7 @@ class Players:
         self._metas = {meta.env_id: meta for meta in group.metas}
         self._players: dict[str, _Player] = {}
         self._kinds: dict[_Player, None] = {}  # All that differ, the newest last.
-        self._task_of: dict[str, str] = {}  # That each env has, or has begun to switch to.
+        self._task_of: dict[str, str] = {}  # Each env's own, or that of its last reset.
         self.entry_of: dict[str, str] = {}
         self.gone: set[str] = set()
         self.refresh()
@@ -95,21 +95,20 @@ class Players:
         return replace(spec, entry=entry, task=spec.task or player.task)
 
     def take(self, env_id: str, waiting: WaitingEpisodes[W]) -> W:
-        """Remove the episode of its entry that an env is to play, which it has begun then."""
+        """Remove the episode of its entry that an env is to play."""
         entry = self.entry_of[env_id]
         others = (
             task
             for other, task in self._task_of.items()
             if other not in (env_id, *self.gone) and self.entry_of[other] == entry
         )
-        episode = waiting.take(self._task_of[env_id], others)
-        self._task_of[env_id] = episode.spec.task
-        return episode
+        return waiting.take(self._task_of[env_id], others)
 
-    def options(self, env_id: str, spec: EpisodeSpec) -> dict[str, Any] | None:
-        """The options of the reset with which an env begins an episode."""
+    def begin(self, env_id: str, spec: EpisodeSpec) -> dict[str, Any] | None:
+        """Note the task of an env that begins an episode; return the options of its reset."""
         options = None if spec.options is None else {**spec.options}
         if self._players[env_id].switches_task:
+            self._task_of[env_id] = spec.task
             return {"task": spec.task, **(options or {})}
         return options
 

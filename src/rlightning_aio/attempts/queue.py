@@ -195,7 +195,7 @@ class AttemptQueue:
     def begin(self, env_id: str, job: Job) -> tuple[int | None, dict[str, Any] | None]:
         """Seed and options of the reset that begins an attempt on an env."""
         seed = self._rules.seed(job.spec, job.index)
-        return seed, self.players.options(env_id, job.spec)
+        return seed, self.players.begin(env_id, job.spec)
 
     # -- what has ended ---------------------------------------------------------------
 
