@@ -14,6 +14,7 @@ from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
 from rlightning_aio import Outcome
+from rlightning_aio.attempts import Attempt
 from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo, ResultsFile
 
 
@@ -101,6 +102,21 @@ def test_failures_in_the_file_count(tmp_path: Path) -> None:
         (attempt,) = found.failed
         assert (attempt.outcome.kind, attempt.outcome.attempt) == ("env_raised", 1)
         assert (attempt.failures, attempt.reward) == ((died,), None)
+
+
+def test_failures_of_a_task_that_is_there_twice_are_counted_apart(tmp_path: Path) -> None:
+    """Those of the one that has ended are forgotten, also when the file is read again."""
+    path, spec = tmp_path / "results.jsonl", EpisodeSpec("1", 0, entry="env")
+    first = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
+    second = Outcome("env_raised", "either", "raised ValueError", "env-1")
+    with ResultsFile(path) as results:
+        results.add_failure(spec, 0, 0, first)
+        results.add_failure(spec, 0, 0, second)
+        ended = Outcome("terminated", "policy", "its episode ended", "env-0", attempt=1)
+        results.add(Attempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
+        assert results.failures(spec, 0) == [second]
+    with ResultsFile(path) as results:
+        assert results.failures(spec, 0) == [second]
 
 
 class Dies(Tasks):

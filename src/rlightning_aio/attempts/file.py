@@ -119,7 +119,10 @@ class ResultsFile:
 
     def _note(self, attempt: Attempt) -> None:
         self.played.append(attempt)
-        self._failures.pop(_place(attempt), None)
+        left = self._failures.get(_place(attempt), [])
+        for outcome in attempt.failures:  # The task may be there twice; the rest is the other's.
+            if outcome in left:
+                left.remove(outcome)
 
     # -- lines ------------------------------------------------------------------------
 
