@@ -1,10 +1,11 @@
 """PPO on CartPole while one step in 2,000 raises, ends its process or hangs.
 
-Stable-Baselines3's PPO trains through `sb3.VecEnv` and through `VectorEnv`, with and without the
-faults; the return is the mean of the last 100 episodes. Gymnasium's `AsyncVectorEnv` is given the
-same envs.
+Stable-Baselines3's PPO trains with and without the faults, through `sb3.VecEnv`, `VectorEnv` and
+`Collector`. The return is that of 40 episodes, without faults, of what was learned. The envs note
+each fault in a file before it happens; counted are the outcomes in `group.metrics()`. Gymnasium's
+`AsyncVectorEnv` is given the same envs, with one kind of fault at a time.
 
-    python benchmarks/faulty_training.py [--steps 30000] [--seeds 3] [--json]
+    python benchmarks/faulty_training.py [--steps 30000] [--seeds 5] [--json]
 """
 
 from __future__ import annotations
@@ -13,121 +14,163 @@ import argparse
 import json
 import os
 import random
+import statistics
 import subprocess
 import sys
+import tempfile
 import time
+from collections import Counter
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import gymnasium as gym
-import numpy as np
 from harness import machine_facts, machine_text
 
 SHARE: Final = 1 / 2000
-NUM_ENVS, PATIENCE_SECONDS = 8, 120.0
-WAYS = ("sb3.VecEnv", "VectorEnv", "AsyncVectorEnv")
+KINDS: Final = {"raises": "env_raised", "dies": "env_died", "hangs": "env_hung"}
+NUM_ENVS, NUM_STEPS, EPISODES = 8, 128, 40
+PATIENCE_SECONDS: Final = 120.0
+WAYS = ("sb3.VecEnv", "VectorEnv", "Collector")
 
 
 class Faulty(gym.Wrapper[Any, Any, Any, Any]):
-    """Some of its steps raise, end the process or hang; which is drawn from the system."""
+    """Some of its steps go wrong, after a line in a file; which is drawn from the system."""
 
-    def __init__(self, env: Any, share: float) -> None:
+    def __init__(self, env: Any, kinds: list[str], log: str) -> None:
         super().__init__(env)
-        self.share, self.rng = share, random.SystemRandom()
+        self.kinds, self.log, self.rng = kinds, log, random.SystemRandom()
 
     def step(self, action: Any) -> Any:
-        if self.rng.random() < self.share:
-            fault = self.rng.choice(("raise", "die", "hang"))
-            if fault == "raise":
+        if self.kinds and self.rng.random() < SHARE:
+            fault = self.rng.choice(self.kinds)
+            with open(self.log, "a") as file:  # noqa: PTH123  # Lines of several processes.
+                file.write(f"{KINDS[fault]}\n")
+            if fault == "raises":
                 raise RuntimeError("a fault")
-            if fault == "die":
+            if fault == "dies":
                 os._exit(3)
             time.sleep(3600)
         return self.env.step(action)
 
 
-def pole(share: float) -> Any:
-    return Faulty(gym.make("CartPole-v1"), share)
+def pole(kinds: list[str], log: str) -> Any:
+    return Faulty(gym.make("CartPole-v1"), kinds, log)
 
 
-def envs_of(way: str, share: float) -> Any:
-    """The envs as a `VecEnv`, and their group if they have one."""
+def learner_of(way: str, make: Any, seed: int) -> tuple[Any, Any]:
+    """PPO on 8 envs, and their group if they have one."""
     from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+    from learner_of_collector import LearnerOfCollector
+    from stable_baselines3 import PPO
 
-    from rlightning_aio import sb3
+    from rlightning_aio import sb3, sync
     from rlightning_aio.vector import VectorEnv
 
-    makers = [partial(pole, share)] * NUM_ENVS
-    fields: dict[str, Any] = {"step_timeout": 2, "on_env_error": "restart", "envs_per_process": 1}
+    same_step: Any = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    fields: dict[str, Any] = {"step_timeout": 3, "on_env_error": "restart", "envs_per_process": 1}
+    given: dict[str, Any] = {"n_steps": NUM_STEPS, "seed": seed, "device": "cpu"}
+    if way == "Collector":
+        group = sync.build_env_group(make, num_workers=NUM_ENVS, name="env", **fields)
+        group.init()
+        return LearnerOfCollector(group, NUM_STEPS * NUM_ENVS, **given), group
     if way == "sb3.VecEnv":
-        envs = sb3.VecEnv(makers, **fields)
-        return envs, envs.group
-    if way == "VectorEnv":
-        envs = VectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP, **fields)
-        return sb3.VecEnv(envs), envs.group
-    return sb3.VecEnv(AsyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)), None
+        envs: Any = sb3.VecEnv([make] * NUM_ENVS, **fields)
+    elif way == "VectorEnv":
+        envs = VectorEnv([make] * NUM_ENVS, **same_step, **fields)
+    else:
+        envs = AsyncVectorEnv([make] * NUM_ENVS, **same_step)
+    wrapped = envs if way == "sb3.VecEnv" else sb3.VecEnv(envs)
+    return PPO("MlpPolicy", wrapped, **given), getattr(envs, "group", None)
 
 
-def train(way: str, share: float, seed: int, steps: int) -> None:
-    """Train, and print the return and the failures by kind."""
+def train(way: str, kinds: list[str], seed: int, steps: int) -> dict[str, Any]:
+    """Return what was learned, and the faults."""
     import torch
-    from stable_baselines3 import PPO
-    from stable_baselines3.common.vec_env import VecMonitor
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
 
     torch.set_num_threads(1)
-    envs, group = envs_of(way, share)
-    model = PPO("MlpPolicy", VecMonitor(envs), n_steps=128, seed=seed, device="cpu")
-    model.learn(steps)
-    buffer: Any = model.ep_info_buffer
-    found = {"return": float(np.mean([one["r"] for one in buffer]))}
+    with tempfile.NamedTemporaryFile("r") as log:
+        learner, group = learner_of(way, partial(pole, kinds, log.name), seed)
+        learner.learn(steps)
+        injected = Counter(log.read().split())
+    counted: dict[str, int] = {}
     if group is not None:
-        kinds = {key.removeprefix("envs/outcomes_"): n for key, n in group.metrics().items()}
-        found |= {kind: kinds[kind] for kind in ("env_raised", "env_died", "env_hung")}
-    print(json.dumps(found), flush=True)
-    os._exit(0)
+        metrics = group.metrics()
+        counted = {kind: int(metrics[f"envs/outcomes_{kind}"]) for kind in KINDS.values()}
+        group.close()
+    fresh = make_vec_env("CartPole-v1", EPISODES, seed=seed)
+    mean, _ = evaluate_policy(learner, fresh, EPISODES, deterministic=False)
+    return {"return": mean, "injected": {k: injected[k] for k in counted}, "counted": counted}
 
 
-def run(way: str, share: float, seed: int, steps: int) -> Any:
-    """Train in a process of its own."""
-    command = [sys.executable, __file__, "--way", way, "--share", str(share)]
-    command += ["--seed", str(seed), "--steps", str(steps)]
-    try:
-        ended = subprocess.run(
-            command, capture_output=True, text=True, timeout=PATIENCE_SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return f"hung: given up after {PATIENCE_SECONDS:g} s"
-    lines = [line for line in ended.stdout.splitlines() if line.startswith('{"')]
-    if ended.returncode == 0 and lines:
-        return json.loads(lines[-1])
-    return f"ended by {ended.stderr.strip().splitlines()[-1]}"
+def run(way: str, kinds: list[str], seeds: int, steps: int) -> Any:
+    """Train in a process of its own, with one seed after the other."""
+    command = [sys.executable, __file__, "--way", way, "--kinds", *kinds]
+    command += ["--seeds", str(seeds), "--steps", str(steps)]
+    limit = None if way in WAYS else PATIENCE_SECONDS
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder, "errors")
+        with (
+            written.open("w") as errors,
+            subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True
+            ) as process,
+        ):
+            try:
+                printed, _ = process.communicate(timeout=limit)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, 9)
+                return f"hung: given up after {limit:g} s"
+        if process.returncode == 0:
+            return [json.loads(line) for line in printed.splitlines()]
+        return f"ended by {written.read_text().strip().splitlines()[-1]}"
+
+
+def row(way: str, name: str, found: list[dict[str, Any]]) -> str:
+    """A line of the table."""
+    returns = [one["return"] for one in found]
+    counts = {
+        what: sum((Counter(one[what]) for one in found), Counter[str]())
+        for what in ("injected", "counted")
+    }
+    cells = [f"{value:.0f}" for value in sorted(returns)]
+    cells = [", ".join(cells), f"{statistics.fmean(returns):.0f}"]
+    for count in counts.values():
+        cells.append(", ".join(str(count[kind]) for kind in KINDS.values()))
+    return f"| {way}, {name} | {' | '.join(cells)} |"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=30_000)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
-    for hidden, kind in (("--way", str), ("--share", float), ("--seed", int)):
-        parser.add_argument(hidden, type=kind, help=argparse.SUPPRESS)
+    parser.add_argument("--way", help=argparse.SUPPRESS)
+    parser.add_argument("--kinds", nargs="*", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.way:
-        train(args.way, args.share, args.seed, args.steps)
-    report = {
-        f"{way}, {name}": [run(way, share, seed, args.steps) for seed in range(args.seeds)]
-        for way in WAYS
-        for name, share in (("no faults", 0.0), ("faults", SHARE))
-        if way != "AsyncVectorEnv" or share
-    }
-    if args.json:
-        print(json.dumps(report))
+        for seed in range(args.seeds):
+            print(json.dumps(train(args.way, args.kinds, seed, args.steps)), flush=True)
         return
+    cases = {"no faults": [], "faults": [*KINDS]}
+    report = {
+        way: {name: run(way, kinds, args.seeds, args.steps) for name, kinds in cases.items()}
+        for way in WAYS
+    }
+    peer = {kind: run("AsyncVectorEnv", [kind], 1, args.steps) for kind in KINDS}
+    if args.json:
+        print(json.dumps(report | {"AsyncVectorEnv": peer}))
+        return
+    print("| | returns | mean | injected: raised, died, hung | counted |\n|---|---|---|---|---|")
+    for way, found in report.items():
+        for name, seeds in found.items():
+            print(seeds if isinstance(seeds, str) else row(way, name, seeds))
+    for kind, end in peer.items():
+        print(f"AsyncVectorEnv, one {kind}: {end}")
     packages = ("rlightning_aio", "gymnasium", "stable-baselines3", "torch")
     print(machine_text(machine_facts(packages)))
-    for what, found in report.items():
-        print(f"\n{what}")
-        for one in found:
-            print(f"  {one}")
 
 
 if __name__ == "__main__":
