@@ -206,11 +206,12 @@ class Killable(Protocol):
 class Inspectable(Protocol):
     """A host that can say where its envs stand."""
 
-    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
         """Find out where the code of an env stands, without blocking.
 
         Args:
             slot: of the env.
+            after: seconds from now, at which the host looks.
             answer: gets the calls that it is in, from the outermost in (empty if that is not
                 known), and the stacks of all threads. Called now or soon, while the driver reads,
                 unless the host dies before.

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Aborting, Killable, Measured, Membership
+from rlightning_aio._core.hosts.base import Aborting, Inspectable, Killable, Measured, Membership
 from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -254,6 +254,16 @@ class HostRecord:
         before = self.traffic
         self.traffic = before if self.killable is None else self.killable.traffic
         return self.traffic != before
+
+    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float = 0.0) -> None:
+        """Have `answer` get where an env stands, as of `Inspectable`; nothing if nobody can say it.
+
+        Robots are not asked: the signal would end a system call of their SDK early.
+        """
+        if isinstance(self.host, Inspectable) and not self.is_hardware:
+            self.host.inspect(slot, answer, after)
+        else:
+            answer("", "")
 
     def kill(self, *, dump: bool) -> None:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""

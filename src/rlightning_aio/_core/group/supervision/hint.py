@@ -62,6 +62,11 @@ class Spent(NamedTuple):
     at_once: bool
 
     @property
+    def step_seconds(self) -> float:
+        """The mean time of a step or reset."""
+        return self.busy_ns / self.results / 1e9
+
+    @property
     def is_enough(self) -> bool:
         """True if it says anything, and other settings would change anything."""
         least = max(_ENOUGH_NS, self.elapsed_ns / 4)
@@ -149,7 +154,7 @@ class Hints:
         best = envs_per_worker(config.num_workers, num_cores)
         if waits(spent) and best < together:
             self._since[name] = None
-            _log.warning("%s", _advice(name, together, best, spent))
+            _warn(records[0], _advice(name, together, best, spent), spent.step_seconds / 2)
 
     def _look_at_separate(
         self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
@@ -212,13 +217,23 @@ def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
     return bool((begun[order][1:] < done[order][:-1]).any())
 
 
+def _warn(record: HostRecord, advice: str, after: float) -> None:
+    """Log an advice, and where an env of a host stands some seconds later: in a step, probably."""
+
+    def log(where: str, stacks: str) -> None:
+        _log.warning("%s%s", advice, f"; a step stands in {where}" if where else "")
+        if stacks:
+            _log.debug("the stacks of a worker of entry %r:\n%s", record.config.name, stacks)
+
+    record.inspect(record.slots.start, log, after)
+
+
 def _advice(name: str, together: int, best: int, spent: Spent) -> str:
     share = spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
-    step_ms = spent.busy_ns / spent.results / 1e6
     factor = min(together / best, 1 / max(share, 1e-9))
     return (
         f"entry {name!r}: {together} envs share each worker, where only one is stepped at a time, "
-        f"and their steps wait (one takes {step_ms:.3g} ms, and keeps a "
+        f"and their steps wait (one takes {1e3 * spent.step_seconds:.3g} ms, and keeps a "
         f"core busy for {100 * share:.0f} % of that); to have them wait at the same time, up to "
         f"{factor:.1f} times as fast, set envs_per_process: {best} (in VectorEnv, "
         f"envs_per_process={best})"

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Patient
-from rlightning_aio._core.hosts.base import Inspectable
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -91,8 +90,4 @@ class Overdue:
             if stacks:
                 _log.debug("the stacks of %s:\n%s", group.envs.env_ids[slot], stacks)
 
-        host = group.records[group.requests.hosts.item(slot)].host
-        if isinstance(host, Inspectable):
-            host.inspect(slot, log)
-        else:
-            log("", "")
+        group.records[group.requests.hosts.item(slot)].inspect(slot, log)

@@ -101,10 +101,14 @@ class LoopHost:
         for entry in entries.tolist():
             self._envs.abort(entry)
 
-    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
         """Name the calls that the env awaits; the trainer's own stack says nothing of it."""
-        waits_in = self._envs.waits_in(slot)
-        answer(waits_in, waits_in)
+
+        def look() -> None:
+            waits_in = self._envs.waits_in(slot)
+            answer(waits_in, waits_in)
+
+        asyncio.get_running_loop().call_later(after, look)
 
     # -- completions --------------------------------------------------------------
 

@@ -78,9 +78,10 @@ class Kill:
 
 @dataclass(frozen=True)
 class Inspect:
-    """Have worker `host_id` write its stacks; `Stacks` follows."""
+    """Have worker `host_id` write its stacks after some seconds; `Stacks` follows."""
 
     host_id: int
+    after: float
 
 
 @dataclass(frozen=True)

@@ -104,6 +104,7 @@ class _Child:
     outputs: list[_Output]
     channel: int
     kill_at: float | None = None
+    inspect_at: float | None = None
     tell_at: float | None = None
 
     def tail(self) -> str:
@@ -222,8 +223,8 @@ class _ForkServer:
 
     def _next_due(self) -> float | None:
         children = self._children.values()
-        times = [at for one in children for at in (one.kill_at, one.tell_at) if at is not None]
-        return min(times) if times else None
+        times = [at for one in children for at in (one.kill_at, one.inspect_at, one.tell_at) if at]
+        return min(times, default=None)
 
     def _step(self, until: float | None) -> bool:
         timeout = None if until is None else max(0.0, until - time.monotonic()) * 1000
@@ -238,7 +239,7 @@ class _ForkServer:
                     return False
             else:
                 self._attend(descriptor)
-        self._tell_due()
+        self._inspect_due()
         self._kill_due()
         self._handle_exits()
         return True
@@ -323,12 +324,14 @@ class _ForkServer:
     def _inspect(self, order: Inspect) -> None:
         for child in self._children.values():
             if child.host_id == order.host_id:
-                os.kill(child.pid, DUMP_SIGNAL)
-                child.tell_at = time.monotonic() + _DUMP_SECONDS
+                child.inspect_at = time.monotonic() + order.after
 
-    def _tell_due(self) -> None:
+    def _inspect_due(self) -> None:
         now = time.monotonic()
         for child in self._children.values():
+            if child.inspect_at is not None and child.inspect_at <= now:
+                os.kill(child.pid, DUMP_SIGNAL)
+                child.inspect_at, child.tell_at = None, now + _DUMP_SECONDS
             if child.tell_at is not None and child.tell_at <= now:
                 child.tell_at = None
                 stacks = child.outputs[-1]

@@ -158,11 +158,11 @@ class ForkServerHandle:
             messages.send(Kill(host.host_id, dump))
             self._watcher.watch_writable(self, messages.waiting)
 
-    def inspect(self, host: ProcessHost) -> None:
-        """Have the worker of `host` write its stacks; `host.on_stacks` follows."""
+    def inspect(self, host: ProcessHost, after: float) -> None:
+        """Have the worker of `host` write its stacks, after some seconds; see `on_stacks`."""
         if self._server is not None and self._ready:
             messages = self._server.messages
-            messages.send(Inspect(host.host_id))
+            messages.send(Inspect(host.host_id, after))
             self._watcher.watch_writable(self, messages.waiting)
 
     def note_used(self) -> None:
@@ -347,12 +347,12 @@ class ProcessHost:
     def destroy(self) -> None:
         self._fork_server.destroy()
 
-    def inspect(self, slot: int, answer: Callable[[str, str], None]) -> None:
+    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
         """See `base.Inspectable`. A worker that steps one env stands where that stands."""
         del slot
         self._inspecting.append(answer)
         if len(self._inspecting) == 1:
-            self._fork_server.inspect(self)
+            self._fork_server.inspect(self, after)
 
     def on_stacks(self, text: str) -> None:
         """Pass on what the worker wrote."""
