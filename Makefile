@@ -67,7 +67,7 @@ simulate: $(VENV)/installed-test ## random programs in a simulated world, compar
 # One defect: ONLY='late replies'. It takes an hour of one core.
 mutations: export PYTHONPATH := tests
 mutations: $(VENV)/installed-test ## defects that were fixed, put back one at a time: how many random programs find each
-	$(PY) -m simulator.mutations --most $(or $(SEEDS),2000) $(ONLY:%=--only '%')
+	$(PY) -m simulator.mutations --most $(or $(SEEDS),2000) $(if $(ONLY),--only '$(ONLY)')
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
