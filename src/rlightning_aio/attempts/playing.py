@@ -251,7 +251,7 @@ class _Engine:
         if not (queue.free or self._playing or self._has_clients or self._source.is_at_end):
             raise queue.fault or RLightningError("no env of this group is left that could play")
         queue.check_players()
-        return queue.lacking({one.env_id for _, one in self._playing.values()})
+        return queue.lacking(one.env_id for _, one in self._playing.values())
 
     def _look(self) -> None:
         """Look for clients that have come, or come back, a few times in a second."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.attempts.players import Players
@@ -16,6 +17,8 @@ from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from rlightning_aio.attempts.file import ResultsFile
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.attempts.rules import Rules
@@ -223,14 +226,16 @@ class AttemptQueue:
 
     # -- envs that are gone -----------------------------------------------------------
 
-    def lacking(self, busy: set[str]) -> list[str]:
+    def lacking(self, busy: Iterable[str]) -> list[str]:
         """The entries of attempts that wait for envs of which none is free or `busy`."""
-        if not len(self):
-            return []
-        entry_of, there = self.players.entry_of, {*self.free, *busy}
-        entries = {entry_of[env_id] for env_id in there}
-        found = [entry for entry in self._entries() if entry not in entries]
-        return [*found, *(entry_of[id_] for id_ in self._pinned_to() if id_ not in there)]
+        entry_of = self.players.entry_of
+        entries, pinned = dict.fromkeys(self._entries()), dict.fromkeys(self._pinned_to())
+        for env_id in chain(self.free, busy):  # Few are looked at: each entry has many.
+            if not entries and not pinned:
+                break
+            entries.pop(entry_of[env_id], None)
+            pinned.pop(env_id, None)
+        return [*entries, *(entry_of[env_id] for env_id in pinned)]
 
     def _entries(self) -> list[str]:
         """The entries of attempts that any of their envs may play."""
