@@ -34,7 +34,7 @@ class Stuck(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         while action == 1 and not self._gate.exists():
-            threading.Event().wait(0.01)
+            threading.Event().wait(0.2)  # Long, to be found here.
         return np.zeros(1, np.float32), 1.0, False, False, {}
 
 
@@ -82,7 +82,7 @@ def check(caplog: pytest.LogCaptureFixture) -> None:
     (record,) = said(caplog)
     assert record.levelname == "WARNING"
     assert record.getMessage().startswith("env 'env-1' (entry 'env'")
-    assert "has owed a result for 0 s" in record.getMessage()
+    assert re.search(r"has owed a result for \d+ s", record.getMessage())
     assert "set step_timeout of its entry" in record.getMessage()
     assert re.search(rf"stands in step, {__file__}:\d+ > wait, .*threading", record.getMessage())
     (stacks,) = [r for r in caplog.records if "the stacks of env-1" in r.getMessage()]
@@ -130,8 +130,9 @@ async def test_an_asynchronous_call_that_waits_says_for_whom(
         batch, _ = await group.reset()
         watch(group, monkeypatch)
         group.step_async(batch.respond([0, 1, 0]))
-        with pytest.raises(TimeoutError):
-            await group.collect_async(wait_all=True, deadline=1)
+        while not said(caplog):  # The worker may be slow to say where it stands.
+            with pytest.raises(TimeoutError):
+                await group.collect_async(wait_all=True, deadline=1)
         gate.touch()
         await group.collect_async(wait_all=True)
     check(caplog)
