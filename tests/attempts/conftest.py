@@ -22,10 +22,7 @@ if on_group.ON_RAY:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """On Ray, deselect what doesn't hold for every place, and one of the two loops."""
-    here = Path(__file__).parent
-    other = [item for item in items if here in item.path.parents and _is_other(item)]
-    config.hook.pytest_deselected(items=other)
-    items[:] = [item for item in items if item not in other]
+    on_group.deselect(config, items, Path(__file__).parent, _is_other)
 
 
 def _is_other(item: pytest.Item) -> bool:

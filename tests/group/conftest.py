@@ -22,7 +22,7 @@ import rlightning_aio.sync
 from rlightning_aio._core.group.drivers.aio_driver import AioDriver
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
 
 assert sample_envs  # Registers its envs.
 
@@ -109,8 +109,17 @@ PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, MIXED_SYNC, SEVERA
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect redundant tests: on Ray, those that don't hold for every placement."""
-    here = Path(__file__).parent
-    other = [item for item in items if here in item.path.parents and _is_other(item)]
+    deselect(config, items, Path(__file__).parent, _is_other)
+
+
+def deselect(
+    config: pytest.Config,
+    items: list[pytest.Item],
+    folder: Path,
+    is_other: Callable[[pytest.Item], bool],
+) -> None:
+    """Deselect the tests of a folder that a function returns True for."""
+    other = [item for item in items if folder in item.path.parents and is_other(item)]
     config.hook.pytest_deselected(items=other)
     items[:] = [item for item in items if item not in other]
 

@@ -5,8 +5,7 @@ to the queue of its group (see `messages`). The other protocols are optional: a 
 descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
 executes in the thread of the caller is `Executing`, one that can end single requests is `Aborting`,
 one that can say where its envs stand is `Inspectable`, and a host whose envs join and leave has
-`Membership`. The core checks for these protocols, never
-for a class of hosts.
+`Membership`. The core checks for these protocols, never for a class of hosts.
 Left out on purpose: waiting. Neither side ever waits.
 """
 

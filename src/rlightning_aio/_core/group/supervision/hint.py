@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from rlightning_aio._core.group.supervision.fault_messages import warn_where
 from rlightning_aio.sharing import envs_per_worker
 
 if TYPE_CHECKING:
@@ -154,7 +155,14 @@ class Hints:
         best = envs_per_worker(config.num_workers, num_cores)
         if waits(spent) and best < together:
             self._since[name] = None
-            _warn(records[0], _advice(name, together, best, spent), spent.step_seconds / 2)
+            warn_where(
+                records[0],
+                records[0].slots.start,
+                _advice(name, together, best, spent),
+                "; a step stands in {}",
+                f"a worker of entry {name!r}",
+                after=spent.step_seconds / 2,  # In a step, probably.
+            )
 
     def _look_at_separate(
         self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
@@ -215,17 +223,6 @@ def _spent(records: Sequence[HostRecord], stats: Stats, since: _Since, now: _Sin
 def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
     order = begun.argsort()
     return bool((begun[order][1:] < done[order][:-1]).any())
-
-
-def _warn(record: HostRecord, advice: str, after: float) -> None:
-    """Log an advice, and where an env of a host stands some seconds later: in a step, probably."""
-
-    def log(where: str, stacks: str) -> None:
-        _log.warning("%s%s", advice, f"; a step stands in {where}" if where else "")
-        if stacks:
-            _log.debug("the stacks of a worker of entry %r:\n%s", record.config.name, stacks)
-
-    record.inspect(record.slots.start, log, after)
 
 
 def _advice(name: str, together: int, best: int, spent: Spent) -> str:

@@ -7,13 +7,13 @@ which `HangDetector` takes care.
 
 from __future__ import annotations
 
-import logging
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Patient
+from rlightning_aio._core.group.supervision.fault_messages import warn_where
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ __all__ = ["Overdue"]
 
 OWED_SECONDS = 60.0
 _RESETS: Final = (Operation.RESET, Operation.RESTORE)
-
-_log = logging.getLogger("rlightning_aio")
 
 
 class Overdue:
@@ -79,15 +77,12 @@ class Overdue:
     def _name(self, slot: int, seconds: float, setting: str) -> None:
         """Log that an env owes a result, and where it stands if its host can say so."""
         group = self._group
-        text = (
+        warn_where(
+            group.records[group.requests.hosts.item(slot)],
+            slot,
             f"{group.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
-            f"what it does: set {setting} of its entry, in seconds, to have it replaced; "
+            f"what it does: set {setting} of its entry, in seconds, to have it replaced; ",
+            "it stands in {}; ",
+            group.envs.env_ids[slot],
+            rest="group.get_workers() tells who owes what",
         )
-
-        def log(where: str, stacks: str) -> None:
-            stands = f"it stands in {where}; " if where else ""
-            _log.warning("%s%sgroup.get_workers() tells who owes what", text, stands)
-            if stacks:
-                _log.debug("the stacks of %s:\n%s", group.envs.env_ids[slot], stacks)
-
-        group.records[group.requests.hosts.item(slot)].inspect(slot, log)

@@ -134,10 +134,19 @@ class ForkServerHandle:
             arena: of the group.
             order: for the fork server.
         """
-        messages = (self._server or self._launch()).messages
+        server = self._server or self._launch()
         self._hosts[order.place.host_id] = host
-        messages.send(order, channel, (arena.descriptor,))
-        self._watcher.watch_writable(self, messages.waiting)
+        self._send(server, order, channel, (arena.descriptor,))
+
+    def _send(
+        self,
+        server: RunningForkServer,
+        message: Message,
+        given: socket.socket | None = None,
+        lent: Sequence[int] = (),
+    ) -> None:
+        server.messages.send(message, given, lent)
+        self._watcher.watch_writable(self, server.messages.waiting)
 
     def on_writable(self) -> None:
         """Send waiting messages; a fork server reads nothing while it imports modules."""
@@ -150,20 +159,16 @@ class ForkServerHandle:
         """Kill the worker of `host`, if it still runs."""
         if self._server is None:
             return
-        messages, process = self._server
         if not self._ready:
             self._failure = f"it was killed while it was importing {self._imports}"
-            process.kill()  # It hangs in an import and reads no messages.
+            self._server.process.kill()  # It hangs in an import and reads no messages.
         else:
-            messages.send(Kill(host.host_id, dump))
-            self._watcher.watch_writable(self, messages.waiting)
+            self._send(self._server, Kill(host.host_id, dump))
 
     def inspect(self, host: ProcessHost, after: float) -> None:
         """Have the worker of `host` write its stacks, after some seconds; see `on_stacks`."""
         if self._server is not None and self._ready:
-            messages = self._server.messages
-            messages.send(Inspect(host.host_id, after))
-            self._watcher.watch_writable(self, messages.waiting)
+            self._send(self._server, Inspect(host.host_id, after))
 
     def note_used(self) -> None:
         """Note that the envs of all workers were built."""
