@@ -193,6 +193,17 @@ async def test_an_awaited_env_is_said_to_stand_where_it_awaits(
     assert re.search(stands, record.getMessage())
 
 
+async def test_a_group_that_is_closed_is_asked_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """Also if its answer was due later."""
+    fields = {"task": lambda: Waiting(asyncio.Event()), "placement": "loop"}
+    async with rl.build_env_group(entry(None, **fields)) as group:
+        await group.reset()
+        (record,) = group._core.supervisor.records
+        record.inspect(0, lambda *_: pytest.fail("a closed group has answered"), after=0.01)
+    await asyncio.sleep(0.05)
+    assert not [one for one in caplog.records if one.name == "asyncio" and one.exc_info]
+
+
 def test_a_stopped_worker_says_nothing_and_is_named(
     gate: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,6 +228,23 @@ def test_a_stopped_worker_says_nothing_and_is_named(
         assert len(group.step(batch.respond([0, 0, 0]))[0]) == 3
     (record,) = said(caplog)
     assert "stands in" not in record.getMessage()
+
+
+def test_a_worker_that_dies_before_it_says_where_it_stands_leaves_no_question(gate: Any) -> None:
+    """Nobody gets an answer of its replacement, which answers the next question."""
+    with sync.build_env_group(entry(gate, num_workers=1)) as group:
+        batch, _ = group.reset()
+        (record,) = group._core.supervisor.records
+        answers: list[str] = []
+        record.inspect(0, lambda *_: answers.append("first"), after=HANG)
+        os.kill(group.get_workers()[0]["pid"], signal.SIGKILL)
+        batch, _ = group.step(batch.respond([0]))
+        assert batch.restarted.all()
+        record.inspect(0, lambda _, stacks: answers.append(stacks))
+        while not answers:
+            batch, _ = group.step(batch.respond([0]))
+        (stacks,) = answers
+        assert "Current thread" in stacks
 
 
 def test_a_loop_keeps_no_timer_of_a_closed_group(gate: Any) -> None:

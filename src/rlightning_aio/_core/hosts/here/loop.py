@@ -105,8 +105,9 @@ class LoopHost:
         """Name the calls that the env awaits; the trainer's own stack says nothing of it."""
 
         def look() -> None:
-            waits_in = self._envs.waits_in(slot)
-            answer(waits_in, waits_in)
+            if self._bell is not None:  # Not released meanwhile.
+                waits_in = self._envs.waits_in(slot)
+                answer(waits_in, waits_in)
 
         asyncio.get_running_loop().call_later(after, look)
 
