@@ -60,7 +60,9 @@ def test_its_figures_are_those_of_the_timeline(tmp_path: Path) -> None:
     for env in found["envs"]:
         busy = sum(one.ended - one.began for one in requests if one.track == env["env_id"])
         assert math.isclose(env["busy"], busy / 1e9, abs_tol=1e-6)
-    longest = max(one.ended - one.began for one in requests)
+    # A step that had no result when the recording ended may be the slowest of all.
+    unfinished = [one for one in seen.slices if one.name.endswith(", not done")]
+    longest = max(one.ended - one.began for one in [*requests, *unfinished])
     assert math.isclose(found["slowest"][0]["seconds"], longest / 1e9, abs_tol=1e-6)
     text = invoke("trace", path).stdout
     assert "300 steps of 4 envs" in text
