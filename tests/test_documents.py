@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import json
 import re
+import tomllib
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -172,16 +174,23 @@ def test_every_configuration_loads(tmp_path: Path) -> None:
         assert len(load_config(file, here)) == len(entries)
 
 
-def test_the_documented_versions_are_the_installed_ones() -> None:
-    """RLlib has its own Gymnasium, and LeRobot is in none of the environments."""
-    constraints, page = (ROOT / "constraints.txt").read_text(), (DOCS / "migrating.md").read_text()
+def test_the_documented_versions_are_those_of_the_project() -> None:
+    """The lowest are what the package asks for, and the tested ones what is installed; LeRobot and
+    MetaWorld are in none of these environments.
+    """
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    wanted.append(f"python{project['requires-python']}")
+    bounds = re.findall(r"^([\w-]+)(?:\[\w+\])?[>=~]=([\d.]+)", "\n".join(wanted), re.MULTILINE)
+    constraints = (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
     pinned = dict(re.findall(r"^([\w-]+)==(\S+)", constraints, re.MULTILINE))
-    rows = re.findall(r"\]\((\w+)\.md\) \| (\w.*) \|$", page, re.MULTILINE)
-    assert len(rows) == 10
-    for name, tested in rows:
-        for library, version in re.findall(r"(\w+) ([\d.]+)", tested):
-            if (name, library) not in {("rllib", "gymnasium"), ("lerobot", "lerobot")}:
-                assert pinned[library] == version, (name, library)
+    table = (DOCS / "model.md").read_text().partition("## Supported versions")[2]
+    rows = re.findall(r"^\| `([\w-]+)` \| ([\d.]*) ?\| (.*) \|$", table, re.MULTILINE)
+    assert len(rows) == 17
+    for name, least, tested in rows:
+        assert dict(bounds).get(name, "") == least, name
+        if name not in {"python", "lerobot", "metaworld"}:
+            assert pinned[name] == tested, name
 
 
 def test_lists_are_lists_on_the_site() -> None:
