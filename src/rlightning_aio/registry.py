@@ -100,7 +100,7 @@ class Backend:
             return "unknown"
 
 
-# For an environment of its own; docs/backends.md says why it takes two steps.
+# For an environment of its own; docs/isaac.md says why it takes two steps.
 ISAAC_LAB = (
     "pip install 'rlightning-aio[isaac]' && "
     "pip install --ignore-requires-python --no-deps isaaclab==3.0.0"

@@ -1,6 +1,6 @@
 """The Isaac Lab backends on the real simulator, without Kit, on the CPU.
 
-These tests run in the virtual environment of Isaac Lab (docs/backends.md); `isaac_assets` has
+These tests run in the virtual environment of Isaac Lab (docs/isaac.md); `isaac_assets` has
 robots and ground.
 """
 
