@@ -60,7 +60,7 @@ def test_every_error_can_be_copied_and_pickled(kind: Any) -> None:
 
 def raised(type_name: str) -> errors.EnvRaised:
     """Return the error for an exception that a worker reports."""
-    return errors.EnvRaised.of(
+    return errors.env_raised(
         "what went wrong",
         env_id="a-0",
         exception_type=type_name,
@@ -110,7 +110,7 @@ class Unpicklable(Exception):
         self.held = held
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not errors.RemoteTraceback])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_cause_is_transferred_at_least_as_text(kind: Any) -> None:
     """Our errors as themselves; others as their tracebacks."""
     try:

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Blame, OutcomeKind
 
 __all__ = [
-    "ActionRefused",
     "BadAction",
     "ClientRefused",
     "ConfigError",
@@ -36,7 +35,6 @@ __all__ = [
     "NothingPending",
     "PolicyServerError",
     "RLightningError",
-    "RemoteTraceback",
     "ReplayDiverged",
     "SnapshotError",
     "StartFailed",
@@ -49,7 +47,7 @@ class RLightningError(Exception):
     """Base of all errors of this package.
 
     They can be pickled and copied, with their attributes; a cause that is not an error of this
-    package is converted to its text (`RemoteTraceback`).
+    package is converted to its text.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -76,7 +74,8 @@ class ConfigError(RLightningError, ValueError):
 class BadAction(RLightningError, ValueError):
     """A response doesn't fit its env: shape, dtype, count or numbers of the action, or the env id.
 
-    Nothing was sent.
+    Nothing was sent; unless the env itself refuses the action, as robots do beyond their limits.
+    Then the other envs have stepped, and the error is an `EnvRaised` as well.
     """
 
 
@@ -176,31 +175,15 @@ class EnvRaised(EnvFault):
 
     _outcome = "env_raised", "either"
 
-    def __init__(
-        self,
-        message: str,
-        *,
-        env_id: str,
-        exception_type: str,
-        exception_text: str,
-        traceback_text: str,
-    ) -> None:
+    def __init__(self, message: str, *, env_id: str) -> None:
         super().__init__(message, env_id=env_id)
-        self.exception_type = exception_type
-        self.exception_text = exception_text
-        self.traceback_text = traceback_text
-        self.__cause__ = RemoteTraceback(traceback_text)
+        self.exception_type = self.exception_text = self.traceback_text = ""
         if isinstance(self, SyntaxError):
             self.msg = message  # Tracebacks print this, not `str`.
 
     def __str__(self) -> str:
         # Some builtin exceptions print something else.
         return str(self.args[0]) if self.args else ""
-
-    @classmethod
-    def of(cls, message: str, *, exception_type: str, **fields: str) -> EnvRaised:
-        """Make the error for an exception of a type; `fields` are those of the constructor."""
-        return _kind_of(exception_type)(message, exception_type=exception_type, **fields)
 
     def __reduce__(self) -> tuple[Any, ...]:
         if type(self) is not _kind_of(self.exception_type):
@@ -210,11 +193,19 @@ class EnvRaised(EnvFault):
         return _unpickled_of, (*args, self.exception_type), state
 
 
-class ActionRefused(EnvRaised, BadAction):
-    """The env itself raised `BadAction`, as robots do for an action beyond their limits.
+def env_raised(
+    message: str, *, env_id: str, exception_type: str, exception_text: str, traceback_text: str
+) -> EnvRaised:
+    """Make the error for an exception of the code of an env."""
+    error = _kind_of(exception_type)(message, env_id=env_id)
+    error.exception_type, error.exception_text = exception_type, exception_text
+    error.traceback_text = traceback_text
+    error.__cause__ = RemoteTraceback(traceback_text)
+    return error
 
-    Unlike for other bad actions, the batch was sent, and the other envs have stepped.
-    """
+
+class ActionRefused(EnvRaised, BadAction):
+    """`EnvRaised` for `BadAction`."""
 
     _outcome = "env_raised", "policy"
 
@@ -240,9 +231,8 @@ def _kind_with(builtin: type[Exception]) -> type[EnvRaised]:
 
 
 def _unpickled_of(message: str, exception_type: str) -> EnvRaised:
-    """Make an error with empty attributes, which pickle sets."""
-    rest = dict.fromkeys(("env_id", "exception_text", "traceback_text"), "")
-    return EnvRaised.of(message, exception_type=exception_type, **rest)
+    """Make an error without its attributes, which pickle sets."""
+    return _kind_of(exception_type)(message, env_id="")
 
 
 class WorkerDied(EnvFault):
@@ -261,12 +251,10 @@ class WorkerDied(EnvFault):
             if one was.
     """
 
-    def __init__(
-        self, message: str, *, env_id: str, exit_code: int | None, stderr_tail: str
-    ) -> None:
+    def __init__(self, message: str, *, env_id: str) -> None:
         super().__init__(message, env_id=env_id)
-        self.exit_code = exit_code
-        self.stderr_tail = stderr_tail
+        self.exit_code: int | None = None
+        self.stderr_tail = ""
         self.env_ids: tuple[str, ...] = ()
         self.suspects: tuple[str, ...] = ()
 

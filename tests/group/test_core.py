@@ -420,7 +420,7 @@ def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
     stepping = group.begin(group.steps.step(steps(0), group.now))
     host, entry = group.hosts[0], group.core.requests.numbering.entry.item(0)
     host.waiting.clear()
-    fault = EnvHung("it hangs", env_id="fake-0", exit_code=None, stderr_tail="")
+    fault = EnvHung("it hangs", env_id="fake-0")
     host.answer(Failed(0, entry, fault) if kind is Failed else Withdrawn(0, entry))
     group.turn()
     with pytest.raises(EnvFault):

@@ -33,7 +33,7 @@ ERROR = ErrorText("ValueError", "no", "Traceback: no")
 STEP, CALL = entry(7, 3, Operation.STEP), entry(8, 3, Operation.CALL)
 SCHEMA = InfoSchema.of({"a": 1})
 assert SCHEMA is not None
-FAULT = EnvHung("it hung", env_id="one-0", exit_code=None, stderr_tail="")
+FAULT = EnvHung("it hung", env_id="one-0")
 
 
 class Unreadable:

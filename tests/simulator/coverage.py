@@ -70,8 +70,8 @@ OTHERS: Final[dict[str, str]] = {
 """The same for transitions and errors that no program reaches."""
 
 NOT_OF_GROUPS: Final = {
-    "ClientRefused", "EnvAway", "PolicyServerError", "RemoteTraceback", "ReplayDiverged",
-    "RLightningError", "EnvFault", "ConfigError", "ActionRefused",
+    "ClientRefused", "EnvAway", "PolicyServerError", "ReplayDiverged",
+    "RLightningError", "EnvFault", "ConfigError",
 }  # fmt: skip
 """Errors that are bases of others, or that no group of local envs raises."""
 

@@ -28,7 +28,7 @@ from rlightning_aio.cli.terminal import (
     print_json,
 )
 from rlightning_aio.config import check_installed, load_config
-from rlightning_aio.errors import ConfigError, EnvRaised, RLightningError
+from rlightning_aio.errors import ConfigError, RLightningError, env_raised
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
         raise
     except Exception as error:  # noqa: BLE001  # It is the env author's code.
         words, env_id = ErrorText.of(error), f"{entry.name}-0"
-        fault = EnvRaised.of(
+        fault = env_raised(
             f"{env_id} (backend {entry.backend!r}, task {entry.task_name!r}) raised "
             f"{words.summary}; its __cause__ is the remote traceback",
             env_id=env_id,

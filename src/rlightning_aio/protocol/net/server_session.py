@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import env_raised
 from rlightning_aio.protocol.net.admission import Admission, Peer
 from rlightning_aio.protocol.net.client_registry import ClientRegistry
 from rlightning_aio.protocol.net.client_requests import ClientRequests
@@ -267,7 +267,7 @@ class ServerSessions:
             return
         session.record.request = None
         env_id = session.announced.meta.env_id
-        error = EnvRaised.of(
+        error = env_raised(
             f"{env_id} raised {kind} in {request.operation}: "
             f"{text}; it can be reset and used again",
             env_id=env_id,

@@ -32,7 +32,7 @@ from rlightning_aio._core.hosts.messages import (
     Value,
     Withdrawn,
 )
-from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.errors import EnvAway, env_raised
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, answers_with_value
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio.errors import EnvFault
+    from rlightning_aio.errors import EnvFault, EnvRaised
     from rlightning_aio.outcomes import Blame
 
 __all__ = ["Intake"]
@@ -162,7 +162,7 @@ class Intake:
                 f"the call of {self._requests.tickets.method(self._requests.owner.item(slot))}()"
             )
             go_on = "the env is still usable"
-        raised = EnvRaised.of(
+        raised = env_raised(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "
             f"__cause__ is the remote traceback; {go_on}",
             env_id=self._envs.env_ids[slot],

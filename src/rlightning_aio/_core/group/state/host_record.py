@@ -104,12 +104,8 @@ class HostLoss:
 
     def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
         tail = self.death.stderr_tail
-        error = self.kind(
-            message + last_lines(tail),
-            env_id=self.env_id,
-            exit_code=self.death.exit_code,
-            stderr_tail=tail,
-        )
+        error = self.kind(message + last_lines(tail), env_id=self.env_id)
+        error.exit_code, error.stderr_tail = self.death.exit_code, tail
         error.env_ids = tuple(self._ids(slots))
         error.suspects = self.why.suspects
         error.outcome = self.why.outcome(self.env_id)

@@ -490,7 +490,7 @@ class AwaitedEnvs:
         for_good = self._restarts.raises
         if not for_good:
             then += ", so this request ends here; the next one tries again"
-        fault = kind(f"{message}; {then}", env_id=record.name, exit_code=None, stderr_tail="")
+        fault = kind(f"{message}; {then}", env_id=record.name)
         if kind is EnvHung:
             fault.outcome = record.lost.outcome(record.name)
         else:
