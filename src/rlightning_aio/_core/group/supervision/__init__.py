@@ -4,4 +4,9 @@
 giving up. `hang_detector` says who is late, `shutdown` ends hosts, `fault_messages` words the
 errors, `workers` and `hint` describe hosts to users. What a loss means for an episode is in
 `episodes`.
+
+Rule: a hang ends as a death. A signal has a hung worker write its stacks, which works inside C
+code, too; then its fork server kills it. If no death is reported within five seconds, the fork
+server has hung as well, and is killed with all its workers. An exception under `on_env_error:
+restart` is counted in the same table as deaths, and the far end rebuilds the env before its reset.
 """
