@@ -16,24 +16,27 @@ DOCS = Path(__file__).parents[2] / "docs"
 @pytest.mark.parametrize(
     ("page", "needed"),
     [
-        ("torchrl", ["torchrl"]),
-        ("rllib", ["ray", "tree", "torch"]),
         ("stable_baselines3", ["stable_baselines3"]),
-        ("rl_zoo3", ["rl_zoo3"]),
-        ("skrl", ["skrl"]),
-        ("tianshou", ["tianshou"]),
         ("lerobot", ["lerobot"]),
+        ("migrating#TorchRL", ["torchrl"]),
+        ("migrating#RLlib", ["ray", "tree", "torch"]),
+        ("migrating#RL Zoo", ["rl_zoo3"]),
+        ("migrating#skrl", ["skrl"]),
+        ("migrating#Tianshou", ["tianshou"]),
     ],
 )
 def test_programs_run(
     page: str, needed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each program of the page runs to its end, and the page's programs print something."""
+    """Each program of the page, or of its section, runs to its end, and they print something."""
     # Ray would join an existing cluster, such as that of other tests.
     monkeypatch.setenv("RAY_ADDRESS", "local")
     if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{', '.join(missing)} not installed")
-    text = (DOCS / f"{page}.md").read_text()
+    name, _, section = page.partition("#")
+    text = (DOCS / f"{name}.md").read_text()
+    if section:
+        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     outputs = []
     for index, block in enumerate(
         re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
