@@ -82,7 +82,7 @@ class OpenEnvOptions(BaseModel):
 
 
 class OpenEnv(BaseEnv):
-    """One session; see the module and docs/agents.md.
+    """One session; see the module and docs/openenv.md.
 
     An observation is a dict of the fields that the server sends. With ``columns`` it is a dict of
     these, and of all other fields as ``rest``. An action is a dict of the action's fields. With
