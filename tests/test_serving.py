@@ -9,6 +9,7 @@ import contextlib
 import json
 import logging
 import math
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -239,6 +240,41 @@ async def test_a_session_without_a_connection_ends_by_itself() -> None:
             async with connect(address + key, proxy=None) as socket:
                 refusal = json.loads(await socket.recv())
             assert refusal["data"]["message"] == f"Unknown session_id: {key}"
+
+
+class Stuck(gym.Env[Any, Any]):
+    """Its steps never end."""
+
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        time.sleep(3600)
+
+
+@on_asyncio
+async def test_a_kept_session_whose_step_never_ends_ends_by_itself() -> None:
+    """Its client is gone, and never closes it; the step is aborted, and its env is free again."""
+    async with (
+        rl.build_env_group(Stuck, name="stuck") as served,
+        OpenEnvServer(served, "stuck", "127.0.0.1", 0) as server,
+    ):
+        created: Any = await rpc(server, "openenv/session/create")
+        address = server.url.replace("http", "ws") + f"/ws?session_id={created['session_id']}"
+        async with connect(address, proxy=None) as socket:
+            await socket.send('{"type": "reset"}')
+            await socket.recv()
+            server._session_timeout = 0.01
+            await socket.send('{"type": "step", "data": {"action": 1}}')
+            while not served.pending:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+        while isinstance(  # noqa: ASYNC110
+            await rpc(server, "openenv/session/create"), int
+        ):
+            await asyncio.sleep(0.01)
+        assert served.pending == []
 
 
 def test_a_client_that_answers_no_ping_keeps_its_session(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ Left out: ``POST /reset`` and ``/step``, whose envs live for one call, and tools
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 import uuid
@@ -62,7 +63,7 @@ class _Session:
     Attributes:
         is_kept: it was created over ``/mcp``, and outlives its socket.
         is_attached: it has a socket.
-        is_closing: it ends with its socket.
+        closing: it ends with its socket.
         ending: ends it, while it has no socket.
     """
 
@@ -70,7 +71,8 @@ class _Session:
         self.key = key
         self.env = env
         self.is_kept = is_kept
-        self.is_attached = self.is_closing = False
+        self.is_attached = False
+        self.closing = asyncio.Event()
         self.ending: asyncio.TimerHandle | None = None
         # Before that, the env is in an episode of an earlier session.
         self.has_reset = False
@@ -107,7 +109,6 @@ class OpenEnvServer:
         self._server: Server
 
     async def __aenter__(self) -> Self:
-        self._ending = asyncio.get_running_loop().create_future()
         try:
             self._server = await serve(
                 self._talk,
@@ -126,7 +127,8 @@ class OpenEnvServer:
 
     async def __aexit__(self, *exc: object) -> None:
         self._server.close()
-        self._ending.set_result(None)
+        for session in self._sessions.values():
+            session.closing.set()
         await self._server.wait_closed()
         for session in list(self._sessions.values()):
             self._end(session)
@@ -212,7 +214,7 @@ class OpenEnvServer:
         if session is own:
             text = "Cannot close active WebSocket-managed session via MCP method"
             return _rpc_error(number, _INVALID_REQUEST, text)
-        session.is_closing = True
+        session.closing.set()
         if session.is_attached:
             return _rpc_result(number, session_id=key, closed=False, closing=True)
         self._end(session)
@@ -276,17 +278,24 @@ class OpenEnvServer:
             await self._serve(socket, session)
         finally:
             self._detach(session)
-            if session.is_closing or not session.is_kept:
+            if session.closing.is_set() or not session.is_kept:
                 self._end(session)
 
     async def _serve(self, socket: ServerConnection, session: _Session) -> None:
-        # A kept session outlives its socket.
-        left = self._ending if session.is_kept else asyncio.ensure_future(socket.wait_closed())
+        left = asyncio.ensure_future(self._left(socket, session))
         try:
             await self._answer_all(socket, session, left)
         finally:
-            if left is not self._ending:
-                left.cancel()
+            left.cancel()
+
+    async def _left(self, socket: ServerConnection, session: _Session) -> None:
+        """Wait until nobody wants a reply any more; a kept session outlives its socket."""
+        await socket.wait_closed()
+        if session.is_kept:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(self._session_timeout):
+                    await session.closing.wait()
+            session.closing.set()
 
     async def _answer_all(
         self, socket: ServerConnection, session: _Session, left: asyncio.Future[None]

@@ -387,6 +387,46 @@ async def test_a_call_that_is_cut_off_does_not_keep_its_env(name: str) -> None:
     assert kinds == [["cancelled", "truncated"]] * 3
 
 
+@pytest.mark.parametrize("deed", ["reset", "step", "call"])
+async def test_an_env_that_never_answers_is_free_for_the_next_attempt(
+    place: dict[str, Any], deed: str
+) -> None:
+    """Nothing but the attempt has a time limit."""
+    if place.get("placement") == "inline":
+        pytest.skip("a step that hangs here is the end of the test")
+    if deed == "call" and place.get("backend") == "openenv":
+        pytest.skip("a session has none")
+    async with rooms(place, num_workers=1) as group:
+        await cut_off_and_play_on(group, deed)
+
+
+@pytest.mark.parametrize("session", ["own", "keep"])
+@pytest.mark.parametrize("deed", ["reset", "step"])
+async def test_the_only_env_of_a_server_is_free_for_the_next_attempt(
+    deed: str, session: str
+) -> None:
+    """The server ends what a client has given up, also of a session that outlives its socket."""
+    async with rooms(PLACES["workers"], num_workers=1) as served, serving(served) as server:
+        place = openenv(server.url, session=session)
+        async with rooms(place, num_workers=1, placement="loop") as group:
+            await cut_off_and_play_on(group, deed)
+
+
+async def cut_off_and_play_on(group: rl.EnvGroup, deed: str) -> None:
+    """Cut an attempt off in whose reset, step or call the env hangs, and play another."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await (episode.call("stall") if deed == "call" else episode.step("hang"))
+
+    (spec,) = tasks(1, **({"reset": "hang"} if deed == "reset" else {}))
+    rules = Rules(attempt_timeout=0.3, retries=0)
+    ((cut,),) = await asyncio.wait_for(played(group, [spec], agent, 1, rules), HANG)
+    assert group.pending == []
+    ((attempt,),) = await asyncio.wait_for(played(group, tasks(2)[1:], earner), HANG)
+    assert (cut.outcome.kind, cut.reward) == ("timed_out", None)
+    assert (attempt.outcome.kind, attempt.reward) == ("terminated", 5.0)
+
+
 async def test_a_call_is_not_answered_by_another_episode() -> None:
     """The env's worker has died, and was replaced."""
 
