@@ -7,10 +7,11 @@ again. The table counts outcomes against what was injected; `gather` is the same
 a loop over the tasks, an env for each attempt, no time limits.
 
 Then the first 6 of 8 attempts whose latencies are log-normal, against waiting for all 8, and how
-long it takes until the env of a surplus attempt plays the next; and the memory of an attempt, with
-2,000 in flight.
+long it takes until the env of a surplus attempt plays the next; how long after its cancellation in
+a step that never ends an env is free, and has begun another episode, at each place; and the memory
+of an attempt, with 2,000 in flight.
 
-    python benchmarks/attempts.py [--json]
+    python benchmarks/attempts.py [--ray] [--json]
 
 A run that is killed ten times, and goes on from its file, is a test:
 
@@ -37,6 +38,7 @@ from harness import machine_facts, machine_text
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
+from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 TASKS, SIZE, STEPS, STEP_SECONDS = 64, 8, 4, 0.002
@@ -51,7 +53,7 @@ FAULTS: Final = {
 }
 """What goes wrong, and the outcome that is to say so."""
 GIVE_UP_SECONDS: Final = 20.0
-MEDIAN_SECONDS, IN_FLIGHT = 0.05, 2000
+MEDIAN_SECONDS, IN_FLIGHT, CUT = 0.05, 2000, 5
 
 
 def fault_of(seed: int, index: int, faults: list[str]) -> str:
@@ -259,6 +261,50 @@ async def first_of(first: int | None, number: int) -> dict[str, Any]:
     return {"seconds_per_group": seconds / number, "freed_s": max(freed, default=None)}
 
 
+async def until_free(fields: dict[str, Any]) -> dict[str, float]:
+    """Cancel episodes in a step that never ends: the longest time until their env is free again.
+
+    And until it has begun another episode, for which most are built anew.
+    """
+    free: list[float] = []
+    begun: list[float] = []
+    async with rl.build_env_group(name="tool", num_workers=1, **fields) as group:
+        (env_id,) = group.env_ids
+        for _ in range(CUT):
+            async with group.episode(env_id, options={"folder": "/"}) as episode:
+                step = asyncio.ensure_future(episode.step("hangs"))
+                await asyncio.sleep(0.1)
+                step.cancel()
+                await asyncio.wait({step})
+                began = time.monotonic()
+            free.append(time.monotonic() - began)
+            async with group.episode(env_id, options={"folder": "/"}):
+                begun.append(time.monotonic() - began)
+    return {"free_s": max(free), "begun_s": max(begun)}
+
+
+async def until_free_everywhere(*, ray: bool) -> dict[str, dict[str, float]]:
+    """`until_free` at each place."""
+    worker: dict[str, Any] = {"task": Tool, "envs_per_process": 1}
+    places = {
+        "loop": {"task": AwaitedTool, "placement": "loop"},
+        "awaitable in a worker": {"task": AwaitedTool},
+        "worker": worker,
+    }
+    if ray:
+        places["ray"] = {**worker, "placement": "ray", "num_cpus": 0, "start_timeout": 300.0}
+    found = {name: await until_free(fields) for name, fields in places.items()}
+    for session in ("own", "keep"):
+        async with (
+            rl.build_env_group(name="tool", num_workers=1, **worker) as served,
+            OpenEnvServer(served, "tool", "127.0.0.1", 0) as server,
+        ):
+            kwargs = {"action_field": "action", "session": session}
+            far = {"backend": "openenv", "task": server.url, "env_kwargs": kwargs}
+            found[f"openenv, session: {session}"] = await until_free({**far, "placement": "loop"})
+    return found
+
+
 async def memory_of_attempts() -> float:
     """KiB of an attempt and its agent in its first step, without those of its env."""
     flying, all_there, go = 0, asyncio.Event(), asyncio.Event()
@@ -288,11 +334,13 @@ async def memory_of_attempts() -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", type=int, default=TASKS)
+    parser.add_argument("--ray", action="store_true", help="cancel episodes on Ray, too")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     args = parser.parse_args()
     report = {place: compared(place, args.tasks) for place in ("loop", "workers")}
     rules = {f"first {k or SIZE}": rl.run(first_of(k, min(args.tasks, 32))) for k in (None, 6)}
-    more = {**rules, "kib_per_attempt": rl.run(memory_of_attempts())}
+    freed = asyncio.run(until_free_everywhere(ray=args.ray))
+    more = {**rules, "freed": freed, "kib_per_attempt": rl.run(memory_of_attempts())}
     if args.json:
         print(json.dumps({**report, **more}))
         return
@@ -311,6 +359,9 @@ def main() -> None:
         if found["freed_s"] is not None:
             line += f"; an env plays the next attempt {found['freed_s']:.3f} s later, at most"
         print(f"\n{line}")
+    print("\ncancelled in a step that never ends, an env is free, and has begun an episode after:")
+    for place, found in freed.items():
+        print(f"  {place}: {found['free_s']:.2f} s, {found['begun_s']:.2f} s")
     print(f"\n{more['kib_per_attempt']:.1f} KiB for each of {IN_FLIGHT} attempts in flight")
 
 

@@ -24,4 +24,6 @@ def test_outcomes_equal_the_faults_that_were_injected() -> None:
         assert found["gather"]["end"] != "ended"
         assert found["gather"]["attempts"] < 48
     assert report["first 6"]["freed_s"] > 0
+    for found in report["freed"].values():
+        assert found["begun_s"] > found["free_s"] > 0
     assert report["kib_per_attempt"] > 0

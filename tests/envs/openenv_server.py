@@ -17,6 +17,7 @@ import random
 import shutil
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ class Rolled(Observation):
 
 
 class Dice(Environment):
-    """Adds moves up; ends at ten, or is truncated after six steps."""
+    """Adds moves up; ends at ten, or is truncated after six steps. A negative move never ends."""
 
     SUPPORTS_CONCURRENT_SESSIONS = True
 
@@ -60,6 +61,8 @@ class Dice(Environment):
         return self._rolled(metadata={"seed": seed})
 
     def step(self, action: Move, timeout_s: float | None = None, **kwargs: Any) -> Rolled:
+        if action.move < 0:
+            time.sleep(3600)
         self.total += action.move
         self._state.step_count += 1
         late = self._state.step_count >= 6
