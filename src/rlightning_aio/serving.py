@@ -14,21 +14,15 @@ import json
 import math
 import uuid
 from collections import deque
-from functools import partial
 from http import HTTPStatus
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, cast
-from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
+from aiohttp import WSCloseCode, WSMsgType, web
 from gymnasium import spaces
-from websockets.asyncio.server import serve
-from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Response
 
 from rlightning_aio.envs.openenv.session import keep_alive_by_system
-from rlightning_aio.envs.post_connection import PostConnection
 from rlightning_aio.errors import ConfigError, EnvFault, RLightningError
 from rlightning_aio.json_text import json_of
 from rlightning_aio.outcomes import Outcome
@@ -39,8 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     import gymnasium as gym
-    from websockets.asyncio.server import Server, ServerConnection
-    from websockets.http11 import Request
 
     from rlightning_aio._core.group.api.aio import EnvGroup, EnvHandle
 
@@ -55,6 +47,8 @@ _METHOD_NOT_FOUND: Final = -32601
 _INVALID_PARAMS: Final = -32602
 _INTERNAL_ERROR: Final = -32603
 _SERVER_ERROR: Final = -32000
+_SECONDS_TO_LEAVE: Final = 1.0
+"""For a client to answer the end of its connection."""
 
 
 class _Session:
@@ -106,78 +100,78 @@ class OpenEnvServer:
         self._free = deque(group.env_ids)
         self._sessions: dict[str, _Session] = {}
         self._space: Any = group.get_action_spaces()[0]
-        self._server: Server
+        self._sockets: set[web.WebSocketResponse] = set()
+        self._runner: web.AppRunner
 
     async def __aenter__(self) -> Self:
+        app = web.Application()
+        app.add_routes(
+            [
+                web.get("/health", self._health),
+                web.get("/metadata", self._metadata),
+                web.get("/schema", self._schema),
+                web.get("/ws", self._talk),
+                web.post("/mcp", self._post),
+                web.route("*", "/{path:.*}", _missing),
+            ]
+        )
+        app.on_shutdown.append(self._leave)
+        self._runner = web.AppRunner(app, access_log=None)
+        await self._runner.setup()
         try:
-            self._server = await serve(
-                self._talk,
-                self._host,
-                self._port,
-                process_request=self._http,
-                max_size=None,
-                # A client whose learner holds its event loop can't answer; see `_talk`.
-                ping_timeout=None,
-                create_connection=cast("Any", partial(PostConnection, answer=self._post)),
-            )
+            await web.TCPSite(self._runner, self._host, self._port).start()
         except OSError as error:
+            await self._runner.cleanup()
             reason = error.strerror or error
             raise ConfigError(f"can't listen at {self._host}:{self._port}: {reason}") from error
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        self._server.close()
-        for session in self._sessions.values():
-            session.closing.set()
-        await self._server.wait_closed()
+        await self._runner.cleanup()
         for session in list(self._sessions.values()):
             self._end(session)
+
+    async def _leave(self, app: web.Application) -> None:
+        del app
+        for session in self._sessions.values():
+            session.closing.set()
+        closing = [socket.close(code=WSCloseCode.GOING_AWAY) for socket in self._sockets]
+        await asyncio.gather(*closing, return_exceptions=True)
 
     @property
     def url(self) -> str:
         """The address for clients."""
-        return f"http://{self._host}:{next(iter(self._server.sockets)).getsockname()[1]}"
+        return f"http://{self._host}:{self._runner.addresses[0][1]}"
 
     # -- HTTP ---------------------------------------------------------------------
 
-    def _http(self, connection: ServerConnection, request: Request) -> Response | None:
-        del connection
-        path = request.path.partition("?")[0]
-        if path == "/ws":
-            return None
-        answers = {"/health": self._health, "/metadata": self._metadata, "/schema": self._schema}
-        found = answers.get(path)
-        status = HTTPStatus.NOT_FOUND if found is None else HTTPStatus.OK
-        body = _not_found(path) if found is None else json_of(found()).encode()
-        headers = {"Content-Type": "application/json", "Content-Length": str(len(body))}
-        return Response(status, status.phrase, Headers(headers), body)
+    async def _health(self, request: web.Request) -> web.Response:
+        del request
+        return _json_response({"status": "healthy"})
 
-    def _health(self) -> dict[str, Any]:
-        return {"status": "healthy"}
-
-    def _metadata(self) -> dict[str, Any]:
+    async def _metadata(self, request: web.Request) -> web.Response:
+        del request
         text = f"{len(self._group)} sessions of an environment of rlightning-aio"
-        return {"name": self._name, "description": text, "version": version("rlightning-aio")}
+        found = {"name": self._name, "description": text, "version": version("rlightning-aio")}
+        return _json_response(found)
 
-    def _schema(self) -> dict[str, Any]:
+    async def _schema(self, request: web.Request) -> web.Response:
+        del request
         (observation, *_) = self._group.get_observation_spaces()
         state = {"episode_id": {"type": ["string", "null"]}, "step_count": {"type": "integer"}}
-        return {
+        found = {
             "action": _fields_schema(self._space, "action"),
             "observation": _fields_schema(observation, "observation"),
             "state": {"type": "object", "properties": state},
         }
+        return _json_response(found)
 
-    async def _post(self, path: str, body: bytes) -> tuple[HTTPStatus, bytes]:
-        if path != "/mcp":
-            return HTTPStatus.NOT_FOUND, _not_found(path)
+    async def _post(self, request: web.Request) -> web.Response:
         try:
-            request: Any = json.loads(body)
-        except ValueError:
-            answer = _rpc_error(None, _PARSE_ERROR, "Parse error")
-        else:
-            answer = self._rpc(request, None)
-        return HTTPStatus.OK, json_of(answer).encode()
+            message: Any = json.loads(await request.read())
+        except (ValueError, RecursionError):
+            return _json_response(_rpc_error(None, _PARSE_ERROR, "Parse error"))
+        return _json_response(self._rpc(message, None))
 
     # -- sessions -----------------------------------------------------------------
 
@@ -244,86 +238,106 @@ class OpenEnvServer:
         del self._sessions[session.key]
         self._free.append(session.env.env_id)
 
-    async def _talk(self, socket: ServerConnection) -> None:
+    async def _talk(self, request: web.Request) -> web.WebSocketResponse:
         """Serve one connection."""
-        assert socket.request is not None
-        keep_alive_by_system(socket.transport)
-        (key,) = parse_qs(urlsplit(socket.request.path).query).get("session_id", [None])
+        # Without a heartbeat: a client whose learner holds its event loop can't answer any.
+        socket = web.WebSocketResponse(timeout=_SECONDS_TO_LEAVE, max_msg_size=0, compress=False)
+        await socket.prepare(request)
+        assert request.transport is not None
+        keep_alive_by_system(request.transport)
+        self._sockets.add(socket)
         try:
-            session = self._create(is_kept=False) if key is None else self._sessions.get(key)
-            if session is None and key is None:
-                most = len(self._group)
-                await _send_error(
-                    socket,
-                    "CAPACITY_REACHED",
-                    self._full(),
-                    active_sessions=most,
-                    max_sessions=most,
-                )
-            elif session is None:
-                await _send_error(socket, "SESSION_ERROR", f"Unknown session_id: {key}")
-            elif session.is_attached:
-                text = f"Session {key} already has an attached WebSocket"
-                await _send_error(socket, "SESSION_ERROR", text)
-            else:
-                await self._attach(socket, session)
-        except ConnectionClosed:
-            return
+            await self._begin(socket, request.query.get("session_id"))
+        except ConnectionResetError:  # The client has left.
+            pass
+        finally:
+            self._sockets.discard(socket)
+        return socket
 
-    async def _attach(self, socket: ServerConnection, session: _Session) -> None:
+    async def _begin(self, socket: web.WebSocketResponse, key: str | None) -> None:
+        """Give a connection its session, or the reason why it has none."""
+        session = self._create(is_kept=False) if key is None else self._sessions.get(key)
+        if session is None and key is None:
+            most = len(self._group)
+            numbers = {"active_sessions": most, "max_sessions": most}
+            await socket.send_str(_error("CAPACITY_REACHED", self._full(), **numbers))
+        elif session is None:
+            await socket.send_str(_error("SESSION_ERROR", f"Unknown session_id: {key}"))
+        elif session.is_attached:
+            text = f"Session {key} already has an attached WebSocket"
+            await socket.send_str(_error("SESSION_ERROR", text))
+        else:
+            await self._attach(socket, session)
+
+    async def _attach(self, socket: web.WebSocketResponse, session: _Session) -> None:
         session.is_attached = True
         assert session.ending is not None
         session.ending.cancel()
         try:
-            await self._serve(socket, session)
+            await self._answer_all(socket, session)
         finally:
             self._detach(session)
             if session.closing.is_set() or not session.is_kept:
                 self._end(session)
 
-    async def _serve(self, socket: ServerConnection, session: _Session) -> None:
-        left = asyncio.ensure_future(self._left(socket, session))
+    async def _answer_all(self, socket: web.WebSocketResponse, session: _Session) -> None:
+        """Answer each message of a client, until it leaves or the server ends."""
+        frames: asyncio.Queue[str | bytes | None] = asyncio.Queue(1)
+        left = asyncio.ensure_future(self._read(socket, session, frames))
         try:
-            await self._answer_all(socket, session, left)
+            while (frame := await frames.get()) is not None:
+                answer = await self._answer(session, frame, left)
+                if answer is None:
+                    return
+                await socket.send_str(answer)
         finally:
             left.cancel()
+            await asyncio.wait({left})
 
-    async def _left(self, socket: ServerConnection, session: _Session) -> None:
-        """Wait until nobody wants a reply any more; a kept session outlives its socket."""
-        await socket.wait_closed()
-        if session.is_kept:
+    async def _read(
+        self,
+        socket: web.WebSocketResponse,
+        session: _Session,
+        frames: asyncio.Queue[str | bytes | None],
+    ) -> None:
+        """Queue the messages of a client, and None at their end; also while its env works.
+
+        Ends once nobody wants a reply any more.
+        """
+        async for message in socket:
+            if message.type is WSMsgType.ERROR:
+                break
+            await frames.put(message.data)
+        await frames.put(None)
+        if session.is_kept:  # It outlives its socket.
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(self._session_timeout):
                     await session.closing.wait()
             session.closing.set()
 
-    async def _answer_all(
-        self, socket: ServerConnection, session: _Session, left: asyncio.Future[None]
-    ) -> None:
-        while True:
-            try:
-                message: Any = json.loads(await socket.recv())
-                kind: Any = message.get("type")
-                data: dict[str, Any] = message.get("data") or {}
-            except (ValueError, AttributeError, RecursionError) as error:
-                await _send_error(socket, "INVALID_JSON", f"Invalid JSON: {error}")
-                continue
-            if kind == "close":
-                return
-            try:
-                reply = await self._unless_left(session, self._reply(session, kind, data), left)
-            except EnvFault as fault:
-                blame = fault.outcome.blame
-                await _send_error(socket, "EXECUTION_ERROR", str(fault), blame=blame)
-            except (KeyError, TypeError, ValueError, OverflowError) as error:
-                await _send_error(socket, "VALIDATION_ERROR", f"Invalid message: {error}")
-            except RLightningError as error:
-                await _send_error(socket, "EXECUTION_ERROR", str(error))
-            else:
-                if reply is None:
-                    await _send_error(socket, "UNKNOWN_TYPE", f"Unknown message type: {kind}")
-                else:
-                    await socket.send(json_of({"type": reply[0], "data": reply[1]}))
+    async def _answer(
+        self, session: _Session, frame: str | bytes, left: asyncio.Future[None]
+    ) -> str | None:
+        """Answer a message; None if it ends the session."""
+        try:
+            message: Any = json.loads(frame)
+            kind: Any = message.get("type")
+            data: dict[str, Any] = message.get("data") or {}
+        except (ValueError, AttributeError, RecursionError) as error:
+            return _error("INVALID_JSON", f"Invalid JSON: {error}")
+        if kind == "close":
+            return None
+        try:
+            reply = await self._unless_left(session, self._reply(session, kind, data), left)
+        except EnvFault as fault:
+            return _error("EXECUTION_ERROR", str(fault), blame=fault.outcome.blame)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            return _error("VALIDATION_ERROR", f"Invalid message: {error}")
+        except RLightningError as error:
+            return _error("EXECUTION_ERROR", str(error))
+        if reply is None:
+            return _error("UNKNOWN_TYPE", f"Unknown message type: {kind}")
+        return json_of({"type": reply[0], "data": reply[1]})
 
     async def _unless_left(
         self, session: _Session, reply: Coroutine[Any, Any, T], left: asyncio.Future[None]
@@ -364,8 +378,13 @@ class OpenEnvServer:
         return "observation", answer
 
 
-def _not_found(path: str) -> bytes:
-    return json_of({"detail": f"there is no {path}; sessions are at /ws"}).encode()
+async def _missing(request: web.Request) -> web.Response:
+    detail = f"there is no {request.path}; sessions are at /ws"
+    return _json_response({"detail": detail}, HTTPStatus.NOT_FOUND)
+
+
+def _json_response(answer: dict[str, Any], status: HTTPStatus = HTTPStatus.OK) -> web.Response:
+    return web.json_response(answer, status=status, dumps=json_of)
 
 
 def _rpc_result(number: Any, **result: Any) -> dict[str, Any]:
@@ -377,9 +396,8 @@ def _rpc_error(number: Any, code: int, message: str, **data: Any) -> dict[str, A
     return {"jsonrpc": "2.0", "id": number, "error": error}
 
 
-async def _send_error(socket: ServerConnection, code: str, message: str, **more: Any) -> None:
-    data = {"message": message, "code": code, **more}
-    await socket.send(json_of({"type": "error", "data": data}))
+def _error(code: str, message: str, **more: Any) -> str:
+    return json_of({"type": "error", "data": {"message": message, "code": code, **more}})
 
 
 def _observed(ret: Any) -> dict[str, Any]:

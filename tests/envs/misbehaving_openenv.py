@@ -1,4 +1,4 @@
-"""An OpenEnv server over websockets that fails as a list of fates says.
+"""An OpenEnv server that fails as a list of fates says.
 
 It speaks the protocol of OpenEnv 0.10. Each action has a unique number, which the observation
 repeats. The server records the numbers that it has executed.
@@ -7,21 +7,14 @@ repeats. The server records the numbers that it has executed.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import json
 from collections import Counter, deque
-from functools import partial
-from http import HTTPStatus
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
-from urllib.parse import parse_qs, urlsplit
 
-from websockets.asyncio.server import ServerConnection, serve
-from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
-from websockets.frames import Opcode
-from websockets.http11 import Request, Response
-
-from rlightning_aio.envs.post_connection import PostConnection
+from aiohttp import WSMsgType, web
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,6 +38,40 @@ FATES = (
 """`never`: the reply comes after the socket is closed; `leaked`: the slot stays taken, too."""
 GOES_ON = ("ok", "late", "another type")
 ANSWERED = (*GOES_ON, "never", "idle loss")
+
+
+@dataclass(frozen=True, eq=False)
+class Socket:
+    """A connection of a client, which can be lost.
+
+    Attributes:
+        answers_pings: those that arrive while it waits for a message.
+        pongs: has one for each that the client has sent.
+    """
+
+    messages: web.WebSocketResponse
+    transport: asyncio.Transport
+    answers_pings: bool
+    pongs: asyncio.Semaphore
+
+    async def receive(self) -> Any:
+        """The next message; None once the client has left."""
+        async for message in self.messages:
+            if message.type is WSMsgType.TEXT:
+                return json.loads(message.data)
+            if message.type is WSMsgType.PONG:
+                self.pongs.release()
+            elif message.type is WSMsgType.PING and self.answers_pings:
+                await self.messages.pong(message.data)
+        return None
+
+    async def send(self, message: Any) -> None:
+        await self.messages.send_str(json.dumps(message))
+
+    async def ping(self) -> None:
+        """Send a ping, and wait for its pong."""
+        await self.messages.ping()
+        await self.pongs.acquire()
 
 
 class Session:
@@ -82,19 +109,21 @@ class Misbehaving:
         self.loses_pongs = False
         self.on_never: Callable[[int], object] = lambda number: None
         self._ids = map(str, itertools.count())
-        self._sockets: set[ServerConnection] = set()
+        self._sockets: set[Socket] = set()
 
     async def __aenter__(self) -> Self:
-        connection: Any = partial(PostConnection, answer=self._post)
-        self._server = await serve(
-            self._talk, "127.0.0.1", 0, process_request=self._http, create_connection=connection
-        )
-        self.url = f"http://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+        app = web.Application()
+        routes = [web.get("/ws", self._talk), web.post("/mcp", self._post)]
+        app.add_routes([*routes, web.get("/health", self._health)])
+        self._runner = web.AppRunner(app, access_log=None, shutdown_timeout=0.1)
+        await self._runner.setup()
+        await web.TCPSite(self._runner, "127.0.0.1", 0).start()
+        self.url = f"http://127.0.0.1:{self._runner.addresses[0][1]}"
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        self._server.close()
-        await self._server.wait_closed()
+        self.restart()
+        await self._runner.cleanup()
 
     def reap(self) -> None:
         """Free the leaked slots."""
@@ -108,25 +137,19 @@ class Misbehaving:
         for socket in self._sockets:
             socket.transport.abort()
 
-    def _http(self, connection: ServerConnection, request: Request) -> Response | None:
-        if request.path.startswith("/ws"):
-            if self.connect_fates and self.connect_fates[0] == "unreachable":
-                self.connect_fates.popleft()
-                connection.transport.abort()
-            return None
-        body = json.dumps({"status": "healthy"}).encode()
-        return Response(HTTPStatus.OK, "OK", Headers({"Content-Length": str(len(body))}), body)
+    async def _health(self, request: web.Request) -> web.Response:
+        del request
+        return web.json_response({"status": "healthy"})
 
     # -- sessions
 
-    async def _post(self, path: str, body: bytes) -> tuple[HTTPStatus, bytes]:
-        assert path == "/mcp"
-        request = json.loads(body)
-        if request["method"] == "openenv/session/create":
+    async def _post(self, request: web.Request) -> web.Response:
+        message = await request.json()
+        if message["method"] == "openenv/session/create":
             self.creating.set()
             await self.may_create.wait()
-        answer = self._rpc(request["method"], request["params"])
-        return HTTPStatus.OK, json.dumps({"jsonrpc": "2.0", "id": request["id"], **answer}).encode()
+        answer = self._rpc(message["method"], message["params"])
+        return web.json_response({"jsonrpc": "2.0", "id": message["id"], **answer})
 
     def _rpc(self, method: str, params: dict[str, Any]) -> dict[str, Any]:
         if method == "openenv/session/create":
@@ -158,9 +181,8 @@ class Misbehaving:
         self.most = max(self.most, len(self.sessions))
         return key
 
-    def _attached(self, query: str) -> tuple[str, str]:
+    def _attached(self, key: str) -> tuple[str, str]:
         """Return the id of the session for a socket, or the code and text of an error."""
-        (key,) = parse_qs(query).get("session_id", [""])
         if key == "":
             key = self._created(is_kept=False)
             if key not in self.sessions:
@@ -182,30 +204,36 @@ class Misbehaving:
 
     # -- messages
 
-    async def _talk(self, socket: ServerConnection) -> None:
-        assert socket.request is not None
-        key, text = self._attached(urlsplit(socket.request.path).query)
+    async def _talk(self, request: web.Request) -> web.StreamResponse:
+        assert request.transport is not None
+        if self.connect_fates and self.connect_fates[0] == "unreachable":
+            self.connect_fates.popleft()
+            request.transport.abort()
+            return web.Response()
+        found = web.WebSocketResponse(timeout=0.1, autoping=False)
+        await found.prepare(request)
+        pongs = asyncio.Semaphore(0)
+        socket = Socket(found, request.transport, not self.loses_pongs, pongs)
+        with contextlib.suppress(ConnectionResetError):
+            await self._serve(socket, *self._attached(request.query.get("session_id", "")))
+        return found
+
+    async def _serve(self, socket: Socket, key: str, text: str) -> None:
         if text:
             await self._error(socket, key, text)
             return
-        if self.loses_pongs:
-            send = socket.protocol.send_frame
-            socket.protocol.send_frame = lambda frame: (  # type: ignore[method-assign]
-                None if frame.opcode is Opcode.PONG else send(frame)
-            )
         self._sockets.add(socket)
         session = self.sessions[key]
         try:
-            while await self._answer(socket, session, json.loads(await socket.recv())):
-                pass
-        except ConnectionClosed:
-            pass
+            while (message := await socket.receive()) is not None:
+                if not await self._answer(socket, session, message):
+                    return
         finally:
             self._sockets.discard(socket)
             if self.sessions.get(key) is session:
                 self._detach(key)
 
-    async def _answer(self, socket: ServerConnection, session: Session, message: Any) -> bool:
+    async def _answer(self, socket: Socket, session: Session, message: Any) -> bool:
         fate = self.fates.popleft() if self.fates else "ok"
         if fate == "never" and message["type"] != "step":
             fate = "late"  # Only steps have a short limit.
@@ -218,23 +246,21 @@ class Misbehaving:
                 reply["type"] = "state" if reply["type"] == "observation" else "observation"
             await self._begin(socket, session, fate, message)
             if fate in ANSWERED:
-                await socket.send(json.dumps(reply))
+                await socket.send(reply)
             if fate in GOES_ON:
                 return True
         socket.transport.abort()
         return False
 
-    async def _begin(
-        self, socket: ServerConnection, session: Session, fate: str, message: Any
-    ) -> None:
+    async def _begin(self, socket: Socket, session: Session, fate: str, message: Any) -> None:
         """Do what precedes the reply, or replaces it."""
         if fate == "late":
             await asyncio.sleep(0.005)
         elif fate == "never":
             self.on_never(message["data"]["number"])
-            await socket.wait_closed()
+            await socket.receive()
         elif fate == "no JSON":
-            await socket.send("{")
+            await socket.messages.send_str("{")
         elif fate == "half a frame":
             socket.transport.write(b"\x81\x7e\x01\x00{")
         elif fate == "restart":
@@ -259,9 +285,9 @@ class Misbehaving:
         observed = {"observation": seen, "reward": 1.0, "done": False}
         return {"type": "observation", "data": observed}
 
-    async def _error(self, socket: ServerConnection, code: str, message: str) -> None:
+    async def _error(self, socket: Socket, code: str, message: str) -> None:
         data = {"code": code, "message": message}
-        await socket.send(json.dumps({"type": "error", "data": data}))
+        await socket.send({"type": "error", "data": data})
 
 
 numbers = itertools.count()

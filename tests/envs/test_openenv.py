@@ -185,7 +185,7 @@ async def test_sessions_outlive_a_learner_that_holds_the_event_loop() -> None:
 
     async def ping_all() -> int:
         for socket in [*server._sockets]:
-            await (await socket.ping())
+            await socket.ping()
         return len(server._sockets)
 
     thread, server = LoopThread("server"), Misbehaving(capacity=ENVS)

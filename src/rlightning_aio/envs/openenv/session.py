@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import json
 import socket as sockets
 import urllib.request
 from contextvars import Context
-from http.client import HTTPException, HTTPResponse
+from http import HTTPStatus
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import quote, urlsplit, urlunsplit
 
+from aiohttp import ClientError, ClientSession, ClientTimeout
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, WebSocketException
 from websockets.protocol import State
@@ -230,7 +230,7 @@ class OpenEnvSession:
         try:
             async with asyncio.timeout(seconds):
                 reply = await post_json(_address(self.url, "http", "/mcp"), request, self._headers)
-        except (OSError, ValueError, HTTPException) as error:
+        except (OSError, ValueError, ClientError) as error:
             raise ServerGone(f"{self.url} can't be reached: {error}", is_unsent=True) from error
         error = reply.get("error")
         if error is not None:
@@ -340,43 +340,16 @@ async def post_json(
     """Return the JSON that a server answers to POST `body`.
 
     Raises:
-        OSError, ValueError, HTTPException: there is no such answer.
+        OSError, ValueError, ClientError: there is no such answer.
     """
-    parts, content = urlsplit(url), json.dumps(body).encode()
-    is_secure = parts.scheme == "https"
-    async with asyncio.timeout(_CONNECT_SECONDS):
-        reader, writer = await asyncio.open_connection(
-            parts.hostname, parts.port or (443 if is_secure else 80), ssl=is_secure or None
-        )
-    try:
-        fields = {
-            "Host": parts.netloc,
-            "Connection": "close",
-            "Content-Type": "application/json",
-            "Content-Length": str(len(content)),
-            **headers,
-        }
-        lines = [f"POST {parts.path} HTTP/1.1", *map(": ".join, fields.items()), "", ""]
-        writer.write("\r\n".join(lines).encode() + content)
-        received = await reader.read()
-    finally:
-        writer.transport.abort()
-    response = HTTPResponse(cast("Any", _Received(received)))
-    response.begin()
-    if response.status >= 300:
-        raise ConnectionError(f"HTTP {response.status} {response.reason}")
-    return json.loads(response.read())
-
-
-class _Received:
-    """What a server has sent, for `HTTPResponse`."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content = content
-
-    def makefile(self, mode: str) -> io.BytesIO:
-        del mode
-        return io.BytesIO(self._content)
+    timeout = ClientTimeout(total=None, connect=_CONNECT_SECONDS)
+    async with (
+        ClientSession(timeout=timeout) as session,
+        session.post(url, json=body, headers=headers, allow_redirects=False) as reply,
+    ):
+        if reply.status >= HTTPStatus.MULTIPLE_CHOICES:
+            raise ConnectionError(f"HTTP {reply.status} {reply.reason}")
+        return await reply.json(content_type=None)
 
 
 def get_json(url: str, path: str, headers: Mapping[str, str] = MappingProxyType({})) -> Any:
