@@ -25,10 +25,11 @@ ENTRY: dict[str, Any] = {
 }
 FAULTS = ["env_raised", "env_died", "env_hung"]
 NUM_STEPS = 30
+GAMMA, LAMBDA = 0.9, 0.8
 
 
 class Numbered(gym.Env[Any, Any]):
-    """Its observation is a random number of the episode, and that of steps; a step earns both.
+    """Its observation is a random number of the episode, and that of steps.
 
     Every second episode of seven steps is truncated. Every eleventh step goes wrong, if any does.
     """
@@ -40,7 +41,7 @@ class Numbered(gym.Env[Any, Any]):
         self.fault, self.count = fault, itertools.count(1)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.state = np.array([int.from_bytes(os.urandom(2), "little"), 0.0])
+        self.state = np.array([int.from_bytes(os.urandom(6), "little"), 0.0])
         return self.state.copy(), {}
 
     def step(self, action: Any) -> Any:
@@ -53,7 +54,13 @@ class Numbered(gym.Env[Any, Any]):
         self.state[1] += 1
         ends = self.state[1] == 7
         is_cut = bool(self.state[0] % 2)
-        return self.state.copy(), self.state.sum(), ends and not is_cut, ends and is_cut, {}
+        reward = earned(self.state)
+        return self.state.copy(), reward, ends and not is_cut, ends and is_cut, {}
+
+
+def earned(observation: Any) -> Any:
+    """Rewards of the steps that have led to observations."""
+    return observation[..., 0] % 1000 + observation[..., 1]
 
 
 def makers() -> list[Any]:
@@ -64,7 +71,7 @@ def makers() -> list[Any]:
 def assert_true(before: Any, after: Any, reward: Any, terminated: Any, truncated: Any) -> None:
     """Compare transitions with what such an env does."""
     np.testing.assert_array_equal(after - before, np.broadcast_to([0, 1], after.shape))
-    np.testing.assert_array_equal(reward, after.sum(axis=-1))
+    np.testing.assert_array_equal(reward, earned(after))
     ends, is_cut = after[..., 1] == 7, after[..., 0] % 2 == 1
     np.testing.assert_array_equal(terminated, ends & ~is_cut)
     np.testing.assert_array_equal(truncated, ends & is_cut)
@@ -90,21 +97,30 @@ def test_a_collector_leaves_out_what_was_lost(options: dict[str, Any]) -> None:
             )
             np.testing.assert_array_equal(rollout.seen, rollout.observation)
             np.testing.assert_array_equal(rollout.first, rollout.observation[..., 1] == 0)
-            gains = rollout.reward.astype(np.float64)
-            found = rollout.advantages(np.zeros_like(gains), np.zeros(len(rollout.ends)), 1.0, 1.0)
-            np.testing.assert_array_equal(found, rest_of_segments(rollout, gains))
+            found = rollout.advantages(
+                value(rollout.observation), value(rollout.end_observation), GAMMA, LAMBDA
+            )
+            np.testing.assert_allclose(found, advantages(rollout))
         metrics = group.metrics()
     assert all(metrics[f"envs/outcomes_{fault}"] > 0 for fault in FAULTS)
 
 
-def rest_of_segments(rollout: Any, rewards: Any) -> Any:
-    """Sum the rewards of each transition and of those after it in its episode of the rollout."""
-    index, ids = rollout.index.ravel(), rollout.observation[..., 0].ravel()
-    flat = rewards.ravel()
-    rest = [
-        flat[k:][(index[k:] == index[k]) & (ids[k:] == ids[k])].sum() for k in range(len(rollout))
-    ]
-    return np.reshape(rest, rollout.shape)
+def value(observation: Any) -> Any:
+    """What a value function might say of observations."""
+    return 7 * observation[..., 1] - observation[..., 0] % 100
+
+
+def advantages(rollout: Any) -> Any:
+    """Advantages by the formula, from what each transition says of itself."""
+    found = np.zeros(rollout.shape)
+    after = np.where(rollout.terminated, 0, value(rollout.next_observation))
+    errors = rollout.reward + GAMMA * after - value(rollout.observation)
+    newest: dict[tuple[int, float], float] = {}
+    for place in reversed([*np.ndindex(rollout.shape)]):
+        episode = rollout.index[place].item(), rollout.observation[place][0].item()
+        newest[episode] = errors[place] + GAMMA * LAMBDA * newest.get(episode, 0.0)
+        found[place] = newest[episode]
+    return found
 
 
 def test_a_vector_env_cuts_the_episode_at_what_was_lost() -> None:
