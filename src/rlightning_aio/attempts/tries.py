@@ -58,7 +58,9 @@ class Try:
     ) -> None:
         self._view, self._agent, self._rules, self._waited = view, agent, rules, waited
         self._logged = logged
-        self._stopped: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        # Why it was stopped, if it was; and what `_either` waits for.
+        self._stopped: str | None = None
+        self._woken: asyncio.Future[None] | None = None
         self.error: BaseException | None = None
 
     @property
@@ -68,8 +70,9 @@ class Try:
 
     def stop(self, why: str) -> None:
         """End it soon, as cancelled."""
-        if not self._stopped.done():
-            self._stopped.set_result(why)
+        if self._stopped is None:
+            self._stopped = why
+            self._wake()
 
     async def run(self) -> Attempt:
         """Play; the env is idle after that.
@@ -95,7 +98,8 @@ class Try:
             ended = view.fault
             await self._leave()
         else:
-            playing = asyncio.ensure_future(_awaited(self._agent(view)))
+            del begin  # A task keeps its coroutine.
+            playing = asyncio.ensure_future(_awaited(self._agent, view))
             await self._either(playing, limit and limit - (time.monotonic() - began))
             ended = self._end_of(playing)
             if not playing.done():
@@ -108,17 +112,28 @@ class Try:
         return self._record(ended, result, time.monotonic() - began)
 
     async def _either(self, task: asyncio.Task[Any], limit: float | None) -> None:
-        """Wait for a task, until this try is stopped, or for `limit` seconds."""
-        deadline = None if limit is None else time.monotonic() + limit
-        while True:
-            left = None if deadline is None else max(deadline - time.monotonic(), 0)
-            waits = asyncio.FIRST_COMPLETED
-            try:
-                await asyncio.wait({task, self._stopped}, timeout=left, return_when=waits)
-            except asyncio.CancelledError:
-                self.stop("the program is ending")
-            else:
-                return
+        """Wait for a task, until this try is stopped, or for `limit` seconds.
+
+        Thousands wait here at once: `asyncio.wait` would make a dozen objects for each.
+        """
+        if self._stopped is not None:
+            return
+        loop = asyncio.get_running_loop()
+        self._woken = loop.create_future()
+        task.add_done_callback(self._wake)
+        timer = None if limit is None else loop.call_later(limit, self._wake)
+        try:
+            await self._woken
+        except asyncio.CancelledError:
+            self.stop("the program is ending")
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    def _wake(self, task: asyncio.Task[Any] | None = None) -> None:
+        del task
+        if self._woken is not None and not self._woken.done():
+            self._woken.set_result(None)
 
     async def _leave(self) -> None:
         self._view.end("is over")
@@ -139,8 +154,8 @@ class Try:
 
     def _cut_short(self, *, has_begun: bool) -> Outcome:
         """The outcome of a try that did not end by itself."""
-        if self._stopped.done():
-            return Outcome("cancelled", "caller", self._stopped.result(), self.env_id)
+        if self._stopped is not None:
+            return Outcome("cancelled", "caller", self._stopped, self.env_id)
         cause = f"its {self._rules.attempt_timeout:g} s were over"
         if not has_begun:
             return Outcome("timed_out", "env", f"{cause} before its reset was done", self.env_id)
@@ -199,8 +214,8 @@ class Try:
         )
 
 
-async def _awaited(answer: Awaitable[Any]) -> Any:
-    return await answer
+async def _awaited(agent: Agent, view: AttemptEpisode) -> Any:
+    return await agent(view)
 
 
 async def surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:

@@ -96,6 +96,7 @@ class EnvEpisode:
             reset: Any = self._group.reset(seeds, self._options, [self.env.env_id])
             self._reset = task = asyncio.ensure_future(reset)
             found = await asyncio.shield(task)
+            self._reset = None  # A task keeps its result.
             self.last, (self.is_over,) = only_result(found), are_over(found[0])
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
