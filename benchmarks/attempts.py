@@ -7,9 +7,14 @@ again. The table counts outcomes against what was injected; `gather` is the same
 a loop over the tasks, an env for each attempt, no time limits.
 
 Then the first 6 of 8 attempts whose latencies are log-normal, against waiting for all 8, and how
-long it takes until the env of a surplus attempt plays the next; how long after its cancellation in
-a step that never ends an env is free, and has begun another episode, at each place; and the memory
-of an attempt, with 2,000 in flight.
+long it takes until the env of a surplus attempt plays the next; and how long after its cancellation
+in a step that never ends an env is free, and has begun another episode, at each place.
+
+Then 2,000 attempts in flight, whose steps wait for a second on average (log-normal): how late the
+event loop is, with the start of all of them, what a step costs the trainer's thread where results
+arrive one after another, and the garbage collector's pauses; as it is, and after
+`gc.collect(); gc.freeze()`, which leaves out what exists already. And what a step costs whose
+result comes all alone, while the other attempts wait; and the memory of an attempt.
 
     python benchmarks/attempts.py [--ray] [--json]
 
@@ -23,6 +28,8 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import gc
+import itertools
 import json
 import os
 import random
@@ -30,16 +37,20 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import psutil
 from harness import machine_facts, machine_text
+from waiting import IDLE, MEAN, Waits
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
 from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterator
 
 TASKS, SIZE, STEPS, STEP_SECONDS = 64, 8, 4, 0.002
 SHARE: Final = 0.05
@@ -53,7 +64,9 @@ FAULTS: Final = {
 }
 """What goes wrong, and the outcome that is to say so."""
 GIVE_UP_SECONDS: Final = 20.0
-MEDIAN_SECONDS, IN_FLIGHT, CUT = 0.05, 2000, 5
+MEDIAN_SECONDS, IN_FLIGHT, LONG, CUT = 0.05, 2000, 10, 5
+WAIT, AT_ONCE, FOREVER = range(3)
+"""For how long a step waits."""
 
 
 def fault_of(seed: int, index: int, faults: list[str]) -> str:
@@ -305,6 +318,109 @@ async def until_free_everywhere(*, ray: bool) -> dict[str, dict[str, float]]:
     return found
 
 
+class Waiting(Waits):
+    """An awaitable env, whose steps wait for a second on average, or as long as they are told."""
+
+    steps = 0
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        del options
+        self.place, self.steps = 97 * (seed or 0), 0
+        return IDLE, {}
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep((self.latency() / MEAN, 0, 3600)[action])
+        self.steps += 1
+        return IDLE, 1.0, self.steps >= LONG and action == WAIT, False, {}
+
+
+@contextlib.contextmanager
+def collector_pauses() -> Generator[list[float]]:
+    """How long each run of the garbage collector takes, in seconds of the thread."""
+    pauses: list[float] = []
+    began = 0.0
+
+    def note(phase: str, info: dict[str, int]) -> None:
+        nonlocal began
+        del info
+        if phase == "start":
+            began = time.thread_time()
+        else:
+            pauses.append(time.thread_time() - began)
+
+    gc.callbacks.append(note)
+    yield pauses
+    gc.callbacks.remove(note)
+
+
+async def many(seconds: float, *, freezes: bool) -> dict[str, float]:
+    """Keep 2,000 attempts in flight for some seconds."""
+    steps, lags = 0, list[float]()
+
+    async def agent(episode: Any) -> None:
+        nonlocal steps
+        while not episode.is_over:
+            await episode.step(WAIT)
+            steps += 1
+
+    def tasks() -> Iterator[EpisodeSpec]:
+        until = time.monotonic() + seconds
+        for seed in itertools.takewhile(lambda _: time.monotonic() < until, itertools.count()):
+            yield EpisodeSpec("", seed)
+
+    async with rl.build_env_group(Waiting, num_workers=IN_FLIGHT, placement="loop") as group:
+        gc.collect()
+        if freezes:
+            gc.freeze()
+        spent = time.thread_time()
+        watching = asyncio.create_task(watch(lags))
+        with collector_pauses() as pauses:
+            async for attempts in play(group, tasks(), agent, SIZE, Rules(seeds="distinct")):
+                assert attempts.is_complete
+        watching.cancel()
+        spent = time.thread_time() - spent
+    gc.unfreeze()
+    lags.sort()
+    return {
+        "lag_p99_ms": 1e3 * lags[int(0.99 * len(lags))],
+        "lag_max_ms": 1e3 * lags[-1],
+        "us_per_step": 1e6 * spent / steps,
+        "longest_collection_ms": 1e3 * max(pauses, default=0.0),
+    }
+
+
+async def alone(number: int) -> float:
+    """What a step of one attempt costs the thread while the others wait, in µs."""
+    begun, all_begun = 0, asyncio.Event()
+    found: asyncio.Future[float] = asyncio.get_running_loop().create_future()
+
+    async def agent(episode: Any) -> None:
+        nonlocal begun
+        begun += 1
+        if begun == IN_FLIGHT:
+            all_begun.set()
+        if episode.spec.seed or episode.index:
+            await episode.step(FOREVER)
+        await all_begun.wait()
+        await asyncio.sleep(1.0)  # Until the steps of the others were sent.
+        costs: list[float] = []
+        for _ in range(5):
+            began = time.thread_time()
+            for _ in range(number):
+                await episode.step(AT_ONCE)
+            costs.append(1e6 * (time.thread_time() - began) / number)
+        found.set_result(min(costs))
+
+    async with rl.build_env_group(Waiting, num_workers=IN_FLIGHT, placement="loop") as group:
+        tasks = [EpisodeSpec("", seed) for seed in range(IN_FLIGHT // SIZE)]
+        playing = asyncio.ensure_future(anext(groups := play(group, tasks, agent, SIZE)))
+        cost = await found
+        playing.cancel()
+        await asyncio.wait([playing])
+        await groups.aclose()
+    return cost
+
+
 async def memory_of_attempts() -> float:
     """KiB of an attempt and its agent in its first step, without those of its env."""
     flying, all_there, go = 0, asyncio.Event(), asyncio.Event()
@@ -335,12 +451,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", type=int, default=TASKS)
     parser.add_argument("--ray", action="store_true", help="cancel episodes on Ray, too")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of 2,000 attempts in flight")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     args = parser.parse_args()
     report = {place: compared(place, args.tasks) for place in ("loop", "workers")}
     rules = {f"first {k or SIZE}": rl.run(first_of(k, min(args.tasks, 32))) for k in (None, 6)}
     freed = asyncio.run(until_free_everywhere(ray=args.ray))
-    more = {**rules, "freed": freed, "kib_per_attempt": rl.run(memory_of_attempts())}
+    flights = {
+        "as it is": rl.run(many(args.seconds, freezes=False)),
+        "frozen": rl.run(many(args.seconds, freezes=True)),
+    }
+    more = {
+        **rules,
+        "freed": freed,
+        "in_flight": flights,
+        "alone_us_per_step": rl.run(alone(200)),
+        "kib_per_attempt": rl.run(memory_of_attempts()),
+    }
     if args.json:
         print(json.dumps({**report, **more}))
         return
@@ -362,6 +489,12 @@ def main() -> None:
     print("\ncancelled in a step that never ends, an env is free, and has begun an episode after:")
     for place, found in freed.items():
         print(f"  {place}: {found['free_s']:.2f} s, {found['begun_s']:.2f} s")
+    for how, found in flights.items():
+        line = f"{IN_FLIGHT} in flight, {how}: event-loop lag {found['lag_p99_ms']:.1f} ms (p99), "
+        line += f"{found['lag_max_ms']:.1f} at most, {found['us_per_step']:.0f} µs for a step, "
+        line += f"longest garbage collection {found['longest_collection_ms']:.1f} ms"
+        print(f"\n{line}")
+    print(f"\n{more['alone_us_per_step']:.0f} µs for a step whose result comes alone")
     print(f"\n{more['kib_per_attempt']:.1f} KiB for each of {IN_FLIGHT} attempts in flight")
 
 

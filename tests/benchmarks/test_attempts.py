@@ -12,7 +12,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "attempts.py"
 
 def test_outcomes_equal_the_faults_that_were_injected() -> None:
     """Every group is complete, and no failure has a reward."""
-    command = [sys.executable, str(SCRIPT), "--json", "--tasks", "6"]
+    command = [sys.executable, str(SCRIPT), "--json", "--tasks", "6", "--seconds", "1"]
     ended = subprocess.run(command, capture_output=True, check=True, text=True)
     report = json.loads(ended.stdout.splitlines()[-1])
     for found in (report["loop"], report["workers"]):
@@ -26,4 +26,8 @@ def test_outcomes_equal_the_faults_that_were_injected() -> None:
     assert report["first 6"]["freed_s"] > 0
     for found in report["freed"].values():
         assert found["begun_s"] > found["free_s"] > 0
+    assert report["alone_us_per_step"] > 0
+    for found in report["in_flight"].values():
+        assert 0 < found["lag_p99_ms"] <= found["lag_max_ms"]
+        assert found["us_per_step"] > 0
     assert report["kib_per_attempt"] > 0

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import rlightning_aio as rl
+from rlightning_aio._core.group.engine import agent_steps
+from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
@@ -59,6 +61,14 @@ class Hanging:
         if action == HANG:
             await asyncio.Event().wait()
         return np.array([0]), 1.0, False, False, {}
+
+
+class Long(Hanging):
+    """Steps end one soon after another, but for those that don't."""
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(0.05 + 0.01 * int(action))
+        return await super().step(action)
 
 
 async def episodes(group: Any) -> list[Any]:
@@ -177,3 +187,34 @@ async def test_agents_and_batches_and_calls_take_turns() -> None:
         calls = map(called, group.env_ids[4:])
         counts = await asyncio.gather(*map(agent, playing), collected(), *calls)
         assert counts == [30, 30, 60, None, None]
+
+
+async def test_long_steps_that_end_soon_after_each_other_are_one_batch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where there are hundreds of them."""
+    for name, value in (("_SHARE", 10), ("_LONGEST_PAUSE", 0.5), ("_MANY", 3)):
+        monkeypatch.setattr(agent_steps, name, value)
+    async with rl.build_env_group(Long, num_workers=3, placement="loop") as group:
+        await stepped(await episodes(group), [0, 1, 2])
+        assert group.get_stats()["batch_size"]["max"] == 3
+
+
+async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_env(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name, value in (("_SHARE", 1000), ("_LONGEST_PAUSE", 30), ("_MANY", 2)):
+        monkeypatch.setattr(agent_steps, name, value)
+    async with rl.build_env_group(Long, num_workers=2, placement="loop") as group:
+        requests = group._core.parts.tables.requests
+        first, other = await episodes(group)
+        steps = [asyncio.ensure_future(first.step(0)), asyncio.ensure_future(other.step(HANG))]
+        while requests.state[0] != State.READY:  # noqa: ASYNC110  # Nothing tells.
+            await asyncio.sleep(0.001)
+        assert not steps[0].done()
+        steps[0].cancel()
+        await asyncio.wait(steps[:1])
+        await first.__aexit__()
+        assert requests.is_idle(0)
+        await group.close()
+        await asyncio.wait(steps)

@@ -25,6 +25,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
+from rlightning_aio._core.group.state import samples
 from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window
 from rlightning_aio.metrics import FIGURES, _Reader
 
@@ -148,7 +149,7 @@ def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
     envs_type = type("Envs", (SimpleNamespace,), {"__len__": lambda _: size})
     requests: Any = SimpleNamespace(state=np.zeros(size, np.int8), sent_ns=np.zeros(size, int))
     times = EnvTimes(envs_type(**vars(envs)), requests)
-    times.most_kept = rng.randint(1, 20)
+    most_kept = rng.randint(1, 20)
     expected = np.zeros((num_entries, 5))
     taken: dict[int, int] = {}
     now = 10**12
@@ -159,7 +160,7 @@ def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
         now += 2000
         one = sample(rng, now, slots, sent)
         times.kept.append(one)
-        if len(times.kept) >= times.most_kept:
+        if len(times.kept) >= most_kept:
             times.sum_up()
         requests.state[slots] = 0
         for k, (slot, s) in enumerate(zip(slots, sent, strict=True)):
@@ -316,12 +317,12 @@ def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None
     assert sum(found[f"outcomes_{kind}"] for kind in kinds) == counted.total()
 
 
-def test_other_threads_may_read() -> None:
+def test_other_threads_may_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """At any time; no result is counted twice or left out, and counters that are exported grow."""
+    monkeypatch.setattr(samples, "_MOST_ROWS", 3 * samples.LEAST_ROWS)
     entry = {**ENTRY, "envs_per_process": 4}
     with sync.build_env_group([entry, {**entry, "name": "more"}]) as group:
         group.reset()
-        group._core.stats.times.most_kept = 3
         wrong: list[Any] = []
         ended = threading.Event()
 

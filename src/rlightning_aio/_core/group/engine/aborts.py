@@ -86,6 +86,7 @@ class Aborts:
             self._requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
+        self._waiting.wake_server()  # It may have results of these that it has not handed out.
         while left := aborted.faults.keys() & slots.tolist():
             now = yield from self._waiting.turn(len(left), None)
             self._waiting.poll()

@@ -1,17 +1,18 @@
-"""`AgentSteps`: the steps of agents, each of which is a coroutine that plays one env.
+"""`AgentSteps`: the steps of agents. An agent is a coroutine that plays one env.
 
 What agents ask for in one turn of the event loop is sent as one batch, and results that are ready
 together are handed out as one. One call waits for all of them, while any agent waits: a step costs
-a row of a batch, and no call of its own.
+a row of a batch, and no call of its own. Where hundreds of long steps are outstanding, which end
+one after another, results wait for a hundredth of a step's time, so that there are batches.
 """
 
 from __future__ import annotations
 
 from asyncio import CancelledError
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
-import numpy as np
-
+from rlightning_aio._core.group.drivers.wait import TURN, Wait
+from rlightning_aio._core.group.engine.waiting import REPLIES
 from rlightning_aio.batch.contents import are_over, lost_rows
 from rlightning_aio.batch.data import BatchedData
 from rlightning_aio.errors import EnvAway
@@ -19,6 +20,7 @@ from rlightning_aio.errors import EnvAway
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
@@ -30,6 +32,13 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["AgentStep", "AgentSteps", "StepEnd"]
+
+_MANY: Final = 400
+"""With this number of steps outstanding, several end in a hundredth of the time of one."""
+_SHARE: Final = 0.01
+"""How much later, as a share of its time, a step may end for a batch with others."""
+_SHORTEST_PAUSE, _LONGEST_PAUSE = 0.001, 0.005
+"""Seconds; an event loop's timers know no less than the first."""
 
 
 class StepEnd(NamedTuple):
@@ -90,7 +99,7 @@ class AgentSteps:
         self._asked: list[AgentStep] = []
         # Those that are outstanding, by slot.
         self._sent: dict[int, AgentStep] = {}
-        self._is_served = False
+        self._is_served = self._is_pausing = False
 
     def ask(self, step: AgentStep) -> bool:
         """Have a step sent.
@@ -120,16 +129,31 @@ class AgentSteps:
                 raise
         self._is_served = False
 
-    def _work(self, ticket: Ticket, now: float) -> bool:
-        """Hand out what is ready and send what is asked for; False if nothing is outstanding."""
-        self._hand_out(ticket)
+    def _work(self, ticket: Ticket, now: float) -> Wait | None:
+        """Hand out what is ready and send what is asked for; return what to wait for."""
+        if self._is_pausing:
+            self._is_pausing = False
+        elif until := self._pause(ticket, now):
+            self._is_pausing = True
+            return Wait(until)
+        has_handed_out = self._hand_out(ticket)
         asked = [step for step in self._asked if not step.reply.done()]
         self._asked.clear()
         if asked:
             self._send(asked, ticket, now)
             self._waiting.poll()  # Some may have ended at once.
-            self._hand_out(ticket)
-        return bool(self._sent or self._asked)
+            has_handed_out = self._hand_out(ticket) or has_handed_out
+        if has_handed_out:
+            return TURN  # Agents ask for their next steps in it.
+        return REPLIES if self._sent or self._asked else None
+
+    def _pause(self, ticket: Ticket, now: float) -> float:
+        """Return when to hand out a ready result with those that come soon; 0.0: now."""
+        if len(self._sent) < _MANY or not ticket.ended or ticket.errors or self._asked:
+            return 0.0
+        since = self._requests.sent_ns.item(ticket.ended[0].item(0)) / 1e9
+        pause = min((now - since) * _SHARE, _LONGEST_PAUSE)
+        return now + pause if pause >= _SHORTEST_PAUSE else 0.0
 
     def _send(self, asked: Sequence[AgentStep], ticket: Ticket, now: float) -> None:
         """Send steps as one batch; if that can't be, one by one, so that each has its own error."""
@@ -152,12 +176,13 @@ class AgentSteps:
         for slot, step in zip(slots.tolist(), asked, strict=True):
             self._sent[slot] = step
             step.is_outstanding = True
-        ticket.slots = np.concatenate((ticket.slots, slots))
         ticket.remaining += len(slots)
         self._steps.send(slots, packed, now, ticket)
 
-    def _hand_out(self, ticket: Ticket) -> None:
-        """Give each agent whose request has ended its result or error."""
+    def _hand_out(self, ticket: Ticket) -> bool:
+        """Give each agent whose request has ended its result or error; False if there is none."""
+        if not ticket.errors and not ticket.ended:
+            return False
         for slot, fault in ticket.errors.items():
             if not (reply := self._ended(slot)).done():
                 reply.set_exception(fault)
@@ -166,6 +191,7 @@ class AgentSteps:
         if len(slots):
             batch, _ = self._steps.hand_out(slots, synchronous=True)
             self._resolve(batch, slots)
+        return True
 
     def _resolve(self, batch: BatchedData, slots: NDArray[np.intp]) -> None:
         lost = lost_rows(batch)
@@ -181,7 +207,7 @@ class AgentSteps:
         return step.reply
 
     def fail(self, error: BaseException) -> None:
-        """Let all agents know of an error of the group, which nobody serves any more."""
+        """Pass an error that has ended `serve` to all agents."""
         self._is_served = False
         steps = [*self._sent.values(), *self._asked]
         self._sent.clear()

@@ -12,11 +12,12 @@ two calls, however many wait.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait
+from rlightning_aio._core.group.state.conditions import OF_HOSTS
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
 from rlightning_aio._core.hosts.spinner import Spinner
@@ -33,7 +34,10 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Host, Watcher
     from rlightning_aio.protocol.rings import TrainerBell
 
-__all__ = ["Poller", "Waiting"]
+__all__ = ["REPLIES", "Poller", "Waiting"]
+
+REPLIES: Final = Wait()
+"""What `Waiting.serve` waits for where its work has nothing else to wait for."""
 
 
 class Waiting:
@@ -145,14 +149,15 @@ class Waiting:
                         now = yield Wait(0.0)
                 else:
                     is_due = until is not None or supervisor.detector.timed
-                    is_due = is_due or self._conditions.unusual != 0
+                    is_due = is_due or self._conditions.unusual & OF_HOSTS != 0
+                    is_due = is_due or supervisor.members.possible
                     patient = supervisor.overdue.wait
                     now = yield Wait(supervisor.next_check(until)) if is_due else patient
                     if may_spin:
                         poller.slept()
                     if not is_due:
                         supervisor.look_by = now + LOOK_SECONDS
-                        is_due = self._conditions.unusual != 0
+                        is_due = self._conditions.unusual & OF_HOSTS != 0
         finally:  # As `_want`, without a call.
             if (calls := self.wanted.pop(wanted)) > 1:
                 self.wanted[wanted] = calls - 1
@@ -224,7 +229,7 @@ class Waiting:
         self._requests.settle(ticket)
         return ticket, now
 
-    def serve(self, now: float, work: Callable[[Ticket, float], bool]) -> Procedure[None]:
+    def serve(self, now: float, work: Callable[[Ticket, float], Wait | None]) -> Procedure[None]:
         """Do some work again and again, whenever replies to its requests are ready.
 
         After an error, it is as with `ask`.
@@ -232,12 +237,18 @@ class Waiting:
         Args:
             now: monotonic seconds.
             work: takes the replies that its ticket has, sends more requests for it, and returns
-                True if any is outstanding. Gets the ticket and the time.
+                what to wait for, `REPLIES` or a wait; None at the end. Gets the ticket and the
+                time.
         """
         self._served = ticket = self._requests.tickets.open(np.zeros(0, np.intp), apart=True)
         try:
-            while work(ticket, now):
-                now = yield from self._next(ticket, 1)
+            while (wait := work(ticket, now)) is not None:
+                if wait is REPLIES:
+                    now = yield from self._next(ticket, 1)
+                else:
+                    now = yield wait
+                    if now >= self._supervisor.look_by:
+                        self.check(now)
                 self.poll()
         except BaseException:
             self._give_up(ticket)
@@ -283,7 +294,7 @@ class Waiting:
         return ticket
 
     def _give_up(self, ticket: Ticket) -> None:
-        """Close a ticket that nobody waits for any more."""
+        """Close a ticket whose call no longer waits."""
         self._requests.give_up(ticket)
         self.wake()
 

@@ -275,7 +275,7 @@ class Continuity:
 
     def begin_steps(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Note steps that are about to be sent; return which of `slots` are reset instead."""
-        if not self.auto_reset_is_open:
+        if not self.auto_reset_is_open and len(self._cut[slots].nonzero()[0]):
             self._cut[slots] = False  # Outside the context a step continues the episode.
             self._update_due()
         return self.due[slots]

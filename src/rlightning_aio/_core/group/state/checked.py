@@ -185,7 +185,7 @@ class CheckedRequests(Requests):
             super().settle(ticket)
 
     def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
-        ended = ticket.slots[self.state[ticket.slots] != State.BUSY]
+        ended = np.concatenate((*ticket.ended, ticket.slots[:0]))
         with self.changes((Event.SETTLED, ended)):
             return super().settle_ended(ticket)
 

@@ -16,6 +16,7 @@ __all__ = [
     "DEATH",
     "FAULT",
     "LOST_EPISODE",
+    "OF_HOSTS",
     "PAST_END",
     "UNLIKE_ENVS",
     "Conditions",
@@ -41,6 +42,8 @@ ABORTING: Final = 1 << 7
 
 PAST_END: Final = 1 << 8
 """Outside `auto_reset` an env is over, of an entry that was not warned that a step would go on."""
+OF_HOSTS: Final = ~(UNLIKE_ENVS | CUT_BEFORE | BESIDE_ROWS | PAST_END)
+"""All that say something of hosts: while one is set, a waiting call looks at them at each turn."""
 
 
 class Conditions:

@@ -43,9 +43,12 @@ class Ticket(msgspec.Struct):
     """A call that waits for its own requests, independently of `collect`.
 
     Attributes:
+        slots: whose requests; of a ticket that is `apart`, only once it is given up.
         remaining: number of its requests that have not ended.
         method: name of the method that it calls; empty for steps and resets.
-        apart: each of its requests is somebody else's, and has an error of its own.
+        apart: each of its requests is somebody else's, and has an error of its own. It stays open
+            while requests come and go.
+        ended: slots of an `apart` ticket whose results and errors are to be taken.
         errors: the error that a request ended in, by slot.
         values: returned by method calls, by slot.
     """
@@ -55,11 +58,14 @@ class Ticket(msgspec.Struct):
     remaining: int
     method: str
     apart: bool = False
+    ended: list[NDArray[np.intp]] = []
     errors: dict[int, EnvFault] = {}
     values: dict[int, Any] = {}
 
     def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
         """Return the slots whose requests are its own, by the `owner` of each request."""
+        if self.apart:
+            return np.flatnonzero(owner == self.owner)
         return self.slots[owner[self.slots] == self.owner]
 
     @property
@@ -444,14 +450,16 @@ class Requests:
         elif len(tickets) == 1 and not collector.num_awaited:
             (ticket,) = tickets.values()  # It isn't parked: no other call is there.
             ticket.remaining -= len(slots)
+            if ticket.apart:
+                ticket.ended.append(slots)
         else:
             owners = self.owner[slots]
             found: list[int] = owners.tolist()
             for owner, count in Counter(found).items():
                 if owner == COLLECTOR:
                     collector.append(slots[owners == owner])
-                else:
-                    self.tickets.note_ended(owner, count)
+                elif (ticket := self.tickets.note_ended(owner, count)).apart:
+                    ticket.ended.append(slots[owners == owner])
 
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
@@ -483,6 +491,8 @@ class Requests:
         if owner > 0:
             ticket = self.tickets.note_ended(owner, len(slots))
             ticket.errors |= dict.fromkeys(slots.tolist(), fault)
+            if ticket.apart:
+                ticket.ended.append(slots)
             self.state[slots] = _SPENT_CODE
         elif owner == COLLECTOR:
             self.collector.num_awaited -= len(slots)
@@ -536,13 +546,12 @@ class Requests:
 
     def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
         """Take what has ended out of a ticket that stays open; return the slots of the results."""
-        states = self.state[ticket.slots]
-        is_busy = states == _BUSY_CODE
-        if is_busy.all():
-            return ticket.slots[:0]
-        ended, states = ticket.slots[~is_busy], states[~is_busy]
-        ticket.slots = ticket.slots[is_busy]
+        if not ticket.ended:
+            return self._each[:0]
+        ended = ticket.ended[0] if len(ticket.ended) == 1 else np.concatenate(ticket.ended)
+        ticket.ended.clear()
         self.owner[ended] = COLLECTOR
+        states = self.state[ended]
         self._forget(ended[states == _SPENT_CODE])
         return ended[states == _READY_CODE]
 

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Requests
 
-__all__ = ["EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
+__all__ = ["LEAST_ROWS", "EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
 
 WINDOW_SECONDS: Final = 10.0
-_MOST_KEPT: Final = 256
-"""The number of samples that are summed at once: one by one, that would take longer than a step."""
 _MOST_ROWS: Final = 1 << 14
-"""The number of results in them, which bounds how long that takes."""
+"""The number of results that are summed at once, which bounds how long that takes."""
+LEAST_ROWS: Final = 64
+"""For how many results each sample counts: to sum them one by one would take longer than a step."""
 
 
 class Sample(msgspec.Struct):
@@ -175,15 +175,16 @@ class EnvTimes:
     begins, the env executes it, and its result waits to be collected. Any thread may read this.
 
     Attributes:
-        kept: samples that are not in the sums yet; whoever adds one calls `sum_up` where there are
-            most_kept.
+        kept: samples that are not in the sums yet.
+        room: for how many results more. A caller that adds a sample takes its results off,
+            `LEAST_ROWS` at least, and calls `sum_up` where no room is left.
     """
 
     def __init__(self, envs: EnvTable, requests: Requests) -> None:
         self._envs = envs
         self._requests = requests
         self.kept: deque[Sample] = deque()
-        self.most_kept = max(1, min(_MOST_KEPT, _MOST_ROWS // max(len(envs), 1)))
+        self.room = _MOST_ROWS
         # Columns as in `so_far`; times in ns.
         self._sums = np.zeros((len(envs.names.entry_names), 5))
         # When each slot's last result was returned; 0 before the first one.
@@ -199,6 +200,7 @@ class EnvTimes:
         """Add to the sums what is kept."""
         kept: list[Sample] = []
         with self._lock:
+            self.room = _MOST_ROWS
             while self.kept:  # The trainer may append meanwhile.
                 kept.append(self.kept.popleft())
             if not kept:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 import numpy as np
 
-from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window, rows_of
+from rlightning_aio._core.group.state.samples import LEAST_ROWS, EnvTimes, Sample, Window, rows_of
 from rlightning_aio.outcomes import Outcome, OutcomeKind
 from rlightning_aio.protocol.slab import IS_RESET, TERMINATED, TRUNCATED
 
@@ -134,7 +134,8 @@ class Stats:
             )
             self._samples.append(sample)
             times.kept.append(sample)
-            if len(times.kept) >= times.most_kept:
+            times.room -= max(len(slots), LEAST_ROWS)
+            if times.room <= 0:
                 times.sum_up()
             if part.episode_return is not None and part.episode_length is not None:
                 self._note_episodes(part, part.episode_return, part.episode_length)
