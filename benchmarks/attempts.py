@@ -353,8 +353,8 @@ def collector_pauses() -> Generator[list[float]]:
     gc.callbacks.remove(note)
 
 
-async def many(seconds: float, *, freezes: bool) -> dict[str, float]:
-    """Keep 2,000 attempts in flight for some seconds."""
+async def many(number: int, seconds: float, *, freezes: bool) -> dict[str, float]:
+    """Keep a number of attempts in flight for some seconds."""
     steps, lags = 0, list[float]()
 
     async def agent(episode: Any) -> None:
@@ -368,7 +368,7 @@ async def many(seconds: float, *, freezes: bool) -> dict[str, float]:
         for seed in itertools.takewhile(lambda _: time.monotonic() < until, itertools.count()):
             yield EpisodeSpec("", seed)
 
-    async with rl.build_env_group(Waiting, num_workers=IN_FLIGHT, placement="loop") as group:
+    async with rl.build_env_group(Waiting, num_workers=number, placement="loop") as group:
         gc.collect()
         if freezes:
             gc.freeze()
@@ -389,7 +389,7 @@ async def many(seconds: float, *, freezes: bool) -> dict[str, float]:
     }
 
 
-async def alone(number: int) -> float:
+async def alone(number: int, steps: int) -> float:
     """What a step of one attempt costs the thread while the others wait, in µs."""
     begun, all_begun = 0, asyncio.Event()
     found: asyncio.Future[float] = asyncio.get_running_loop().create_future()
@@ -397,7 +397,7 @@ async def alone(number: int) -> float:
     async def agent(episode: Any) -> None:
         nonlocal begun
         begun += 1
-        if begun == IN_FLIGHT:
+        if begun == number:
             all_begun.set()
         if episode.spec.seed or episode.index:
             await episode.step(FOREVER)
@@ -406,13 +406,13 @@ async def alone(number: int) -> float:
         costs: list[float] = []
         for _ in range(5):
             began = time.thread_time()
-            for _ in range(number):
+            for _ in range(steps):
                 await episode.step(AT_ONCE)
-            costs.append(1e6 * (time.thread_time() - began) / number)
+            costs.append(1e6 * (time.thread_time() - began) / steps)
         found.set_result(min(costs))
 
-    async with rl.build_env_group(Waiting, num_workers=IN_FLIGHT, placement="loop") as group:
-        tasks = [EpisodeSpec("", seed) for seed in range(IN_FLIGHT // SIZE)]
+    async with rl.build_env_group(Waiting, num_workers=number, placement="loop") as group:
+        tasks = [EpisodeSpec("", seed) for seed in range(number // SIZE)]
         playing = asyncio.ensure_future(anext(groups := play(group, tasks, agent, SIZE)))
         cost = await found
         playing.cancel()
@@ -451,22 +451,26 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tasks", type=int, default=TASKS)
     parser.add_argument("--ray", action="store_true", help="cancel episodes on Ray, too")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of 2,000 attempts in flight")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of attempts in flight")
+    parser.add_argument(
+        "--in-flight", type=int, default=IN_FLIGHT, help="how many, 8 or a multiple"
+    )
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
     args = parser.parse_args()
     report = {place: compared(place, args.tasks) for place in ("loop", "workers")}
     rules = {f"first {k or SIZE}": rl.run(first_of(k, min(args.tasks, 32))) for k in (None, 6)}
     freed = asyncio.run(until_free_everywhere(ray=args.ray))
+    memory = rl.run(memory_of_attempts())  # Before others have used and freed as much.
     flights = {
-        "as it is": rl.run(many(args.seconds, freezes=False)),
-        "frozen": rl.run(many(args.seconds, freezes=True)),
+        "as it is": rl.run(many(args.in_flight, args.seconds, freezes=False)),
+        "frozen": rl.run(many(args.in_flight, args.seconds, freezes=True)),
     }
     more = {
         **rules,
         "freed": freed,
         "in_flight": flights,
-        "alone_us_per_step": rl.run(alone(200)),
-        "kib_per_attempt": rl.run(memory_of_attempts()),
+        "alone_us_per_step": rl.run(alone(args.in_flight, 200)),
+        "kib_per_attempt": memory,
     }
     if args.json:
         print(json.dumps({**report, **more}))
@@ -490,7 +494,8 @@ def main() -> None:
     for place, found in freed.items():
         print(f"  {place}: {found['free_s']:.2f} s, {found['begun_s']:.2f} s")
     for how, found in flights.items():
-        line = f"{IN_FLIGHT} in flight, {how}: event-loop lag {found['lag_p99_ms']:.1f} ms (p99), "
+        line = f"{args.in_flight} in flight, {how}: "
+        line += f"event-loop lag {found['lag_p99_ms']:.1f} ms (p99), "
         line += f"{found['lag_max_ms']:.1f} at most, {found['us_per_step']:.0f} µs for a step, "
         line += f"longest garbage collection {found['longest_collection_ms']:.1f} ms"
         print(f"\n{line}")
