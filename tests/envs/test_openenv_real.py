@@ -46,12 +46,14 @@ pytestmark = [
 
 @contextmanager
 def served(kind: str, sessions: int) -> Generator[tuple[str, subprocess.Popen[bytes]]]:
-    """The address of an OpenEnv server, and its process."""
+    """The address of an OpenEnv server that listens, and its process."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     process = subprocess.Popen([*OPENENV, "serve", kind, str(port), str(sessions)], env=AS_USUAL)
     try:
-        yield f"http://127.0.0.1:{port}", process
+        url = f"http://127.0.0.1:{port}"
+        wait_for(url)
+        yield url, process
     finally:
         process.kill()  # Its steps may never end.
         process.wait()
@@ -124,8 +126,6 @@ def rows_of(batch: Any) -> list[list[Any]]:
 def test_attempts_over_servers_of_openenv(session: str) -> None:
     """Some are cut off in a step that never ends; later one of the two servers is killed."""
     with served("dice", 64) as (first, process), served("dice", 64) as (second, _):
-        for url in (first, second):
-            wait_for(url)
         kwargs = {"session": session, "truncated_field": "late", "urls": [second]}
         fields = {"backend": "openenv", "env_kwargs": kwargs, "placement": "loop"}
         entry = {"name": "dice", "task": first, "num_workers": 8, **fields}
@@ -181,7 +181,7 @@ async def attempts_over(
 
 
 def wait_for(url: str) -> None:
-    """Wait until a server listens."""
+    """Wait until a server listens, which takes as long as its imports."""
     while True:
         try:
             get_json(url, "/health")
