@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -18,14 +17,15 @@ class LearnerOfCollector(PPO):
     """Its update is PPO's own; transitions and advantages come from a `Collector`.
 
     Args:
-        group: of envs with the spaces of CartPole, initialised.
+        group: of envs, initialised.
+        make: makes an env with their spaces.
         num_transitions: of each rollout, in a block.
         fields: of `PPO`.
     """
 
-    def __init__(self, group: Any, num_transitions: int, **fields: Any) -> None:
+    def __init__(self, group: Any, make: Any, num_transitions: int, **fields: Any) -> None:
         # It has the spaces and the number of envs; only its first observations are read.
-        same = DummyVecEnv([lambda: gym.make("CartPole-v1")] * len(group))
+        same = DummyVecEnv([make] * len(group))
         super().__init__("MlpPolicy", same, **fields)
         self._collector = Collector(
             group, self._answer, num_transitions=num_transitions, wait_all=True, seed=self.seed
