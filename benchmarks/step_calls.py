@@ -1,9 +1,9 @@
 """How many Python calls does the trainer make for one step? Exact on any machine.
 
 `sys.setprofile` counts each entry into a Python function, including resumed generators, but no
-calls into C. Workers sleep and are stopped before each step, and continue when the trainer waits,
-so every step wakes them and waits once, on any machine. Spinning is switched off. Work that is done
-only once is done before the counted steps.
+calls into C. Workers sleep and are stopped before each step, and continue when the trainer waits.
+So every step wakes them, and waits once in at least one round, on any machine. Spinning is switched
+off. Work that is done only once is done before the counted steps.
 """
 
 from __future__ import annotations
@@ -100,18 +100,13 @@ class Calls:
         return "\n".join(f"  {count:4} {name}:{line} {what}" for name, line, what, count in lines)
 
 
-def median_of(found: list[Calls]) -> Calls:
-    """Return the calls of the round with the median number, of the second half of all."""
-    found = sorted(found[len(found) // 2 :], key=lambda calls: calls.of.total())
-    return found[len(found) // 2]
-
-
 def fewest_of(found: list[Calls]) -> Calls:
-    """Return the calls of the round with the fewest.
+    """Return the calls of the round with the fewest, of the second half of all.
 
-    A worker that is not held may be late, and is then waited for once more.
+    Workers that continue may be late, on a machine with other work, and are then waited for once
+    more; one that isn't held may be as well.
     """
-    return min(found, key=lambda calls: calls.of.total())
+    return min(found[len(found) // 2 :], key=lambda calls: calls.of.total())
 
 
 class Held:
@@ -168,9 +163,7 @@ class Death(Held):
         return super().poll(timeout)
 
 
-def counted(
-    group: Any, call: Callable[[], Any], choose: Callable[[list[Calls]], Calls] = median_of
-) -> Calls:
+def counted(group: Any, call: Callable[[], Any]) -> Calls:
     """Return the calls of one `call`, which sends steps and waits for their results."""
     found: list[Calls] = []
     with Held(group) as held:
@@ -183,7 +176,7 @@ def counted(
             finally:
                 calls.stop()
             found.append(calls)
-    return choose(found)
+    return fewest_of(found)
 
 
 def step_and_collect() -> Calls:
@@ -232,7 +225,7 @@ def step_and_collect_async() -> Calls:
                     batch, _ = await group.collect_async(wait_all=True)
                     calls.stop()
                     found.append(calls)
-                return median_of(found)
+                return fewest_of(found)
 
     # In a separate task, because `uvloop.run` wraps the main one.
     async def apart() -> Calls:
@@ -262,7 +255,7 @@ def collect_16() -> Calls:
         collector = Collector(group, policy, num_transitions=16, min_results=NUM_ENVS, seed=0)
         collector.collect()
         # It steps twice; workers are held only before the first.
-        return counted(group, collector.collect, fewest_of)
+        return counted(group, collector.collect)
 
 
 def death() -> Calls:
