@@ -149,7 +149,7 @@ async def train(args: Args | CartPole) -> Run:
                     figures = learner.learn(learner.columns(rollout), rate)
                     player.take(learner.agent)
                 collector.policy_version += 1
-                figures |= waiting(rollout) | {"lag": rollout.lag.mean}
+                figures |= waiting(rollout) | {"lag": rollout.lag.mean()}
                 returns = [episode.total_reward for episode in rollout.episodes]
                 run.record(len(rollout), returns, **figures)
                 if len(run.rows) % args.save_every == 0:

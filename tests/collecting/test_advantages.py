@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.collecting import Lag, Rollout, Seconds
+from rlightning_aio.collecting import Rollout, Seconds
 from rlightning_aio.collecting.rollout import Ends
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-NO_LAG, NO_TIME = Lag(0, 0.0, 0), Seconds(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_TIME = Seconds(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def rollout_of(
@@ -34,7 +34,7 @@ def rollout_of(
     others = np.union1d(np.flatnonzero(columns["done"]), np.array(cuts, int))
     places = np.concatenate([lasts, np.setdiff1d(others, lasts)]).astype(np.intp)
     empty = np.zeros((len(places), 1))
-    return Rollout(columns, reward.shape, Ends(places, empty), len(lasts), [], NO_LAG, NO_TIME)
+    return Rollout(columns, reward.shape, Ends(places, empty), len(lasts), [], NO_TIME)
 
 
 def cleanrl(
@@ -67,11 +67,11 @@ def test_an_example_by_hand() -> None:
 def test_v_trace_by_hand() -> None:
     """Ratios are clipped at 1; values after an end don't affect those before it."""
     rollout = rollout_of([1, 2], [0, 0], [0, 0], lengths=[2])
-    found = rollout.vtrace(np.array([4.0, 8.0]), [6.0], np.log([0.5, 4.0]), 0.5)
+    targets, advantages = rollout.vtrace(np.array([4.0, 8.0]), [6.0], np.log([0.5, 4.0]), 0.5)
     # Errors: .5 * (1 + 4 - 4) = .5 and 1 * (2 + 3 - 8) = -3; targets 8 - 3 and 4 + .5 + .25 * -3.
-    assert found.targets.tolist() == [3.75, 5.0]
+    assert targets.tolist() == [3.75, 5.0]
     # The errors are .5 and -3, the targets of the last 5 and of the first 4 + .5 - .75.
-    assert found.advantages.tolist() == [-0.25, -3.0]
+    assert advantages.tolist() == [-0.25, -3.0]
 
 
 @st.composite
@@ -122,7 +122,9 @@ def test_v_trace_equals_the_papers_sum(case: tuple[list[int], Any]) -> None:
     rollout = rollout_of(rng.normal(size=count), terminated, truncated, (), lengths)
     values, next_values = rng.normal(size=count), rng.normal(size=len(rollout.ends))
     log_ratios = rng.normal(size=count)
-    found = rollout.vtrace(values, next_values, log_ratios, 0.97, 0.9, clip_rho=1.3, clip_c=1.1)
+    found_targets, found_advantages = rollout.vtrace(
+        values, next_values, log_ratios, 0.97, 0.9, clip_rho=1.3, clip_c=1.1
+    )
     rho = np.minimum(np.exp(log_ratios), 1.3)
     c = 0.9 * np.minimum(np.exp(log_ratios), 1.1)
 
@@ -136,10 +138,10 @@ def test_v_trace_equals_the_papers_sum(case: tuple[list[int], Any]) -> None:
             + sum(0.97 ** (t - s) * np.prod(c[rows][s:t]) * delta[t] for t in range(s, length))
             for s in range(length)
         ]
-        np.testing.assert_allclose(found.targets[rows], targets, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found_targets[rows], targets, rtol=1e-9, atol=1e-12)
         after = np.append(targets[1:], last)
         advantages = rho[rows] * (rollout.reward[rows] + 0.97 * after - values[rows])
-        np.testing.assert_allclose(found.advantages[rows], advantages, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found_advantages[rows], advantages, rtol=1e-9, atol=1e-12)
 
     segment_by_segment(rollout, check)
 
@@ -169,14 +171,14 @@ def test_each_agent_has_its_own_advantages() -> None:
         name: {"a": block[name], "b": 2 * block[name] if name == "reward" else ~block[name]}
         for name in ("reward", "terminated", "truncated", "done")
     }
-    both = Rollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, [], NO_LAG, NO_TIME)
+    both = Rollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, [], NO_TIME)
     values = {"a": np.zeros(2), "b": np.zeros(2)}
     found = both.advantages(values, {"a": [9.0], "b": [9.0]}, 0.5, 1.0)
     assert found["a"].tolist() == [1 + 0.5 * 2, 2.0]
     assert found["b"].tolist() == [2.0, 4 + 0.5 * 9]
     ratios = {"a": np.zeros(2), "b": np.zeros(2)}
     traced = both.vtrace(values, {"a": [9.0], "b": [9.0]}, ratios, 0.5)
-    assert {agent: own.targets.tolist() for agent, own in traced.items()} == {
+    assert {agent: own[0].tolist() for agent, own in traced.items()} == {
         "a": [2.0, 2.0],
         "b": [2.0, 8.5],
     }
@@ -229,7 +231,7 @@ def test_values_after_a_termination_are_ignored(
     chains = places.T if block else places.reshape(envs, steps)
     after = dict(zip(rollout.ends.tolist(), next_values.tolist(), strict=True))
     gains = rollout.advantages(values, next_values, 0.97, 0.9)
-    trace = rollout.vtrace(values, next_values, log_ratios, 0.97, 0.9)
+    all_targets, all_advantages = rollout.vtrace(values, next_values, log_ratios, 0.97, 0.9)
     for chain in chains:
         reward = rollout.reward.astype(float)
         own = [column.reshape(-1)[chain] for column in (reward, terminated, values)]
@@ -240,8 +242,8 @@ def test_values_after_a_termination_are_ignored(
         np.testing.assert_allclose(gains.reshape(-1)[chain], targets - own[2], atol=1e-9)
         rhos = np.minimum(np.exp(log_ratios.reshape(-1)[chain]), 1)
         targets, advantages = naive(own[0], own[1], last, own[2], ends, rhos)
-        np.testing.assert_allclose(trace.targets.reshape(-1)[chain], targets, atol=1e-9)
-        np.testing.assert_allclose(trace.advantages.reshape(-1)[chain], advantages, atol=1e-9)
+        np.testing.assert_allclose(all_targets.reshape(-1)[chain], targets, atol=1e-9)
+        np.testing.assert_allclose(all_advantages.reshape(-1)[chain], advantages, atol=1e-9)
 
 
 @pytest.mark.parametrize("number", NOT_FINITE)
@@ -250,14 +252,14 @@ def test_values_after_an_agents_end_are_ignored(number: float) -> None:
     block = rollout_of([1, 2, 3], [0, 1, 0], [0, 0, 0], lengths=[3])
     ends = np.array([2], np.intp)
     columns = {name: {"a": block[name]} for name in ("reward", "terminated", "truncated", "done")}
-    rollout = Rollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, [], NO_LAG, NO_TIME)
+    rollout = Rollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, [], NO_TIME)
     values = {"a": np.array([0.0, 0.0, number])}
     gains = rollout.advantages(values, {"a": [9.0]}, 0.5, 1.0)
     assert gains["a"][:2].tolist() == [1 + 0.5 * 2, 2.0]
     with np.errstate(invalid="ignore"):  # Of the later rows themselves.
         traced: Any = rollout.vtrace(values, {"a": [9.0]}, {"a": np.zeros(3)}, 0.5)
-    assert traced["a"].targets[:2].tolist() == [2.0, 2.0]
-    assert traced["a"].advantages[:2].tolist() == [2.0, 2.0]
+    assert traced["a"][0][:2].tolist() == [2.0, 2.0]
+    assert traced["a"][1][:2].tolist() == [2.0, 2.0]
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (6,), (3, 2, 1)])

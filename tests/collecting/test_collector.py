@@ -634,7 +634,7 @@ def test_lag_is_counted_in_versions() -> None:
         collector.policy_version += 2
         rollout = collector.collect()
         assert sorted(rollout.policy_version.tolist()) == [0, 2, 2]
-        assert rollout.lag == (0, 2 / 3, 2)
+        assert sorted(rollout.lag.tolist()) == [0, 0, 2]
 
 
 def test_a_rollout_reports_its_times() -> None:

@@ -63,7 +63,7 @@ async def trained(group: Any, **order: Any) -> Any:
             rollout = await collector.collect()
             learner.learn(rollout)
             collector.policy_version += 1
-            seen.append((rollout.index.tolist(), rollout.observation.copy(), rollout.lag))
+            seen.append((rollout.index.tolist(), rollout.observation.copy(), rollout.lag.tolist()))
     return learner.weights, seen
 
 

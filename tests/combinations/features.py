@@ -100,7 +100,6 @@ def copied(rollout: Rollout) -> Rollout:
         ends,
         rollout.num_chains,
         rollout.episodes,
-        rollout.lag,
         rollout.seconds,
     )
 

@@ -7,15 +7,12 @@ Rule: it uses only the public `EnvGroup` and NumPy; torch shares the arrays.
 
 from __future__ import annotations
 
-from rlightning_aio.collecting.advantages import VTrace
 from rlightning_aio.collecting.collector import Collector
-from rlightning_aio.collecting.rollout import EndedEpisode, Lag, Rollout, Seconds
+from rlightning_aio.collecting.rollout import EndedEpisode, Rollout, Seconds
 
 __all__ = [
     "Collector",
     "EndedEpisode",
-    "Lag",
     "Rollout",
     "Seconds",
-    "VTrace",
 ]

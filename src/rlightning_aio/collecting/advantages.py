@@ -8,26 +8,14 @@ formulas.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Segments", "VTrace", "gae", "vtrace"]
-
-
-class VTrace(NamedTuple):
-    """V-trace's result for each transition.
-
-    Attributes:
-        targets: of the value function (``vs`` of the paper).
-        advantages: of the policy gradient, already weighted by the clipped ratio.
-    """
-
-    targets: NDArray[Any]
-    advantages: NDArray[Any]
+__all__ = ["Segments", "gae", "vtrace"]
 
 
 class Segments:
@@ -127,7 +115,7 @@ def vtrace(
     clip_rho: float,
     clip_c: float,
     stops: NDArray[np.bool_] | None = None,
-) -> VTrace:
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """V-trace (Espeholt et al., 2018, arXiv:1802.01561, eq. 1 and section 4.2).
 
     Takes the arguments of `gae`, and ``[n]`` `log_ratios`: log-probability of the action under the
@@ -147,4 +135,4 @@ def vtrace(
     # A stop's successor is not part of its chain, so its value is used instead of its target.
     after = following if stops is None else np.where(stops, after, following)
     advantages = rhos * (rewards + gamma * _until(terminated, after) - values)
-    return VTrace(targets, advantages.astype(dtype, copy=False))
+    return targets, advantages.astype(dtype, copy=False)

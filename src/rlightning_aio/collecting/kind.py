@@ -10,7 +10,7 @@ import numpy as np
 from rlightning_aio.batch import BatchedData, joined
 from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.collecting.results import ResultRows, result_rows
-from rlightning_aio.collecting.rollout import Ends, Lag, Rollout, Seconds
+from rlightning_aio.collecting.rollout import Ends, Rollout, Seconds
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
@@ -209,11 +209,11 @@ class EnvKind:
             end_observation = gather(staging.end_observation, full.end_rows)
         else:
             end_observation = mapped(lambda leaf: leaf[:0], columns["observation"])
-        lag = _lag(version - columns["policy_version"])
+        columns["lag"] = version - columns["policy_version"]
         episodes = staging.episodes
         staging.carry_over()
         found = Ends(ends, end_observation)
-        return Rollout(columns, shape, found, full.num_chains, episodes, lag, seconds)
+        return Rollout(columns, shape, found, full.num_chains, episodes, seconds)
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)
@@ -236,7 +236,7 @@ class EnvKind:
 
 OWN_NAMES: Final = frozenset(
     {"done", "end_observation", "ends", "episodes", "first", "index", "lag", "num_chains"}
-    | {"observation", "policy_version", "reward", "seconds", "segments", "shape", "terminated"}
+    | {"observation", "policy_version", "reward", "seconds", "shape", "terminated"}
     | {"truncated", "advantages", "at_ends", "keys", "next_observation", "vtrace"}
 )
 """Names that neither a policy nor an info may give to a column of a rollout."""
@@ -244,9 +244,3 @@ OWN_NAMES: Final = frozenset(
 
 def _answered(answers: list[BatchedData]) -> list[str]:
     return answers[0].env_ids() if len(answers) == 1 else []
-
-
-def _lag(ages: NDArray[np.int64]) -> Lag:
-    if not ages.size:
-        return Lag(0, 0.0, 0)
-    return Lag(int(ages.min()), float(ages.mean()), int(ages.max()))

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.collecting.advantages import Segments, VTrace, gae, vtrace
+from rlightning_aio.collecting.advantages import Segments, gae, vtrace
 from rlightning_aio.collecting.trees import with_lists
 from rlightning_aio.protocol.columns import Tree, gather, mapped, paired
 
@@ -16,15 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["EndedEpisode", "Ends", "Lag", "Rollout", "Seconds"]
+__all__ = ["EndedEpisode", "Ends", "Rollout", "Seconds"]
 
-
-class Lag(NamedTuple):
-    """Age of the policies that made the transitions, in versions behind the newest."""
-
-    min: int
-    mean: float
-    max: int
+_Pair: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
 
 
 class EndedEpisode(NamedTuple):
@@ -96,6 +90,7 @@ class Rollout:
         reward: float32; terminated: the env ended the episode; truncated: the env or the step
             limit of `auto_reset` cut it; done: either.
         policy_version: int64, `Collector.policy_version` when the action was chosen.
+        lag: int64, how many versions that is behind the newest.
         index: int64, index of the env in the group: see `BatchedData.index`.
         first: True if an episode begins with the transition, or continues after a loss.
         ends: ``[k]``, positions of the ends (for ``[T, N]``, in the flattened block). The last
@@ -103,7 +98,7 @@ class Rollout:
         episodes: those that ended in this rollout, in the order of arrival: terminated, truncated,
             or cut by the step limit, but not lost with a worker. They may have begun earlier.
         num_chains: number of envs with transitions in this rollout.
-        lag: age of the policies of the transitions; seconds: times of the rollout.
+        seconds: times of the rollout.
     """
 
     observation: Tree
@@ -113,6 +108,7 @@ class Rollout:
     truncated: Any
     done: Any
     policy_version: NDArray[np.int64]
+    lag: NDArray[np.int64]
     index: NDArray[np.int64]
     first: NDArray[np.bool_]
 
@@ -123,7 +119,6 @@ class Rollout:
         ends: Ends,
         num_chains: int,
         episodes: list[EndedEpisode],
-        lag: Lag,
         seconds: Seconds,
     ) -> None:
         self._columns = columns
@@ -131,7 +126,6 @@ class Rollout:
         self.ends, self._end_observation = ends
         self.num_chains = num_chains
         self.episodes = episodes
-        self.lag = lag
         self.seconds = seconds
         self._segments: Segments | None = None
 
@@ -180,9 +174,7 @@ class Rollout:
 
     # -- chains -------------------------------------------------------------------
 
-    @property
-    def segments(self) -> Segments:
-        """The segments of consecutive transitions."""
+    def _chains(self) -> Segments:
         if self._segments is None:
             stride = self.shape[1] if len(self.shape) > 1 else 1
             self._segments = Segments(self.ends, len(self), stride)
@@ -194,7 +186,7 @@ class Rollout:
 
         def after(leaf: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
             flat = self._flat(leaf)
-            return self.segments.successors(flat, ends).reshape(leaf.shape)
+            return self._chains().successors(flat, ends).reshape(leaf.shape)
 
         return with_lists(paired(after, self._columns["observation"], self._end_observation))
 
@@ -242,7 +234,7 @@ class Rollout:
         now, after = self._checked(values, next_values)
         reward, terminated = self._of(agent, "reward"), self._of(agent, "terminated")
         stops = None if agent is None else self._of(agent, "done")
-        found = gae(self.segments, reward, terminated, now, after, gamma, lam, stops)
+        found = gae(self._chains(), reward, terminated, now, after, gamma, lam, stops)
         return found.reshape(self.shape)
 
     def vtrace(
@@ -255,7 +247,7 @@ class Rollout:
         *,
         clip_rho: float = 1.0,
         clip_c: float = 1.0,
-    ) -> VTrace | dict[str, VTrace]:
+    ) -> _Pair | dict[str, _Pair]:
         """Compute V-trace over chains, for transitions of an older policy.
 
         Args:
@@ -270,8 +262,9 @@ class Rollout:
             clip_c: upper limit of the ratios that carry corrections back.
 
         Returns:
-            New arrays in the shape of the rollout, or a dict of such by agent: targets of the
-            value function and advantages of the policy gradient.
+            Two new arrays in the shape of the rollout, or a dict of such by agent: targets of the
+            value function (``vs`` of the paper), and advantages of the policy gradient, already
+            weighted by the clipped ratio.
 
         Raises:
             ValueError: an argument has another shape.
@@ -295,12 +288,12 @@ class Rollout:
         lam: float,
         clip_rho: float,
         clip_c: float,
-    ) -> VTrace:
+    ) -> _Pair:
         now, after = self._checked(values, next_values)
         ratios = self._rows("log_ratios", log_ratios)
         reward, terminated = self._of(agent, "reward"), self._of(agent, "terminated")
-        found = vtrace(
-            self.segments,
+        targets, advantages = vtrace(
+            self._chains(),
             reward,
             terminated,
             now,
@@ -312,7 +305,7 @@ class Rollout:
             clip_c,
             None if agent is None else self._of(agent, "done"),
         )
-        return VTrace(found.targets.reshape(self.shape), found.advantages.reshape(self.shape))
+        return targets.reshape(self.shape), advantages.reshape(self.shape)
 
     def _of(self, agent: str | None, name: str) -> NDArray[Any]:
         column = self[name]
