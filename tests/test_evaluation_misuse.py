@@ -15,7 +15,7 @@ from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 import rlightning_aio as rl
 from rlightning_aio import Outcome
 from rlightning_aio.attempts import Attempt
-from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo, ResultsFile
+from rlightning_aio.evaluation import EpisodeSpec, ResultsFile
 
 
 @pytest.mark.parametrize(
@@ -142,8 +142,7 @@ def test_a_process_that_ends_while_a_film_begins_is_replaced(tmp_path: Path) -> 
     """The film is of another env of the process than the one that ended it."""
     queue = [EpisodeSpec("1", seed) for seed in (2, 9, 1, 0, 3)]
     fields = {"task": Dies, "env_kwargs": {"folder": str(tmp_path)}, "envs_per_process": 2}
-    video = EpisodeVideo(tmp_path / "films")
-    found = evaluated(group_of(2, placement="process", **fields), queue, video=video)
+    found = evaluated(group_of(2, placement="process", **fields), queue, video=tmp_path / "films")
     assert rows(found) == [("1", seed, seed + 1.0, seed + 1) for seed in (0, 1, 2, 3, 9)]
     assert not found.failed
 

@@ -21,7 +21,6 @@ from rlightning_aio.attempts.queue import Job, TaskInPlay
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.evaluation import (
     EpisodeSpec,
-    EpisodeVideo,
     Evaluation,
     ResultsFile,
     evaluate,
@@ -412,8 +411,8 @@ def test_a_subject_is_compared_as_it_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("failed_only", [False, True])
 def test_chosen_or_failed_episodes_are_filmed(tmp_path: Path, failed_only: bool) -> None:
     """Their films are named after them, and nothing else is left."""
-    video = EpisodeVideo(tmp_path, lambda spec: spec.task == "2", failed_only=failed_only)
-    assert rows(evaluated(group_of(), video=video)) == ROWS
+    films = {"video": tmp_path, "video_if": lambda spec: spec.task == "2"}
+    assert rows(evaluated(group_of(), **films, video_failed=failed_only)) == ROWS
     seeds = (1, 3) if failed_only else range(4)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == [f"env-2-seed-{seed}.mp4" for seed in seeds]
@@ -424,7 +423,7 @@ def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: P
     films, outside = tmp_path / "films", tmp_path / "mine-0.partial"
     outside.mkdir()
     (outside / "notes").touch()
-    evaluated(group_of(name="../mine"), QUEUE[:1], video=EpisodeVideo(films))
+    evaluated(group_of(name="../mine"), QUEUE[:1], video=films)
     assert (outside / "notes").exists()
     assert [path.suffix for path in films.iterdir()] == [".mp4"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["films", "mine-0.partial"]
@@ -434,7 +433,7 @@ def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: P
 def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) -> None:
     """The limit is the trainer's, so the film is still open when the episode ends."""
     with group_of() as group, group.auto_reset(limit):
-        found = evaluate(group, nothing, QUEUE[:4], video=EpisodeVideo(tmp_path))
+        found = evaluate(group, nothing, QUEUE[:4], video=tmp_path)
     lengths = sorted(record.length or 0 for record in found.attempts)
     assert lengths == [min(k, limit) for k in (1, 2, 3, 4)]
     names = sorted(path.name for path in tmp_path.iterdir())

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.spec import EpisodeSpec
-from rlightning_aio.evaluation.episode_video import EpisodeVideo
 from rlightning_aio.evaluation.estimates import Estimate
 from rlightning_aio.evaluation.evaluate import evaluate
 from rlightning_aio.evaluation.evaluation import Evaluation
 
 __all__ = [
     "EpisodeSpec",
-    "EpisodeVideo",
     "Estimate",
     "Evaluation",
     "ResultsFile",

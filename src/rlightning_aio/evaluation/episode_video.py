@@ -35,10 +35,7 @@ class EpisodeVideo:
     """The episodes to film.
 
     Attributes:
-        folder: for ``<entry>-<task>-seed-<seed>.mp4``; created if missing. Options of the episode
-            add a number to the name, and an episode for one env adds that and its own number.
-        wants: returns True for an episode to film; None films all.
-        failed_only: keep the films of episodes whose success is False, and delete the others.
+        folder, wants, failed_only: `video`, `video_if` and `video_failed` of `evaluate`.
     """
 
     folder: str | os.PathLike[str]

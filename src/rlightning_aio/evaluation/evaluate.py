@@ -11,11 +11,13 @@ from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy
+from rlightning_aio.evaluation.episode_video import EpisodeVideo
 from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.evaluation.playing import Options, PolicyPlay
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Coroutine, Iterable
 
     from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.queue import TaskInPlay
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.evaluation.episode_video import EpisodeVideo
 
 __all__ = ["evaluate"]
 
@@ -39,7 +40,9 @@ def evaluate(
     min_results: int | None = None,
     retries: int = 2,
     results: ResultsFile | None = None,
-    video: EpisodeVideo | None = None,
+    video: str | os.PathLike[str] | None = None,
+    video_if: Callable[[EpisodeSpec], bool] | None = None,
+    video_failed: bool = False,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Evaluation: ...
 
@@ -54,7 +57,9 @@ def evaluate(
     min_results: int | None = None,
     retries: int = 2,
     results: ResultsFile | None = None,
-    video: EpisodeVideo | None = None,
+    video: str | os.PathLike[str] | None = None,
+    video_if: Callable[[EpisodeSpec], bool] | None = None,
+    video_failed: bool = False,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Coroutine[Any, Any, Evaluation]: ...
 
@@ -68,7 +73,9 @@ def evaluate(
     min_results: int | None = None,
     retries: int = 2,
     results: ResultsFile | None = None,
-    video: EpisodeVideo | None = None,
+    video: str | os.PathLike[str] | None = None,
+    video_if: Callable[[EpisodeSpec], bool] | None = None,
+    video_failed: bool = False,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
@@ -91,7 +98,10 @@ def evaluate(
             it has failed, and the others are played.
         results: the file to save episodes in; those that it has are not played again. One file for
             each `seed`, since episodes without a seed are only known by their number.
-        video: the episodes to film.
+        video: folder for films, ``<entry>-<task>-seed-<seed>.mp4``, created if missing; options of
+            an episode add a number to the name, an episode for one env its env and number.
+        video_if: returns True for an episode to film; None films all.
+        video_failed: keep the films of episodes whose success is False, and delete the others.
         on_episode: called with each episode: first with those in the file, then as others end.
 
     Raises:
@@ -102,21 +112,17 @@ def evaluate(
         BadAction: the policy's actions don't fit; nothing was sent.
         WorkerDied, EnvHung: no env is left that could play an episode.
         ConfigError: `results` can't be written.
-        OSError: nothing can be written into the folder of `video`.
+        OSError: nothing can be written into the folder `video`.
     """
-    rules = Rules(retries=retries)
     is_number = isinstance(episodes, SupportsIndex)
     _check_numbers({"min_results": min_results} | ({"episodes": episodes} if is_number else {}))
-    _check(group)
-    if video is not None or not is_number:
-        _check_single(group)
-    queue = AttemptQueue(group, rules, results)
+    _check(group, one_each=video is not None or not is_number)
+    films = None if video is None else EpisodeVideo(video, video_if, video_failed)
+    queue = AttemptQueue(group, Rules(retries=retries), results)
     tasks = _filled(group, queue, episodes, seed)
     policy, min_results = policy or _random(group, seed), min_results or default_min_results(group)
-    play = PolicyPlay(group, policy, queue, Evaluation(), Options(min_results, video, on_episode))
-    for task in tasks:
-        for attempt in task.attempts.values():
-            play.note(attempt)
+    play = PolicyPlay(group, policy, queue, Evaluation(), Options(min_results, films, on_episode))
+    play.note_known(tasks)
     return run(_resetting(play, group), group)
 
 
@@ -164,7 +170,7 @@ def _check_numbers(numbers: dict[str, Any]) -> None:
             raise ValueError(f"{name} must be at least 1, not {number!r}")
 
 
-def _check(group: Any) -> None:
+def _check(group: Any, *, one_each: bool) -> None:
     for meta in group.metas:
         if meta.action_space is None:
             raise ValueError(
@@ -177,11 +183,8 @@ def _check(group: Any) -> None:
             "the group. A Collector leaves requests in flight after each rollout: to evaluate "
             "between rollouts, build a second group of the same entries"
         )
-
-
-def _check_single(group: Any) -> None:
     for meta in group.metas:
-        if meta.num_envs > 1:
+        if one_each and meta.num_envs > 1:
             raise ValueError(
                 f"{meta.env_id} has {meta.num_envs} sub-environments, but an env plays or films "
                 "one episode of a queue at a time: num_envs: 1, and num_workers for the number of "

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.attempts.queue import AttemptQueue, Job
+    from rlightning_aio.attempts.queue import AttemptQueue, Job, TaskInPlay
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting.procedure import Procedure
     from rlightning_aio.evaluation.evaluation import Evaluation
@@ -157,10 +157,15 @@ class PolicyPlay:
                 attempt.spec,
                 attempt.outcome.cause,
             )
-        self.note(attempt)
+        self._note(attempt)
 
-    def note(self, attempt: Attempt) -> None:
-        """Add an episode that has ended, now or in the file."""
+    def note_known(self, tasks: list[TaskInPlay]) -> None:
+        """Note the episodes that were in the file."""
+        for task in tasks:
+            for attempt in task.attempts.values():
+                self._note(attempt)
+
+    def _note(self, attempt: Attempt) -> None:
         self._found.attempts.append(attempt)
         if self._options.on_episode is not None:
             self._options.on_episode(attempt)

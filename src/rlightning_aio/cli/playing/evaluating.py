@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts import Attempt
     from rlightning_aio.cli.policies.policies import Policy
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
+    from rlightning_aio.evaluation import EpisodeSpec
 
 __all__ = ["evaluation"]
 
@@ -135,7 +135,7 @@ class _Order:
 
     configs: Sequence[EnvConfig]
     episodes: int | Sequence[EpisodeSpec]
-    video: EpisodeVideo | None
+    films: dict[str, Any]
     whose: _Whose
     by: _By
     title: str
@@ -217,19 +217,19 @@ def evaluation(
 
 def _in_queue(configs: Sequence[EnvConfig], queue: QueueOptions, whose: _Whose) -> _Order:
     specs = queue.specs(configs)
-    video = queue.films(specs)
-    if video is not None:
-        with naming_option("--video", Path(video.folder)):
-            check_folder(video.folder)
+    films = queue.films(specs)
+    if films:
+        with naming_option("--video", films["video"]):
+            check_folder(films["video"])
         configs = [rendering(config) for config in configs]
     title = f"{whose.facts['policy']}: {counted(len(specs), 'episode')}"
-    return _Order(configs, specs, video, whose, "task", title)
+    return _Order(configs, specs, films, whose, "task", title)
 
 
 def _of_each(configs: Sequence[EnvConfig], episodes: int, whose: _Whose) -> _Order:
     whose.facts["episodes_each"] = episodes
     title = f"{whose.facts['policy']}: {counted(episodes, 'episode')} of each env"
-    return _Order(configs, episodes, None, whose, "entry", title)
+    return _Order(configs, episodes, {}, whose, "entry", title)
 
 
 def _refuse(given: dict[str, Any]) -> None:
@@ -298,8 +298,8 @@ async def _evaluate(
                 seed=base,
                 retries=order.whose.retries,
                 results=results,
-                video=order.video,
                 on_episode=watch.note,
+                **order.films,
             )
         except ValueError as error:
             raise ConfigError(str(error)) from None

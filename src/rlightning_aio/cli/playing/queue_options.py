@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
+from rlightning_aio.evaluation import EpisodeSpec
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,8 +118,8 @@ class QueueOptions:
             raise ConfigError("--episodes-file names the episodes; leave --tasks and --seeds out")
         return _with_tasks(_in_file(self.episodes_file), configs)
 
-    def films(self, specs: Sequence[EpisodeSpec]) -> EpisodeVideo | None:
-        """Return the episodes to film.
+    def films(self, specs: Sequence[EpisodeSpec]) -> dict[str, Any]:
+        """Return what `evaluate` is to know of films.
 
         Raises:
             ConfigError: an option lacks --video, or names no episode.
@@ -131,15 +131,15 @@ class QueueOptions:
                     "--video-episode, --video-failed and --video-every choose what to film; add "
                     "--video FOLDER for the files"
                 )
-            return None
+            return {}
         for name in chosen - {_name(spec) for spec in specs}:
             raise ConfigError(f"--video-episode {name}: is not in the queue; give TASK:SEED")
         every = {_place(spec) for spec in specs[:: self.video_every or 1]}
-        return EpisodeVideo(
-            self.video,
-            lambda spec: (_place(spec) in every) and (not chosen or _name(spec) in chosen),
-            failed_only=self.video_failed,
-        )
+
+        def wanted(spec: EpisodeSpec) -> bool:
+            return _place(spec) in every and (not chosen or _name(spec) in chosen)
+
+        return {"video": self.video, "video_if": wanted, "video_failed": self.video_failed}
 
 
 def _name(spec: EpisodeSpec) -> str:
