@@ -46,6 +46,7 @@ from waiting import IDLE, MEAN, Waits
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
+from rlightning_aio.attempts.rules import seed_of
 from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
@@ -199,7 +200,7 @@ async def gathered(
         nonlocal ended
         while jobs:
             spec, index = jobs.pop()
-            seed = Rules(seeds="distinct").seed(spec, index)
+            seed = seed_of(Rules(seeds="distinct"), spec, index)
             async with group.episode(env_id, seed, dict(spec.options or {})) as episode:
                 await agent.play(episode, faults.get((spec.seed, index), ""))
             ended += 1
@@ -232,7 +233,7 @@ def compared(place: str, number: int) -> dict[str, Any]:
             for spec in tasks:
                 for index in range(SIZE):
                     if faults.get((spec.seed, index)) == "fails to reset":
-                        seed = Rules(seeds="distinct").seed(spec, index)
+                        seed = seed_of(Rules(seeds="distinct"), spec, index)
                         Path(folder, str(seed)).touch()
             found[name] = rl.run(program(place, tasks, faults))
     kinds = Counter("{} ({})".format(*FAULTS[fault]) for fault in faults.values())

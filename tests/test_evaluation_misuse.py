@@ -15,6 +15,7 @@ from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 import rlightning_aio as rl
 from rlightning_aio import Outcome
 from rlightning_aio.attempts import Attempt
+from rlightning_aio.attempts.file import log_of
 from rlightning_aio.evaluation import EpisodeSpec, ResultsFile
 
 
@@ -94,7 +95,7 @@ def test_failures_in_the_file_count(tmp_path: Path) -> None:
     """An evaluation that was killed goes on with the tries that are left."""
     died = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
     with ResultsFile(tmp_path / "results.jsonl") as results:
-        results.add_failure(EpisodeSpec("1", 0, entry="env"), 0, 0, died)
+        log_of(results).add_failure(EpisodeSpec("1", 0, entry="env"), 0, 0, died)
     for _ in range(2):
         with ResultsFile(tmp_path / "results.jsonl") as results:
             group = group_of(1, env_kwargs={"breaks": {"1": "raise"}})
@@ -110,13 +111,13 @@ def test_failures_of_a_task_that_is_there_twice_are_counted_apart(tmp_path: Path
     first = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
     second = Outcome("env_raised", "either", "raised ValueError", "env-1")
     with ResultsFile(path) as results:
-        results.add_failure(spec, 0, 0, first)
-        results.add_failure(spec, 0, 0, second)
+        log_of(results).add_failure(spec, 0, 0, first)
+        log_of(results).add_failure(spec, 0, 0, second)
         ended = Outcome("terminated", "policy", "its episode ended", "env-0", attempt=1)
-        results.add(Attempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
-        assert results.failures(spec, 0) == [second]
+        log_of(results).add(Attempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
+        assert log_of(results).failures(spec, 0) == [second]
     with ResultsFile(path) as results:
-        assert results.failures(spec, 0) == [second]
+        assert log_of(results).failures(spec, 0) == [second]
 
 
 class Dies(Tasks):

@@ -17,6 +17,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.attempts.file import log_of
 from rlightning_aio.attempts.queue import Job, TaskInPlay
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.evaluation import (
@@ -372,7 +373,7 @@ def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
         with pytest.raises(Enough):
             evaluated(group_of(**breaks), results=results, on_episode=stops, retries=9)
         assert results.played
-        failed = sum(len(results.failures(replace(one, entry="env"), 0)) for one in QUEUE)
+        failed = sum(len(log_of(results).failures(replace(one, entry="env"), 0)) for one in QUEUE)
         found = evaluated(group_of(), results=results, retries=9)
         assert len(found.attempts) == len({one.spec.key for one in found.attempts}) == 12
         assert found.failures.total() == failed > 0

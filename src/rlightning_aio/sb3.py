@@ -437,11 +437,13 @@ class _OfVector(VecEnv):
         if self._separate is not None:
             each = [self._separate[k].get_wrapper_attr(name) for k in places]
             return [one(*args, **kwargs) if callable(one) else one for one in each]
-        if not hasattr(self._inner, "call_one"):
+        if not hasattr(self._inner, "envs"):
             raise ValueError(
                 f"{type(self._inner).__name__} can't call {name}() of only some of its envs"
             )
-        return [self._inner.call_one(k, name, *args, **kwargs) for k in places]
+        envs: Any = self._inner.envs
+        found = [getattr(envs[k], name) for k in places]
+        return [one(*args, **kwargs) if callable(one) else one for one in found]
 
 
 def _with_cuts(each: list[dict[str, Any]], cuts: NDArray[np.bool_]) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rlightning_aio._core.group.api.aio import EnvGroup
-    from rlightning_aio.attempts import AttemptEpisode
+    from rlightning_aio.attempts.episode import AttemptInPlay
 
 __all__ = ["EnvGroups"]
 
@@ -85,7 +85,7 @@ class _Env:
     def __init__(self, lending: Lending, coding: Any, seed: Any, options: Any) -> None:
         self._lending, self._seed, self._options = lending, seed, options
         self._encode, self._decode = coding
-        self._episode: AttemptEpisode | None = None
+        self._episode: AttemptInPlay | None = None
 
     async def initial_observation(self) -> tuple[Any, Any]:
         found = await self._lending.begin(self._seed, self._options)

@@ -10,7 +10,7 @@ import functools
 import inspect
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio.attempts import AttemptEpisode
+from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.lending import LendingThread
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.called import called_env
@@ -106,7 +106,7 @@ class _Environment:
         if self._episode is not None:
             self._lending.end(self._episode)
         found = self._lending.begin(row)
-        is_there = isinstance(found, AttemptEpisode)
+        is_there = isinstance(found, AttemptInPlay)
         self._episode, self._failure = (found, None) if is_there else (None, found)
         return found.first if is_there else None
 

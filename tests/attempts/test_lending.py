@@ -7,7 +7,7 @@ import asyncio
 import pytest
 from attempts.rooms import PLACES, rooms
 
-from rlightning_aio.attempts.episode import AttemptEpisode
+from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.lending import Lending
 from rlightning_aio.outcomes import Outcome
 
@@ -30,6 +30,6 @@ async def test_the_death_of_another_env_uses_up_no_retry() -> None:
         )
         assert isinstance(died, Outcome)
         assert died.kind in ("env_died", "not_started")
-        assert isinstance(other, AttemptEpisode)
+        assert isinstance(other, AttemptInPlay)
         assert other.first["seed"] == 3
         await lending.end_all()

@@ -9,8 +9,8 @@ from pathlib import Path
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "interface.py"
 MOST = {
     "names": 82,
-    "members": 379,
-    "arguments": 448,
+    "members": 363,
+    "arguments": 419,
     "fields": 25,
     "commands": 9,
     "options": 31,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
-__all__ = ["AttemptEpisode"]
+__all__ = ["AttemptEpisode", "AttemptInPlay"]
 
 
 class AttemptEpisode:
@@ -58,18 +58,6 @@ class AttemptEpisode:
         """The newest result has ended the episode."""
         return self._episode.is_over
 
-    async def begin(self) -> None:
-        """Reset the env; the agent comes after that.
-
-        Raises:
-            EnvFault: that has failed.
-        """
-        await self._timed(self._episode.__aenter__())
-        lost: Any = self.last.info.get("outcome")
-        if isinstance(lost, Outcome):  # Its worker died in the reset, and was replaced.
-            self.fault = lost
-        self.first = copied(self.last.observation)  # Its env may change it, and its row will.
-
     async def step(self, action: Any, **columns: Any) -> EnvRet | MultiAgentEnvRet:
         """Step the env, and wait for the result.
 
@@ -101,16 +89,6 @@ class AttemptEpisode:
         self._check_open()
         return await self._timed(self._episode.call(name, *args, **kwargs))
 
-    async def leave(self) -> None:
-        """End what is in flight; the env is idle after that."""
-        await self._episode.__aexit__()
-
-    def end(self, why: str) -> None:
-        """Refuse further steps."""
-        self._over = why
-        for column in self.columns.values():
-            column.extend([None] * (len(self.rewards) - len(column)))
-
     def _check_open(self) -> None:
         if self._over:
             raise RLightningError(f"this attempt on env {self.env_id!r} {self._over}")
@@ -129,3 +107,29 @@ class AttemptEpisode:
             self.seconds += time.monotonic() - began
         self.fault = None
         return found
+
+
+class AttemptInPlay(AttemptEpisode):
+    """An attempt as what plays it sees it; its agent doesn't."""
+
+    async def begin(self) -> None:
+        """Reset the env; the agent comes after that.
+
+        Raises:
+            EnvFault: that has failed.
+        """
+        await self._timed(self._episode.__aenter__())
+        lost: Any = self.last.info.get("outcome")
+        if isinstance(lost, Outcome):  # Its worker died in the reset, and was replaced.
+            self.fault = lost
+        self.first = copied(self.last.observation)  # Its env may change it, and its row will.
+
+    async def leave(self) -> None:
+        """End what is in flight; the env is idle after that."""
+        await self._episode.__aexit__()
+
+    def end(self, why: str) -> None:
+        """Refuse further steps."""
+        self._over = why
+        for column in self.columns.values():
+            column.extend([None] * (len(self.rewards) - len(column)))

@@ -14,8 +14,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio.attempts.records import Attempt
-from rlightning_aio.attempts.spec import EpisodeSpec
+from rlightning_aio.attempts.records import attempt_of
+from rlightning_aio.attempts.spec import spec_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import check_writable
 from rlightning_aio.outcomes import Outcome
@@ -23,45 +23,27 @@ from rlightning_aio.outcomes import Outcome
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
 
-    from rlightning_aio.attempts.spec import EpisodeKey
+    from rlightning_aio.attempts.records import Attempt
+    from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
 
-__all__ = ["ResultsFile"]
+__all__ = ["AttemptLog", "ResultsFile", "log_of"]
 
 
-class ResultsFile:
-    """Attempts as JSON lines, for this process alone; `play` and `evaluate` continue from it.
-
-    A line holds an attempt after its last try, as of `Attempt.to_json`, or, with ``failed_try``,
-    the outcome of a try after which there may be another. Cancelled attempts are not written: with
-    ``Rules(first=…)`` a task is done when as many others are in the file.
-
-    ::
-
-        with ResultsFile("results.jsonl", {"policy": "act-1"}) as results:
-            evaluate(group, policy, episodes, results=results)
+class AttemptLog:
+    """What a `ResultsFile` does for `AttemptQueue`.
 
     Args:
-        path: the file, created if it is missing; a link is followed.
-        subject: what plays, as JSON values: the first line of the file. A file with another subject
-            is refused.
-        label: what messages call the file.
+        path: see `ResultsFile`.
+        subject: see `ResultsFile`.
 
     Attributes:
-        played: the attempts in the file.
-
-    Raises:
-        ConfigError: the file can't be read and written, another process has it open, it belongs
-            to something else, or it is damaged.
+        played: see `ResultsFile`.
     """
 
     def __init__(
-        self,
-        path: str | os.PathLike[str],
-        subject: Mapping[str, Any] | None = None,
-        *,
-        label: str = "results file",
+        self, path: str | os.PathLike[str], subject: Mapping[str, Any] | None = None
     ) -> None:
-        self._name = f"{label} {os.fspath(path)}"
+        self._name = f"results file {os.fspath(path)}"
         self.played: list[Attempt] = []
         self._failures: dict[tuple[EpisodeKey, int, int], list[Outcome]] = {}
         try:
@@ -176,9 +158,9 @@ class ResultsFile:
 
     def _read_line(self, row: dict[str, Any]) -> None:
         if "failed_try" not in row:
-            self._note(Attempt.from_json(row))
+            self._note(attempt_of(row))
             return
-        outcome, spec = Outcome.from_json(row.pop("failed_try")), EpisodeSpec.taken_from(row)
+        outcome, spec = Outcome.from_json(row.pop("failed_try")), spec_of(row)
         place = spec.key, row["index"], row["sub_env"]
         self._failures.setdefault(place, []).append(outcome)
 
@@ -198,12 +180,6 @@ class ResultsFile:
         """Close the file, so that another process may open it."""
         self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
 
 def _place(attempt: Attempt) -> tuple[EpisodeKey, int, int]:
     return attempt.spec.key, attempt.index, attempt.sub_env
@@ -211,3 +187,51 @@ def _place(attempt: Attempt) -> tuple[EpisodeKey, int, int]:
 
 def _line_of(value: dict[str, Any]) -> bytes:
     return f"{json.dumps(value, allow_nan=False)}\n".encode()
+
+
+class ResultsFile:
+    """Attempts as JSON lines, for this process alone; `play` and `evaluate` continue from it.
+
+    A line holds an attempt after its last try, as of `Attempt.to_json`, or, with ``failed_try``,
+    the outcome of a try after which there may be another. Cancelled attempts are not written: with
+    ``Rules(first=…)`` a task is done when as many others are in the file.
+
+    ::
+
+        with ResultsFile("results.jsonl", {"policy": "act-1"}) as results:
+            evaluate(group, policy, episodes, results=results)
+
+    Args:
+        path: the file, created if it is missing; a link is followed.
+        subject: what plays, as JSON values: the first line of the file. A file with another subject
+            is refused.
+
+    Raises:
+        ConfigError: the file can't be read and written, another process has it open, it belongs
+            to something else, or it is damaged.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], subject: Mapping[str, Any] | None = None
+    ) -> None:
+        self._log = AttemptLog(path, subject)
+
+    @property
+    def played(self) -> list[Attempt]:
+        """The attempts in the file."""
+        return self._log.played
+
+    def close(self) -> None:
+        """Close the file, so that another process may open it."""
+        self._log.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+def log_of(results: ResultsFile) -> AttemptLog:
+    """Return what `AttemptQueue` reads and writes."""
+    return results._log  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.

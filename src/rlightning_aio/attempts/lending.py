@@ -9,9 +9,9 @@ from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.api.aio import build_env_group
-from rlightning_aio.attempts.episode import AttemptEpisode
+from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.players import Players
-from rlightning_aio.attempts.rules import Rules
+from rlightning_aio.attempts.rules import Rules, tries_again
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import EnvFault, RLightningError
 from rlightning_aio.loop_thread import LoopThread
@@ -39,7 +39,7 @@ class Lending:
     def __init__(self, group: EnvGroup, retries: int) -> None:
         self._group, self._rules, self._players = group, Rules(retries=retries), Players(group)
         self._idle = asyncio.Queue[str]()
-        self._lent = set[AttemptEpisode]()
+        self._lent = set[AttemptInPlay]()
         for env_id in group.env_ids:
             self._idle.put_nowait(env_id)
 
@@ -50,7 +50,7 @@ class Lending:
 
     async def begin(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> AttemptEpisode | Outcome:
+    ) -> AttemptInPlay | Outcome:
         """Wait for an idle env and reset it; return the outcome of the last try if all failed.
 
         Raises:
@@ -63,7 +63,7 @@ class Lending:
                 self._idle.put_nowait("")
                 raise RLightningError("no env of this group is left that could play")
             playing = self._group.episode(env_id, seed, options)
-            episode = AttemptEpisode(playing, EpisodeSpec("", seed, None), 0)
+            episode = AttemptInPlay(playing, EpisodeSpec("", seed, None), 0)
             self._lent.add(episode)
             try:
                 with contextlib.suppress(EnvFault):
@@ -74,11 +74,11 @@ class Lending:
             if episode.fault is None:
                 return episode
             await self.end(episode)
-            if not self._rules.tries_again(episode.fault, failures):
+            if not tries_again(self._rules, episode.fault, failures):
                 return episode.fault
             failures.append(episode.fault)
 
-    async def end(self, episode: AttemptEpisode) -> None:
+    async def end(self, episode: AttemptInPlay) -> None:
         """Take the env back, unless that was done, or its worker is gone for good."""
         if episode in self._lent:
             self._lent.remove(episode)
@@ -104,7 +104,7 @@ class LendingThread:
 
     def __init__(self, name: str, retries: int) -> None:
         self._thread, self._retries = LoopThread(name), retries
-        self._begun = deque[tuple[Any, Future[AttemptEpisode | Outcome]]]()
+        self._begun = deque[tuple[Any, Future[AttemptInPlay | Outcome]]]()
 
     def open(self, config: EnvConfig) -> None:
         """Start the envs."""
@@ -134,7 +134,7 @@ class LendingThread:
         self.run(self._lending.end_all())
         self._begun.extend((one, self._thread.submit(self._begin(one))) for one in options)
 
-    def begin(self, options: dict[str, Any]) -> AttemptEpisode | Outcome:
+    def begin(self, options: dict[str, Any]) -> AttemptInPlay | Outcome:
         """Reset an idle env, or wait for that, if it has begun; see `Lending.begin`.
 
         Raises:
@@ -147,7 +147,7 @@ class LendingThread:
                 return episode.result()
         return self.run(self._begin(options))
 
-    def end(self, episode: AttemptEpisode) -> None:
+    def end(self, episode: AttemptInPlay) -> None:
         """See `Lending.end`."""
         self.run(self._lending.end(episode))
 
@@ -156,7 +156,7 @@ class LendingThread:
         await group.init()
         return group, Lending(group, self._retries)
 
-    async def _begin(self, options: dict[str, Any]) -> AttemptEpisode | Outcome:
+    async def _begin(self, options: dict[str, Any]) -> AttemptInPlay | Outcome:
         if not self._lending.idle:
             raise RLightningError(f"none of {len(self._group)} envs is idle; raise num_envs")
         return await self._lending.begin(options=options)

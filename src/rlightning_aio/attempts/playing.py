@@ -14,10 +14,10 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio.attempts.episode import AttemptEpisode
+from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
-from rlightning_aio.attempts.rules import Rules
+from rlightning_aio.attempts.rules import Rules, needed
 from rlightning_aio.attempts.tasks import TaskSource
 from rlightning_aio.attempts.tries import Try, surely
 from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
@@ -197,7 +197,7 @@ class _Engine:
     def _start(self, env_id: str) -> None:
         (job,) = self._queue.take(env_id)
         seed, options = self._queue.begin(env_id, job)
-        view = AttemptEpisode(self._group.episode(env_id, seed, options), job.spec, job.index)
+        view = AttemptInPlay(self._group.episode(env_id, seed, options), job.spec, job.index)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         task = asyncio.create_task(one.run())
         self._playing[task] = job, one
@@ -239,7 +239,7 @@ class _Engine:
                 task.spec, job.index, cancelled, failures=tuple(job.failures)
             )
         attempts = [task.attempts[index] for index in sorted(task.attempts)]
-        is_complete = task.num_whole >= self._rules.needed(self._size)
+        is_complete = task.num_whole >= needed(self._rules, self._size)
         self.done.append(AttemptGroup(task.spec, attempts, is_complete))
         self.news.set()
 

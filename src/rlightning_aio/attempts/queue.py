@@ -12,7 +12,9 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio.attempts.file import log_of
 from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.rules import seed_of, tries_again
 from rlightning_aio.attempts.waiting import WaitingEpisodes
 from rlightning_aio.errors import RLightningError
 
@@ -87,14 +89,14 @@ class AttemptQueue:
     """
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
-        self._rules, self._results = rules, results
+        self._rules, self._log = rules, None if results is None else log_of(results)
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ not in self.players.gone}
         self.fault: WorkerDied | None = None
         self._waiting: dict[str, WaitingEpisodes[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
-        self._before = {} if results is None else results.by_place()
+        self._before = {} if self._log is None else self._log.by_place()
         self._repeats = Counter[Any]()
 
     # -- what waits -------------------------------------------------------------------
@@ -128,8 +130,8 @@ class AttemptQueue:
         if repeat < len(found):
             job.task.attempts[job.index] = found[repeat]
             return True
-        if self._results is not None and repeat == len(found):
-            job.failures += self._results.failures(*_written_as(job))
+        if self._log is not None and repeat == len(found):
+            job.failures += self._log.failures(*_written_as(job))
         return False
 
     def _wait(self, job: Job) -> None:
@@ -197,7 +199,7 @@ class AttemptQueue:
 
     def begin(self, env_id: str, job: Job) -> tuple[int | None, dict[str, Any] | None]:
         """Seed and options of the reset that begins an attempt on an env."""
-        seed = self._rules.seed(job.spec, job.index)
+        seed = seed_of(self._rules, job.spec, job.index)
         return seed, self.players.begin(env_id, job.spec)
 
     # -- what has ended ---------------------------------------------------------------
@@ -207,16 +209,16 @@ class AttemptQueue:
         outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
         if job.task.is_settled:
             return False
-        if self._rules.tries_again(outcome, job.failures):
+        if tries_again(self._rules, outcome, job.failures):
             job.failures.append(outcome)
-            if self._results is not None:
-                self._results.add_failure(*_written_as(job), outcome)
+            if self._log is not None:
+                self._log.add_failure(*_written_as(job), outcome)
             self._wait(job)
             return False
         attempt.failures = tuple(job.failures)
         job.task.attempts[job.index] = attempt
-        if self._results is not None:
-            self._results.add(attempt)
+        if self._log is not None:
+            self._log.add(attempt)
         return True
 
     def is_done(self, task: TaskInPlay) -> bool:

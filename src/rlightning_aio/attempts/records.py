@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
 
-from rlightning_aio.attempts.spec import EpisodeSpec, plain
+from rlightning_aio.attempts.spec import EpisodeSpec, plain, spec_of
 from rlightning_aio.json_text import finite
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["Attempt", "AttemptGroup"]
+__all__ = ["Attempt", "AttemptGroup", "attempt_of"]
 
 
 @dataclass(slots=True)
@@ -82,24 +82,24 @@ class Attempt:
         }
         return finite(row)
 
-    @classmethod
-    def from_json(cls, row: Mapping[str, Any]) -> Attempt:
-        """Make an attempt from its row.
 
-        Raises:
-            TypeError, ValueError, KeyError: it is not such a row.
-        """
-        fields = {**row}
-        spec = EpisodeSpec.taken_from(fields)
-        outcome = Outcome.from_json(fields.pop("outcome"))
-        failures = tuple(map(Outcome.from_json, fields.pop("failures")))
-        rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
-        reward = fields.pop("reward")
-        if reward is None and not outcome.is_failure:  # It was not finite.
-            reward = math.nan
-        return cls(
-            spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
-        )
+def attempt_of(row: Mapping[str, Any]) -> Attempt:
+    """Make an attempt from what `Attempt.to_json` returned.
+
+    Raises:
+        TypeError, ValueError, KeyError: it is not such a row.
+    """
+    fields = {**row}
+    spec = spec_of(fields)
+    outcome = Outcome.from_json(fields.pop("outcome"))
+    failures = tuple(map(Outcome.from_json, fields.pop("failures")))
+    rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
+    reward = fields.pop("reward")
+    if reward is None and not outcome.is_failure:  # It was not finite.
+        reward = math.nan
+    return Attempt(
+        spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
+    )
 
 
 def _json_or_none(value: Any) -> Any:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Rules", "is_retried"]
+__all__ = ["Rules", "is_retried", "needed", "seed_of", "tries_again"]
 
 _SEED_BITS: Final = 2
 
@@ -73,18 +73,21 @@ class Rules:
         if self.at_least is not None and self.first is not None:
             raise ValueError("at_least and first exclude each other")
 
-    def seed(self, spec: EpisodeSpec, index: int) -> int | None:
-        """The seed of an attempt."""
-        if self.seeds == "same" or spec.seed is None:
-            return spec.seed
-        state = np.random.SeedSequence((spec.seed, index)).generate_state(1, np.uint64)
-        return int(state[0]) >> _SEED_BITS
 
-    def tries_again(self, outcome: Outcome, before: Sequence[Outcome]) -> bool:
-        """Return True if an attempt is tried again after a try, and those `before` that failed."""
-        counted = sum(not is_bystanders(one) for one in before)
-        return self.retried(outcome) and (is_bystanders(outcome) or counted < self.retries)
+def seed_of(rules: Rules, spec: EpisodeSpec, index: int) -> int | None:
+    """The seed of an attempt."""
+    if rules.seeds == "same" or spec.seed is None:
+        return spec.seed
+    state = np.random.SeedSequence((spec.seed, index)).generate_state(1, np.uint64)
+    return int(state[0]) >> _SEED_BITS
 
-    def needed(self, size: int) -> int:
-        """Number of attempts, of `size`, that must not fail for their group to be complete."""
-        return min(size, self.first or self.at_least or size)
+
+def tries_again(rules: Rules, outcome: Outcome, before: Sequence[Outcome]) -> bool:
+    """Return True if an attempt is tried again after a try, and those `before` that failed."""
+    counted = sum(not is_bystanders(one) for one in before)
+    return rules.retried(outcome) and (is_bystanders(outcome) or counted < rules.retries)
+
+
+def needed(rules: Rules, size: int) -> int:
+    """Number of attempts, of `size`, that must not fail for their group to be complete."""
+    return min(size, rules.first or rules.at_least or size)

@@ -13,7 +13,7 @@ from typing import Any
 
 from rlightning_aio._core.group.episodes.seeds import checked_seed
 
-__all__ = ["EpisodeKey", "EpisodeSpec", "plain", "written"]
+__all__ = ["EpisodeKey", "EpisodeSpec", "plain", "spec_of", "written"]
 
 EpisodeKey = tuple[str, str, int | None, str, str]
 """Entry, task, seed, options as JSON, and env of an episode."""
@@ -74,14 +74,14 @@ class EpisodeSpec:
             "env_id": self.env_id,
         }
 
-    @classmethod
-    def taken_from(cls, row: dict[str, Any]) -> EpisodeSpec:
-        """Take an episode's fields out of a row that has others as well.
 
-        Raises:
-            TypeError, ValueError, KeyError: it has no such fields.
-        """
-        return cls(**{name: row.pop(name) for name in cls.__slots__})
+def spec_of(row: dict[str, Any]) -> EpisodeSpec:
+    """Take an episode's fields out of a row that has others as well.
+
+    Raises:
+        TypeError, ValueError, KeyError: it has no such fields.
+    """
+    return EpisodeSpec(**{name: row.pop(name) for name in EpisodeSpec.__slots__})
 
 
 def written(options: Mapping[str, Any] | None) -> str:

@@ -21,7 +21,7 @@ from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from rlightning_aio.attempts.episode import AttemptEpisode
+    from rlightning_aio.attempts.episode import AttemptEpisode, AttemptInPlay
     from rlightning_aio.attempts.rules import Rules
 
 __all__ = ["Agent", "Try", "surely"]
@@ -50,7 +50,7 @@ class Try:
 
     def __init__(
         self,
-        view: AttemptEpisode,
+        view: AttemptInPlay,
         agent: Agent,
         rules: Rules,
         waited: float,

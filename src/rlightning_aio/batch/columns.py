@@ -17,7 +17,7 @@ from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
-from rlightning_aio.types import EnvRet, MultiAgentEnvRet
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet, unchecked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -245,7 +245,7 @@ class ResultColumns(msgspec.Struct):
             "info": self.info_of(row),
             "ts_env_sent_ns": self.sent_ns_of(row),
         }
-        return (MultiAgentEnvRet if self.agents else EnvRet).of(fields, kept.get("extra"))
+        return unchecked(MultiAgentEnvRet if self.agents else EnvRet, fields, kept.get("extra"))
 
     def _ret_handed_over(self, row: int, ret: Any) -> Any:
         changed: dict[str, Any] = {}

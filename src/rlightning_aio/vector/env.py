@@ -391,7 +391,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         collect = partial(collect_calls, self.group)
         return tuple(self._rows.values(self._finish("call", timeout, collect)))
 
-    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env at `place`, or get its attribute."""
         check_name(name)
         send = partial(self._rows.call, name, args, kwargs, [place])

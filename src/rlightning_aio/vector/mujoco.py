@@ -149,13 +149,13 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
         is_method = callable(getattr(self.env, name, None))
-        return is_method, None if is_method else self.call_one(place, name)
+        return is_method, None if is_method else self._call_one(place, name)
 
-    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of env `place`, or get its attribute."""
         check_free(self, self._pending, "call_async")
         check_name(name)
-        return super().call_one(place, name, *args, **kwargs)
+        return self.call_one(place, name, *args, **kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""

@@ -52,7 +52,7 @@ class CalledEnvs:
         """Call method `name` of each env, found through its wrappers, or get an attribute."""
         raise NotImplementedError
 
-    def call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env at `place`, or get its attribute."""
         raise NotImplementedError
 
@@ -68,7 +68,7 @@ class CalledEnvs:
     def envs(self) -> list[Any]:
         """A proxy of each env; it fetches attributes when they are read."""
         return [
-            EnvProxy(partial(self._look_up, place), partial(self.call_one, place))
+            EnvProxy(partial(self._look_up, place), partial(self._call_one, place))
             for place in range(self.num_envs)
         ]
 

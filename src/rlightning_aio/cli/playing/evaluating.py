@@ -248,7 +248,10 @@ def _resumed(order: _Order, resume: Path | None, stack: contextlib.ExitStack) ->
     about = _subject(order.configs, order.whose.named)
     if isinstance(order.episodes, int):
         about["seed"] = order.whose.facts["seed"]
-    return stack.enter_context(ResultsFile(resume, about, label="--resume"))
+    try:
+        return stack.enter_context(ResultsFile(resume, about))
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("results file", "--resume", 1)) from error
 
 
 def _subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:

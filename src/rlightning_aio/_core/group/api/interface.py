@@ -306,9 +306,9 @@ class GroupInterface(Facade):
     def _handle(self, env_id: str, of_env: type[E], of_server: type[S]) -> E | S:
         server = self._core.supervisor.members.server(env_id)
         if server is not None:
-            return of_server(self, self._core, self._driver, server)
+            return of_server(self, server)
         self._core.envs.find_one(env_id)
-        return of_env(self, self._core, self._driver, env_id)
+        return of_env(self, env_id)
 
     def offload(self) -> Any:
         """Free the device memory of every local env until `reload`.
@@ -345,10 +345,10 @@ class GroupInterface(Facade):
 class EnvHandleInterface:
     """The methods of a handle on one env."""
 
-    def __init__(self, group: Any, core: Core, driver: Any, env_id: str) -> None:
+    def __init__(self, group: Any, env_id: str) -> None:
         self._group = group
-        self._core = core
-        self._driver = driver
+        self._core: Core = group._core  # noqa: SLF001  # Same module.
+        self._driver: Any = group._driver  # noqa: SLF001  # Likewise.
         self._env_id = env_id
 
     def __repr__(self) -> str:
@@ -425,8 +425,8 @@ class EnvHandleInterface:
 class ServerHandleInterface(EnvHandleInterface):
     """The methods of a handle on one env_server."""
 
-    def __init__(self, group: Any, core: Core, driver: Any, server: Membership) -> None:
-        super().__init__(group, core, driver, server.server_id)
+    def __init__(self, group: Any, server: Membership) -> None:
+        super().__init__(group, server.server_id)
         self._server = server
 
     @property
