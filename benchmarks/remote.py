@@ -28,8 +28,8 @@ from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.protocol.net.wire import ClientResult, Step, Writer
-from rlightning_aio.remote import RemoteEnvClient, make_keys
-from rlightning_aio.remote.keys import read_client_keys, read_server_keys
+from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote.keys import make_keys, read_client_keys, read_server_keys
 
 TASK = "benchmarks/CheetahSized-v0"
 WARM_UP_CALLS = 100

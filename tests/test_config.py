@@ -640,7 +640,7 @@ def test_any_value_gives_entries_or_a_config_error(cfgs: object) -> None:
 @pytest.fixture
 def absent(monkeypatch: pytest.MonkeyPatch) -> Backend:
     backend = Backend(
-        "absent", "nowhere:Env", "no_such_simulator", "no-such-simulator", extra="absent"
+        "absent", "nowhere:Env", "no_such_simulator", "no-such-simulator", install="make absent"
     )
     monkeypatch.setitem(BACKENDS, "absent", backend)
     return backend
@@ -652,7 +652,7 @@ def test_a_missing_simulator_is_named_with_its_install_command(absent: Backend) 
     with pytest.raises(ConfigError) as caught:
         check_installed(configs)
     assert "envs.1 ('cartpole'), backend" in str(caught.value)
-    assert "pip install 'rlightning-aio[absent]'" in str(caught.value)
+    assert "make absent" in str(caught.value)
 
 
 def test_installed_simulators_pass() -> None:

@@ -55,7 +55,6 @@ class Backend:
         target: ``module:Class`` of the env class.
         module: the simulator's top module; it is looked for, never imported.
         distribution: the package whose version is shown.
-        extra: the extra of this package that installs it; empty for core dependencies.
         cpu_bound: a step is plain computation on one core, so several envs may share a worker
             (``envs_per_process: auto``).
         awaitable: its envs are awaitable and do nothing but wait, so one worker runs all of an
@@ -64,7 +63,7 @@ class Backend:
         hardware: it moves something real. After a worker's death only an explicit reset may set
             that in motion: ``on_worker_death`` is ``raise`` by default, a replacement is not reset
             by itself, and its envs refuse steps until then.
-        own_command: the command that installs the simulator, where no extra does.
+        install: the command that installs the simulator.
         preload: modules that are slow to import and safe to import before workers are forked:
             they start no thread and open no device.
     """
@@ -73,19 +72,12 @@ class Backend:
     target: str
     module: str
     distribution: str
-    extra: str = ""
     cpu_bound: bool = False
     awaitable: bool = False
     vectorized: bool = False
     hardware: bool = False
-    own_command: str = ""
+    install: str = "pip install rlightning-aio"
     preload: tuple[str, ...] = ()
-
-    @property
-    def install_command(self) -> str:
-        """Return the one command that installs the simulator."""
-        package = f"'rlightning-aio[{self.extra}]'" if self.extra else "rlightning-aio"
-        return self.own_command or f"pip install {package}"
 
     def installed_version(self) -> str | None:
         """Return the simulator's version in this interpreter, or None if it isn't installed."""
@@ -98,6 +90,10 @@ class Backend:
             return version(self.distribution)
         except PackageNotFoundError:
             return "unknown"
+
+
+def _of_extra(name: str) -> str:
+    return f"pip install 'rlightning-aio[{name}]'"
 
 
 # For an environment of its own; docs/isaac.md says why it takes two steps.
@@ -123,28 +119,31 @@ BACKENDS: dict[str, Backend] = {
                 preload=(f"{_SIMULATORS}.callable",)),
         Backend("env_server", "rlightning_aio._core.hosts.env_server.host:EnvServerHost", "zmq",
                 "pyzmq", vectorized=True),
-        Backend("ale", f"{_SIMULATORS}.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
+        Backend("ale", f"{_SIMULATORS}.ale:ALEEnv", "ale_py", "ale-py", install=_of_extra("ale"),
                 cpu_bound=True, vectorized=True, preload=(f"{_SIMULATORS}.ale",)),
         Backend("pettingzoo", f"{_SIMULATORS}.pettingzoo:PettingZooEnv", "pettingzoo",
-                "pettingzoo", extra="pettingzoo", cpu_bound=True,
+                "pettingzoo", install=_of_extra("pettingzoo"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.pettingzoo",)),
         Backend("envpool", f"{_SIMULATORS}.envpool:EnvPoolEnv", "envpool", "envpool",
-                extra="envpool", vectorized=True, preload=(f"{_SIMULATORS}.envpool",)),
+                install=_of_extra("envpool"), vectorized=True, preload=(f"{_SIMULATORS}.envpool",)),
         Backend("maniskill", f"{_SIMULATORS}.maniskill:ManiskillEnv", "mani_skill",
-                "mani-skill", extra="maniskill", vectorized=True,
+                "mani-skill", install=_of_extra("maniskill"), vectorized=True,
                 preload=(f"{_SIMULATORS}.maniskill",)),
         Backend("isaac_manager_based", f"{_SIMULATORS}.isaac:IsaacManagerBasedEnv",
-                "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
+                "isaaclab", "isaaclab", vectorized=True, install=ISAAC_LAB),
         Backend("isaac_marl", f"{_SIMULATORS}.isaac:IsaacMarlEnv",
-                "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
+                "isaaclab", "isaaclab", vectorized=True, install=ISAAC_LAB),
         Backend("metaworld", f"{_SIMULATORS}.metaworld:MetaworldEnv", "metaworld", "metaworld",
-                extra="metaworld", cpu_bound=True, preload=(f"{_SIMULATORS}.metaworld",)),
+                install=_of_extra("metaworld"), cpu_bound=True,
+                preload=(f"{_SIMULATORS}.metaworld",)),
         Backend("pusht", f"{_SIMULATORS}.lerobot_tasks:PushTEnv", "gym_pusht", "gym-pusht",
-                extra="pusht", cpu_bound=True, preload=(f"{_SIMULATORS}.lerobot_tasks",)),
+                install=_of_extra("pusht"), cpu_bound=True,
+                preload=(f"{_SIMULATORS}.lerobot_tasks",)),
         Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
-                extra="aloha", cpu_bound=True, preload=(f"{_SIMULATORS}.lerobot_tasks",)),
+                install=_of_extra("aloha"), cpu_bound=True,
+                preload=(f"{_SIMULATORS}.lerobot_tasks",)),
         Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets", "websockets",
-                extra="websockets", awaitable=True),
+                install=_of_extra("websockets"), awaitable=True),
     )
 }
 # fmt: on

@@ -25,7 +25,7 @@ def test_each_backend_has_a_line() -> None:
     lines = run("backends").stdout.splitlines()
     for backend in ROWS:
         (line,) = [line for line in lines if line.split()[:1] == [backend.name]]
-        assert line.rstrip().endswith(backend.install_command)
+        assert line.rstrip().endswith(backend.install)
         version = backend.installed_version() or "not installed"
         assert f" {backend.distribution} {version} " in line
 
@@ -37,7 +37,7 @@ def test_json_has_one_object_for_each_backend() -> None:
     (row,) = [row for row in rows if row["name"] == "gymnasium"]
     assert row["installed"] is True
     assert row["version"] == gymnasium.__version__
-    assert row["install"] == BACKENDS["gymnasium"].install_command
+    assert row["install"] == BACKENDS["gymnasium"].install
 
 
 def test_a_missing_simulator_is_listed_as_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,8 +16,7 @@ from cli.command import COMMAND, TESTS, invoke, invoke_json, start, write_config
 from patience import HANG
 from run_python import output_of
 
-from rlightning_aio.remote import make_keys
-from rlightning_aio.remote.keys import read_client_keys, read_server_keys
+from rlightning_aio.remote.keys import make_keys, read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
-from rlightning_aio.envs.base import result_of
+from rlightning_aio.envs.base import result_of, sub_env_seeds
 from rlightning_aio.envs.fast_path import BareStep, FastPath
 
 if TYPE_CHECKING:
@@ -390,7 +390,7 @@ class Batched(BaseEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
-        self.seeds = np.array(self.sub_env_seeds(0 if seed is None else seed))
+        self.seeds = np.array(sub_env_seeds(self, 0 if seed is None else seed))
         self.counts = np.zeros(self.num_envs, int)
         return EnvRet(env_id=self.env_id, observation=self._observation())
 

@@ -22,8 +22,7 @@ from rlightning_aio._core.hosts.env_server.rate_limiter import (
 )
 from rlightning_aio.protocol.net.limited_log import LimitedLog
 from rlightning_aio.protocol.net.wire import MAX_HELLO_BYTES
-from rlightning_aio.remote import make_keys
-from rlightning_aio.remote.keys import read_client_keys
+from rlightning_aio.remote.keys import make_keys, read_client_keys
 
 if TYPE_CHECKING:
     from pathlib import Path

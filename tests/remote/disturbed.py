@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from patience import HANG
 
 from rlightning_aio import sync
-from rlightning_aio.remote import make_keys
+from rlightning_aio.remote.keys import make_keys
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

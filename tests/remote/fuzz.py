@@ -17,8 +17,7 @@ from remote.unauthenticated_peers import hello
 from remote.unreliable import World
 
 from rlightning_aio.protocol.net.client_session import Refused
-from rlightning_aio.remote import make_keys
-from rlightning_aio.remote.keys import AllowedKeys, read_client_keys
+from rlightning_aio.remote.keys import AllowedKeys, make_keys, read_client_keys
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -24,7 +24,8 @@ from rlightning_aio._core.hosts.env_server import (
 )
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, ClientHello, Ping, Writer
-from rlightning_aio.remote import RemoteEnvClient, make_keys
+from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote.keys import make_keys
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.remote import make_keys
-from rlightning_aio.remote.keys import AllowedKeys, read_client_keys, read_keys
+from rlightning_aio.remote.keys import AllowedKeys, make_keys, read_client_keys, read_keys
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -24,8 +24,8 @@ from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.net.wire import ClientHello, Writer
-from rlightning_aio.remote import RemoteEnvClient, client, make_keys
-from rlightning_aio.remote.keys import read_client_keys, read_server_keys
+from rlightning_aio.remote import RemoteEnvClient, client
+from rlightning_aio.remote.keys import make_keys, read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable

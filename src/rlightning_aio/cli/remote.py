@@ -29,7 +29,8 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
-from rlightning_aio.remote import RemoteEnvClient, make_keys
+from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote.keys import make_keys
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence

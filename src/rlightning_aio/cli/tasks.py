@@ -77,5 +77,5 @@ def names_of_tasks(backend: str) -> list[str]:
         )
     known_backend = BACKENDS[backend]
     if known_backend.installed_version() is None:
-        raise ConfigError(f"backend {backend!r} is not installed: {known_backend.install_command}")
+        raise ConfigError(f"backend {backend!r} is not installed: {known_backend.install}")
     return sorted(_LISTS[backend]())

@@ -37,6 +37,7 @@ __all__ = [
     "Result",
     "initialised",
     "result_of",
+    "sub_env_seeds",
 ]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
@@ -169,19 +170,6 @@ class BaseEnv(abc.ABC):
         """Return the space of the actions of `step`; batched when ``num_envs > 1``."""
         return self.env.action_space
 
-    def sub_env_seeds(self, seed: int | list[int]) -> list[int]:
-        """Return one seed for each sub-environment: ``seed + k``, or the given list.
-
-        Raises:
-            ValueError: a list of another length than ``num_envs`` of the config.
-        """
-        count = self.config.num_envs
-        if not isinstance(seed, list):
-            return [int(seed) + k for k in range(count)]
-        if len(seed) != count:
-            raise ValueError(f"env {self.env_id!r}: {len(seed)} seeds for {count} sub-environments")
-        return [int(one) for one in seed]
-
     def save_state(self) -> Any:
         """Return the complete state of the env as a value that can be pickled; see `load_state`.
 
@@ -249,3 +237,17 @@ def initialised(env: BaseEnv) -> EnvMeta:
     """Call `init` and return the metadata; every runner of an env starts with this."""
     meta = env.init()
     return env.get_metadata() if meta is None else meta
+
+
+def sub_env_seeds(env: BaseEnv, seed: int | list[int]) -> list[int]:
+    """Return one seed for each sub-environment: ``seed + k``, or the given list.
+
+    Raises:
+        ValueError: a list of another length than ``num_envs`` of the config.
+    """
+    count = env.config.num_envs
+    if not isinstance(seed, list):
+        return [int(seed) + k for k in range(count)]
+    if len(seed) != count:
+        raise ValueError(f"env {env.env_id!r}: {len(seed)} seeds for {count} sub-environments")
+    return [int(one) for one in seed]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.envs.fast_path import BareResult, BareStep
 
-__all__ = ["EnvContract", "Expected", "same", "values_of"]
+__all__ = ["EnvContract"]
 
 Expected = tuple[Any, Any, Any, Any]
 """Observation, reward, terminated, truncated; NumPy arrays and Python scalars in them."""

@@ -11,6 +11,6 @@ BACKEND = Backend(
     "rlightning_aio.piper.env:PiperEnv",
     "piper_sdk",
     "piper-sdk",
-    extra="piper",
     hardware=True,
+    install="pip install 'rlightning-aio[piper]'",
 )

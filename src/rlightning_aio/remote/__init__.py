@@ -3,6 +3,5 @@
 from __future__ import annotations
 
 from rlightning_aio.remote.client import RemoteEnvClient
-from rlightning_aio.remote.keys import make_keys
 
-__all__ = ["RemoteEnvClient", "make_keys"]
+__all__ = ["RemoteEnvClient"]

@@ -18,6 +18,7 @@ from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation, TimeLi
 from gymnasium.wrappers.vector import TransformObservation
 
 from rlightning_aio.envs.ale_console import StickyConsole, is_sticky
+from rlightning_aio.envs.base import sub_env_seeds
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.errors import ConfigError
 
@@ -147,7 +148,7 @@ class ALEEnv(GymnasiumEnv):
             return super().reset(seed=seed, options=options)
         seeds: Any = None
         if seed is not None:
-            seeds = np.asarray(self.sub_env_seeds(seed))
+            seeds = np.asarray(sub_env_seeds(self, seed))
         elif not self._is_seeded:
             # ale-py would seed with the time in seconds, the same for all workers.
             seeds = np.random.default_rng().integers(2**31 - 1, size=self.num_envs)

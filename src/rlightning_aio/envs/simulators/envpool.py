@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of, sub_env_seeds
 from rlightning_aio.envs.fast_path import (
     BareResult,
     BareStep,
@@ -126,7 +126,7 @@ class EnvPoolEnv(FastPath, BaseEnv):
         if options:
             raise ValueError(f"env {self.env_id!r}: EnvPool takes no reset options: {options}")
         if seed is not None:
-            self._reopen(self.sub_env_seeds(seed))
+            self._reopen(sub_env_seeds(self, seed))
         elif self._asynchronous and self._ready is not None:
             self._reopen(self._drawn_seeds())
         self.env.async_reset()

@@ -71,7 +71,7 @@ def make_simulator(
     if importlib.util.find_spec("isaaclab") is None:
         raise ConfigError(
             f"{env_id}: {sys.executable} has no Isaac Lab; set the entry's interpreter to the "
-            f"Python of an environment made by: {BACKENDS['isaac_marl'].install_command}"
+            f"Python of an environment made by: {BACKENDS['isaac_marl'].install}"
         )
     options = read_options(IsaacOptions, env_id, config.env_kwargs)
     device = options.device or _default_device()

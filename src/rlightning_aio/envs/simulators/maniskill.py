@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, sub_env_seeds
 from rlightning_aio.envs.simulators.vulkan import do_without_materials, render_device_is_usable
 from rlightning_aio.envs.tensors import as_numpy, is_tensor
 from rlightning_aio.errors import ConfigError
@@ -145,7 +145,7 @@ class ManiskillEnv(BaseEnv):
 
     def _seeds(self, seed: int | list[int] | None) -> list[int] | None:
         if seed is not None:
-            seeds = self.sub_env_seeds(seed)
+            seeds = sub_env_seeds(self, seed)
             self._unseeded = np.random.default_rng(seeds)
         elif not self._is_seeded:
             seeds = self._unseeded.integers(2**31, size=self.num_envs).tolist()
