@@ -1,4 +1,4 @@
-"""``rlightning-aio trace``: what a timeline says, as text.
+"""What a timeline says, as text: ``rlightning-aio check run.json``.
 
 Rule: everything is computed from the file alone. A span of the trainer counts without those within
 it. The first track of a worker is its own, and the others are those of its envs.
@@ -9,10 +9,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
-from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
-
-import typer
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rlightning_aio._core.group.timeline.file import TRAINER
 from rlightning_aio.cli.terminal import (
@@ -27,8 +24,9 @@ from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+    from pathlib import Path
 
-__all__ = ["trace"]
+__all__ = ["is_timeline", "summarise"]
 
 _WAITING: Final = frozenset({"collect_async", "step", "reset", "restore"})
 """Calls that wait for envs; they return results in "hand out", which counts by itself."""
@@ -90,23 +88,19 @@ class _Summary:
     events: list[dict[str, Any]]
 
 
-def trace(
-    file: Annotated[
-        Path, typer.Argument(help="Timeline, as `--trace FILE` writes it.", show_default=False)
-    ],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the text.")
-    ] = False,
-) -> None:
+def is_timeline(file: Path) -> bool:
+    """Return True for what `--trace FILE` writes, and for nothing that is a config."""
+    try:
+        return b'"traceEvents"' in file.read_bytes()
+    except OSError:
+        return False
+
+
+def summarise(file: Path, *, as_json: bool) -> None:
     """Say where the time of a timeline went, by worker and env.
 
-    Which side starves (the trainer, or the envs), the slowest steps, deaths and restarts. Record
-    a timeline by `rollout --trace run.json`, or in a program by `group.trace("run.json")`.
-
-    For example:
-
-        rlightning-aio rollout cartpole.yaml --trace run.json
-        rlightning-aio trace run.json
+    Raises:
+        ConfigError: the file is damaged.
     """
     summary = _Reader(file).summary()
     if as_json:
