@@ -147,7 +147,7 @@ def test_each_built_in_backend_has_a_class_and_an_install_command(backend: Backe
     module, _, name = backend.target.partition(":")
     assert module.startswith("rlightning_aio.")
     assert name.isidentifier()
-    assert backend.install_command.startswith("pip install ")
+    assert backend.install.startswith("pip install ")
 
 
 def test_the_version_of_a_missing_simulator_is_none() -> None:
