@@ -12,7 +12,7 @@ MOST = {
     "members": 360,
     "arguments": 412,
     "fields": 25,
-    "commands": 8,
+    "commands": 9,
     "options": 31,
     "extras": 15,
 }

@@ -1,4 +1,4 @@
-"""``rlightning-aio check`` of a timeline says what a timeline shows."""
+"""``rlightning-aio trace`` says what a timeline shows."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def recorded(path: Path, actions: list[list[int]], think: float = 0.0) -> Any:
                 with group.span("learner"):
                     time.sleep(think)
                 batch, _ = group.step(batch.respond(action=some))
-    return invoke_json("check", path)
+    return invoke_json("trace", path)
 
 
 def test_its_figures_are_those_of_the_timeline(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 4})
     path = tmp_path / "run.json"
     assert invoke("rollout", config, "--steps", "300", "--trace", path).exit_code == 0
-    found, seen = invoke_json("check", path), Seen(path)
+    found, seen = invoke_json("trace", path), Seen(path)
     requests = seen.results()
     assert sum(one["steps"] for one in found["envs"]) == len(seen.called("step"))
     assert sum(one["resets"] for one in found["envs"]) == len(
@@ -64,7 +64,7 @@ def test_its_figures_are_those_of_the_timeline(tmp_path: Path) -> None:
     unfinished = [one for one in seen.slices if one.name.endswith(", not done")]
     longest = max(one.ended - one.began for one in [*requests, *unfinished])
     assert math.isclose(found["slowest"][0]["seconds"], longest / 1e9, abs_tol=1e-6)
-    text = invoke("check", path).stdout
+    text = invoke("trace", path).stdout
     assert "300 steps of 4 envs" in text
     assert "slowest requests" in text
 
@@ -93,7 +93,7 @@ def test_deaths_and_restarts_have_their_causes(tmp_path: Path) -> None:
     (died,) = [event for event in found["events"] if event["what"] == "died"]
     assert "code 7" in died["cause"]
     assert sum(worker["replaced"] for worker in found["workers"]) > 0
-    text = invoke("check", path).stdout
+    text = invoke("trace", path).stdout
     assert "faults" in text
     assert "code 7" in text
 
@@ -103,15 +103,6 @@ def test_what_is_no_timeline_is_refused(tmp_path: Path, content: str | None) -> 
     path = tmp_path / "other.json"
     if content is not None:
         path.write_text(content)
-    done = invoke("check", path)
+    done = invoke("trace", path)
     assert done.exit_code == 2
     assert "other.json" in done.stderr
-
-
-def test_what_applies_to_configs_is_refused_for_a_timeline(tmp_path: Path) -> None:
-    path = tmp_path / "run.json"
-    path.write_text('{"traceEvents": []}')
-    for more in (["envs.0.num_workers=2"], ["--steps", "3"]):
-        done = invoke("check", path, *more)
-        assert done.exit_code == 2
-        assert "is a timeline" in done.stderr

@@ -17,6 +17,7 @@ from rlightning_aio.cli.playing.rollout import rollout
 from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.serving import serve
 from rlightning_aio.cli.terminal import guarded
+from rlightning_aio.cli.trace import trace
 from rlightning_aio.protocol import kernel
 
 __all__ = ["app"]
@@ -69,7 +70,7 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, check, backends, serve, client, keygen):
+for command in (rollout, bench, check, trace, backends, serve, client, keygen):
     app.command()(guarded(command))
 # Named after what Python has a function of that name for.
 app.command("eval")(guarded(evaluation))

@@ -1,20 +1,18 @@
-"""``rlightning-aio check`` steps one env of each entry of a config, or reads a timeline."""
+"""``rlightning-aio check`` builds and steps one env of each entry and prints its spaces."""
 
 from __future__ import annotations
 
 import asyncio
 from dataclasses import asdict, dataclass
-from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
-from rlightning_aio.cli.options import Overrides
+from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
-from rlightning_aio.cli.trace import is_timeline, summarise
 from rlightning_aio.cli.trial import Trial, try_out
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
@@ -58,12 +56,7 @@ class _Finding:
 
 
 def check(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="CONFIG", help="YAML file with envs:, or a timeline.", show_default=False
-        ),
-    ],
+    config: Config,
     overrides: Overrides = None,
     steps: Annotated[
         int, typer.Option(min=0, help="Play so many steps with random actions, and look closely.")
@@ -77,28 +70,18 @@ def check(
     Errors in the file are reported first, before anything is started. Robots are not
     started, and neither are env_servers, whose envs live elsewhere.
 
-    Given a timeline, as --trace FILE of `rollout` or `group.trace` writes it, say where its time
-    went, by worker and env: which side starves (the trainer, or the envs), the slowest steps,
-    deaths and restarts.
-
     For example:
 
         rlightning-aio check configs/cartpole.yaml
         rlightning-aio check configs/halfcheetah.yaml envs.0.task=Ant-v5
         rlightning-aio check configs/cartpole.yaml --steps 2000
-        rlightning-aio check run.json
     """
-    if is_timeline(file):
-        if overrides or steps:
-            raise ConfigError(f"{file} is a timeline, which overrides and --steps don't apply to")
-        summarise(file, as_json=as_json)
-        return
-    configs = load_config(file, overrides or ())
+    configs = load_config(config, overrides or ())
     check_installed(configs)
     findings: list[_Finding] = []
     run_interruptible(_look(configs, findings, steps))
     if as_json:
-        print_json({"config": str(file), "entries": [asdict(found) for found in findings]})
+        print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
         return
     for found in findings:
         for line in _lines(found):

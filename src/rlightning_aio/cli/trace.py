@@ -1,4 +1,4 @@
-"""What a timeline says, as text: ``rlightning-aio check run.json``.
+"""``rlightning-aio trace``: what a timeline says, as text.
 
 Rule: everything is computed from the file alone. A span of the trainer counts without those within
 it. The first track of a worker is its own, and the others are those of its envs.
@@ -9,7 +9,10 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from pathlib import Path  # noqa: TC003 (Typer reads annotations)
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+
+import typer
 
 from rlightning_aio._core.group.timeline.file import TRAINER
 from rlightning_aio.cli.terminal import (
@@ -24,9 +27,8 @@ from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
-__all__ = ["is_timeline", "summarise"]
+__all__ = ["trace"]
 
 _WAITING: Final = frozenset({"collect_async", "step", "reset", "restore"})
 """Calls that wait for envs; they return results in "hand out", which counts by itself."""
@@ -88,19 +90,23 @@ class _Summary:
     events: list[dict[str, Any]]
 
 
-def is_timeline(file: Path) -> bool:
-    """Return True for what `--trace FILE` writes, and for nothing that is a config."""
-    try:
-        return b'"traceEvents"' in file.read_bytes()
-    except OSError:
-        return False
-
-
-def summarise(file: Path, *, as_json: bool) -> None:
+def trace(
+    file: Annotated[
+        Path, typer.Argument(help="Timeline, as `--trace FILE` writes it.", show_default=False)
+    ],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document instead of the text.")
+    ] = False,
+) -> None:
     """Say where the time of a timeline went, by worker and env.
 
-    Raises:
-        ConfigError: the file is damaged.
+    Which side starves (the trainer, or the envs), the slowest steps, deaths and restarts. Record
+    a timeline by `rollout --trace run.json`, or in a program by `group.trace("run.json")`.
+
+    For example:
+
+        rlightning-aio rollout cartpole.yaml --trace run.json
+        rlightning-aio trace run.json
     """
     summary = _Reader(file).summary()
     if as_json:
