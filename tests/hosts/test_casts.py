@@ -90,7 +90,7 @@ def test_an_env_that_was_rebuilt_is_looked_at_as_well(placement: str) -> None:
         casts = group["e-0"].call
         assert casts(CASTS) == []
         batch, _ = group.step(batch.respond(action=[1]))
-        assert group.metrics()["restarts"] == 1
+        assert group.num_restarts == 1
         batch, _ = group.reset(seed=0)
         assert casts(CASTS) == []
         batch, _ = group.step(batch.respond(action=[0]))

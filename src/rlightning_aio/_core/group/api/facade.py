@@ -353,6 +353,11 @@ class Facade:
             stats.reset_envs()
         return found
 
+    @property
+    def num_restarts(self) -> int:
+        """Number of workers that were replaced, and of envs that were rebuilt, so far."""
+        return sum(record.restarts for record in self._core.supervisor.records)
+
     def get_workers(self) -> list[dict[str, Any]]:
         """The current state of each host: each worker, this process, and each env_server.
 
