@@ -195,12 +195,15 @@ async def test_an_awaited_env_is_said_to_stand_where_it_awaits(
 
 async def test_a_group_that_is_closed_is_asked_nothing(caplog: pytest.LogCaptureFixture) -> None:
     """Also if its answer was due later."""
+    is_closed, answers = False, list[bool]()
     fields = {"task": lambda: Waiting(asyncio.Event()), "placement": "loop"}
     async with rl.build_env_group(entry(None, **fields)) as group:
         await group.reset()
         (record,) = group._core.supervisor.records
-        record.inspect(0, lambda *_: pytest.fail("a closed group has answered"), after=0.01)
-    await asyncio.sleep(0.05)
+        record.inspect(0, lambda *_: answers.append(is_closed), after=0.05)
+    is_closed = True
+    await asyncio.sleep(0.1)
+    assert True not in answers  # On a busy machine, it may have been asked before.
     assert not [one for one in caplog.records if one.name == "asyncio" and one.exc_info]
 
 
