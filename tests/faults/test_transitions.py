@@ -144,4 +144,4 @@ def test_a_vector_env_cuts_the_episode_at_what_was_lost() -> None:
         assert not terminated[lost].any()
         before = shown
     envs.close()
-    assert (num_lost > 0).tolist() == [True, True, True, False]
+    assert (num_lost[:3] > 0).all()
