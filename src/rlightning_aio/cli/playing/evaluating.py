@@ -251,7 +251,7 @@ def _resumed(order: _Order, resume: Path | None, stack: contextlib.ExitStack) ->
     try:
         return stack.enter_context(ResultsFile(resume, about))
     except ConfigError as error:
-        raise ConfigError(str(error).replace("results file", "--resume", 1)) from error
+        raise ConfigError(f"--resume: {error}") from error
 
 
 def _subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:
