@@ -189,12 +189,17 @@ async def test_agents_and_batches_and_calls_take_turns() -> None:
         assert counts == [30, 30, 60, None, None]
 
 
+def pause(monkeypatch: pytest.MonkeyPatch, *, share: float, longest: float, many: int) -> None:
+    """Have results wait for others, as hundreds of long steps do."""
+    for name, value in (("_SHARE", share), ("_LONGEST_PAUSE", longest), ("_MANY", many)):
+        monkeypatch.setattr(agent_steps, name, value)
+
+
 async def test_long_steps_that_end_soon_after_each_other_are_one_batch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where there are hundreds of them."""
-    for name, value in (("_SHARE", 10), ("_LONGEST_PAUSE", 0.5), ("_MANY", 3)):
-        monkeypatch.setattr(agent_steps, name, value)
+    pause(monkeypatch, share=10, longest=0.5, many=3)
     async with rl.build_env_group(Long, num_workers=3, placement="loop") as group:
         await stepped(await episodes(group), [0, 1, 2])
         assert group.get_stats()["batch_size"]["max"] == 3
@@ -203,8 +208,7 @@ async def test_long_steps_that_end_soon_after_each_other_are_one_batch(
 async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_env(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name, value in (("_SHARE", 1000), ("_LONGEST_PAUSE", 30), ("_MANY", 2)):
-        monkeypatch.setattr(agent_steps, name, value)
+    pause(monkeypatch, share=1000, longest=30, many=2)
     async with rl.build_env_group(Long, num_workers=2, placement="loop") as group:
         requests = group._core.parts.tables.requests
         first, other = await episodes(group)
