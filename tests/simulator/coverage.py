@@ -55,12 +55,8 @@ ROWS: Final[dict[str, str]] = {
 }
 """For each row of the table of faults, by its beginning: what is counted where it is reached."""
 
-_REMOTE: Final = ELSEWHERE + "tests/remote, as no program has env_servers"
 _OTHERS: Final = ELSEWHERE + "tests/group/test_aborting.py; programs abort no call of another task"
 OTHERS: Final[dict[str, str]] = {
-    "IDLE COLLECTOR JOINED": _REMOTE,
-    "READY COLLECTOR CLAIMED": _REMOTE,
-    "BUSY COLLECTOR WITHDRAWN": _REMOTE,
     "BUSY TICKET ABORTED": _OTHERS,
     "EnvAborted": _OTHERS,
     "GroupClosed": ELSEWHERE + "tests/group/test_core.py; programs use no closed group",
@@ -70,7 +66,7 @@ OTHERS: Final[dict[str, str]] = {
 """The same for transitions and errors that no program reaches."""
 
 NOT_OF_GROUPS: Final = {
-    "ClientRefused", "EnvAway", "PolicyServerError", "ReplayDiverged",
+    "ClientRefused", "PolicyServerError", "ReplayDiverged",
     "RLightningError", "EnvFault", "ConfigError",
 }  # fmt: skip
 """Errors that are bases of others, or that no group of local envs raises."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -35,9 +35,12 @@ if TYPE_CHECKING:
     from collections import Counter
     from collections.abc import Callable, Iterable, Sequence
 
+    from simulator.clients import Client
+
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.errors import EnvFault
 
+MARKS = {"worker_restarted", "client_lost"}
 COLLECTOR = "collector"
 """Owner of the requests whose results a collect returns."""
 
@@ -110,7 +113,8 @@ class Request:
     """What an env was asked, and by whom.
 
     Attributes:
-        kind: ``step``, ``reset``, ``show`` (a state that was restored) or ``call``.
+        kind: ``step``, ``reset``, ``show`` (a state that was restored), ``call``, or ``join``: of
+            a client that was not asked.
         acts: of a step, one for each sub-environment.
         due: `auto_reset` resets the env in place of its step.
         sent: the policy's columns, one value of each; None if it was no response.
@@ -118,6 +122,7 @@ class Request:
         interrupted: Ctrl-C may have ended it, in an env of this process.
         deaths: of the host, before it was sent.
         before: whether the env was in limbo, and cut, before it was sent.
+        seeds: of which one is its seed: that of a client depends on who else is there.
     """
 
     kind: str
@@ -131,10 +136,15 @@ class Request:
     interrupted: bool = False
     deaths: int = 0
     before: tuple[bool, bool] = (False, False)
+    seeds: Sequence[int] = ()
 
     @property
     def resets(self) -> bool:
         return self.kind == "reset" or self.due
+
+    def alternatives(self) -> list[Request]:
+        """The same with each seed that it may have."""
+        return [replace(self, seed=seed, seeds=()) for seed in self.seeds] or [self]
 
 
 class Expected(NamedTuple):
@@ -282,6 +292,7 @@ class Env:
         loose: states of which it may have one, because a call was given up; torn: the same of a
             restore, after which only a marked result, or one of a reset, may come from them.
         episodes: return and length of each that has ended.
+        client: that lends it, if one does.
     """
 
     env_id: str
@@ -307,10 +318,21 @@ class Env:
     loose: list[State] = field(default_factory=list)
     torn: list[State] = field(default_factory=list)
     episodes: list[tuple[float, int]] = field(default_factory=list)
+    client: Client | None = None
 
     @property
     def idle(self) -> bool:
-        return self.request is None and not self.gone
+        return self.request is None and not self.gone and self.is_known
+
+    @property
+    def is_known(self) -> bool:
+        """The trainer knows its id."""
+        return self.client is None or self.client.session >= 0
+
+    @property
+    def shared_id(self) -> str:
+        """Its id in batches: that of its server if it has one."""
+        return self.env_id.partition("/")[0]
 
     @property
     def may_be_lost(self) -> bool:
@@ -427,6 +449,10 @@ class Model:
         require(env.idle, "a busy env was asked again", env.env_id)
         request.before, request.deaths = (env.limbo, env.state.cut), env.deaths
         context = self.context
+        if env.client is not None:
+            if request.kind == "reset" or context is not None:
+                env.client.asked.append(("reset", 0))
+            env.client.asked.extend(request.acts)
         if request.kind == "step":
             if context is None:
                 env.state.cut = False
@@ -483,6 +509,8 @@ class Model:
             env = self.envs.get(row.env_id)
             require(env is not None, "a result of a stranger", row)
             assert env is not None
+            if env.client is not None and env.request is None:
+                env.client.note_pending(is_pending=True)
             request = env.request
             require(request is not None, "a result that nobody asked for", row)
             assert request is not None
@@ -500,9 +528,13 @@ class Model:
     def _judge(self, env: Env, request: Request, row: Row) -> None:
         restarted = row.restarted
         if restarted is None:
-            restarted = ["worker_restarted" in row.info] * len(row.words)
+            restarted = [bool(row.info.keys() & MARKS)] * len(row.words)
         require(len(set(restarted)) == 1, "restarted in part")
         _check_sent(env, request, row)
+        if env.client is not None:
+            require(restarted[0] == ("client_lost" in row.info), "marked, or not", row)
+            env.client.judge(self, request, row)
+            return
         if restarted[0] and row.info.get("worker_restarted", "")[:7] == "raised ":
             self._judge_restarted(env, request, row)
             return
@@ -512,7 +544,7 @@ class Model:
         require(not env.put_away or request.kind != "step", "a step of an env that has raised")
         is_reset = request.kind == "reset"
         states = env.possible() if is_reset else [env.state, *env.loose]
-        limit = self._limit_of(env)
+        limit = self.limit_of(env)
         now = [state.copy() for state in states]
         played = [state.play(request, limit) for state in now]
         found = [k for k, expected in enumerate(played) if expected.outcome.words == row.words]
@@ -521,7 +553,7 @@ class Model:
         acts = [{effect for effect, _ in state.copy().faults(request)} for state in states]
         found = [k for k in found if not acts[k] & endless]
         require(found, "a result where there is none")
-        _compare(env, played[found[0]], row)
+        compare(env, played[found[0]], row)
         if found[0]:
             env.seen = request.deaths
         env.adopt(*[now[k] for k in found])
@@ -532,7 +564,7 @@ class Model:
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         self._save(env, request)
 
-    def _limit_of(self, env: Env) -> float:
+    def limit_of(self, env: Env) -> float:
         return math.inf if self.context is None else self.context.limit_of(env)
 
     def _played(self, env: Env, request: Request) -> list[Words]:
@@ -570,7 +602,7 @@ class Model:
     def _judge_restarted(self, env: Env, request: Request, row: Row) -> None:
         """Check the result of an env that has raised and was rebuilt."""
         require(env.entry.on_error == "restart", "restarted, where exceptions are raised")
-        self._judge_heads(row)
+        self.judge_heads(row)
         require(row.info["env_at_fault"] == env.env_id, "another env has raised", row.info)
         if not env.put_away:
             require(self._raising(env, request), "restarted, and nothing has raised")
@@ -598,8 +630,9 @@ class Model:
         env.put_away = True
         self.counts["exceptions past max_restarts"] += 1
 
-    def _judge_heads(self, row: Row) -> None:
-        require(isinstance(row.info.get("worker_restarted"), str), "marked without a cause")
+    def judge_heads(self, row: Row, cause: str = "worker_restarted") -> None:
+        """Check that a result is marked in all ways."""
+        require(isinstance(row.info.get(cause), str), "marked without a cause")
         many = len(row.words)
         heads = row.rewards, row.terminated, row.truncated
         require(heads == ([0.0] * many, [False] * many, [True] * many), "not marked in all ways")
@@ -611,7 +644,7 @@ class Model:
         if not env.torn:
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
             require(env.entry.on_death != "raise", "marked, where a death is to be raised")
-        self._judge_heads(row)
+        self.judge_heads(row)
         self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
         shows = "worker_resumed" in row.info
         require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
@@ -765,7 +798,8 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
     require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")
 
 
-def _compare(env: Env, expected: Expected, row: Row) -> None:
+def compare(env: Env, expected: Expected, row: Row) -> None:
+    """Compare a result with what was expected."""
     outcome = expected.outcome
     many = len(outcome.words)
     for what, found, right in (
@@ -831,7 +865,8 @@ def _check_sent(env: Env, request: Request, row: Row) -> None:
 def rows_of(batch: BatchedData, envs: dict[str, Env], flags: Sequence[bool] | None) -> list[Row]:
     """The results of a batch, one by one."""
     env_ids = batch.env_ids()
-    require(batch.ids() == env_ids and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
+    shared = [env_id.partition("/")[0] for env_id in env_ids]
+    require(batch.ids() == shared and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
     require(flags is None or len(flags) == len(env_ids), "as many flags as results", flags)
     names = {envs[env_id].entry.name for env_id in env_ids if env_id in envs}
     parts = [batch] if len(names) == 1 else list(batch.by_entry().values())

@@ -14,7 +14,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import zmq
-from simulator.processes import Process
+from simulator.processes import Killed, Process
 
 from rlightning_aio.remote import client as client_module
 from rlightning_aio.remote.client import RemoteEnvClient
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.net.server_session import ServerSessions
 
-__all__ = ["Network"]
+__all__ = ["ClientProcess", "Network"]
 
 _DIAL_SECONDS: Final = (0.1, 5.0)
 
@@ -57,17 +57,61 @@ class Network:
             (client_module, "recv_monitor_message", lambda monitor, _: monitor.take()),
         ]
 
-    def client(self, make_env: Callable[[], BaseEnv], address: str, name: str) -> Process:
-        """Start a client that lends an env to the env_server at an address."""
+    def client(
+        self,
+        make_env: Callable[[], BaseEnv],
+        address: str,
+        name: str,
+        on_trouble: Callable[[], object] = lambda: None,
+    ) -> ClientProcess:
+        """Start a client that lends an env to the env_server at an address.
+
+        `on_trouble` is called whenever something happens to it that may end its session.
+        """
         host, _, port = address.removeprefix("tcp://").rpartition(":")
 
         def main() -> int:
-            client = RemoteEnvClient(make_env(), host, int(port), name=name)
-            client.run()
-            client.close()
+            try:
+                with RemoteEnvClient(make_env(), host, int(port), name=name) as client:
+                    client.run()
+            except Killed:
+                raise
+            except BaseException as error:  # noqa: BLE001  # The process ends with it.
+                self.world.note("client {} raises {}", name, repr(error))
+                return 1
             return 0
 
-        return Process(self.world, f"client {name}", main, lambda *_: None)
+        return ClientProcess(self.world, f"client {name}", main, on_trouble)
+
+
+class ClientProcess(Process):
+    """The process of a client, whose connection ends with it.
+
+    Args:
+        on_trouble: see `Network.client`.
+    """
+
+    def __init__(
+        self, world: World, name: str, main: Callable[[], int], on_trouble: Callable[[], object]
+    ) -> None:
+        self.on_trouble = on_trouble
+        self.dealer: _Dealer | None = None
+        super().__init__(world, name, main, lambda *_: None)
+
+    def stop(self, seconds: float) -> None:
+        self.on_trouble()
+        super().stop(seconds)
+
+    def end(self, code: int) -> None:
+        if self.alive:
+            self.on_trouble()
+            self.cut()
+        super().end(code)
+
+    def cut(self) -> None:
+        """Break its connection."""
+        if self.dealer is not None:
+            self.dealer.cut()
 
 
 class _Connection:
@@ -103,6 +147,7 @@ class _Connection:
         if not self.is_up:
             return
         self.is_up = False
+        self.dealer.process.on_trouble()
         world = self._world
         world.counts["cuts"] += 1
         world.note("the connection of {} breaks", self.dealer.process.name)
@@ -220,8 +265,9 @@ class _Dealer:
 
     def __init__(self, network: Network) -> None:
         running = network.world.running
-        assert isinstance(running, Process)
+        assert isinstance(running, ClientProcess)
         self.process = running
+        running.dealer = self
         self._network = network
         self._monitor = _Monitor()
         self._connection: _Connection | None = None
@@ -255,6 +301,10 @@ class _Dealer:
     def disconnect(self, address: str) -> None:
         del address
         self._attempt += 1
+        self.cut()
+
+    def cut(self) -> None:
+        """Break the connection, if there is one."""
         if self._connection is not None:
             self._connection.cut()
 

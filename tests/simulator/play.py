@@ -51,6 +51,7 @@ from rlightning_aio.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Sequence
 
+    from simulator.clients import Client
     from simulator.program import Op
 
 
@@ -78,7 +79,15 @@ class Play(Session):
         calm = calm and not {"snapshots", "die"} <= self.features  # States that are put back kill.
         starts_fail = faults != Faults()
         self.model = Model(self.envs, self.counts, starts_fail=starts_fail, calm=calm)
-        require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
+        ids = list(dict.fromkeys(env.shared_id for env in self.envs))
+        require(ids == self.group.env_ids, "ids", self.group.env_ids)
+        self.clients = [env.client for env in self.envs if env.client is not None]
+        if self.clients:
+            self.address = self.group[ids[-1]].address
+            rng = Random(self.program.seed)
+            for client in self.clients:
+                if rng.random() < 0.7:
+                    client.start(self.address)
 
     async def play(self, number: int, op: Op) -> None:
         await super().play(number, op)
@@ -103,6 +112,8 @@ class Play(Session):
         await super().close()
 
     def end(self) -> None:
+        for client in self.clients:
+            client.check_done()
         for columns, copies in self.kept:
             require(same(columns, copies), "a result was overwritten", columns, copies)
         for part, sent in self.unread:
@@ -124,8 +135,10 @@ class Play(Session):
         # An episode steps in a task of its own, so its results are handed out a little earlier. An
         # env whose worker has died takes no further part in a restore.
         nested = {env.env_id for env in owed if env.env_id in self.nested or self.is_lost(env)}
-        pending = {env.env_id for env in owed} - nested
         found = set(self.group.pending) - nested
+        for client in self.clients:
+            client.note_pending(is_pending=client.env.env_id in found)
+        pending = {env.env_id for env in self.model.pending()} - nested
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
 
     def is_lost(self, env: Env) -> bool:
@@ -140,6 +153,8 @@ class Play(Session):
             await self.interruptible(self.collect(deadline=self.hang))
         if self.context is not None:
             self.leave()
+        for client in self.clients:
+            await self.expect(client)
         for env in self.model.envs.values():
             # Errors of the env, or of a call that was given up, may come first; and each call may
             # send no more of the order to start than a narrow channel takes.
@@ -157,6 +172,19 @@ class Play(Session):
         while env.request is not None:
             await self.collect(deadline=self.hang)
         return await self.reset([env]) and await self.step_on([env])
+
+    async def expect(self, client: Client) -> None:
+        """Have a client be there, and what it still owes collected."""
+        if not client.is_alive:
+            client.start(self.address)
+        for _ in range(100):
+            if client.env.request is None and not client.may_be_lost:
+                return
+            await self.interruptible(self.collect(deadline=30.0))
+            self.check_pending()
+            if client.env.idle and client.may_be_lost:
+                await self.interruptible(self.reset([client.env]))
+        raise Violation(f"client {client.name} does not come")
 
     # -- comparing
 
@@ -301,6 +329,10 @@ class Play(Session):
         """Envs that can be stepped."""
         return [env for env in self.model.idle() if env.was_reset and not env.dirty]
 
+    def local(self, envs: list[Env]) -> list[Env]:
+        """Those that no client lends."""
+        return [env for env in envs if env.client is None]
+
     def some(self, rng: Random, envs: list[Env]) -> list[Env]:
         """All of these envs, or some in any order."""
         if "partial steps" not in self.features or rng.random() < 0.4:
@@ -332,7 +364,7 @@ class Play(Session):
             return batch.respond(**self.written), requests
         self.written = {}
         values = [PolicyResponse(env.env_id, **own) for env, own in zip(envs, sent, strict=True)]
-        return BatchedData([env.env_id for env in envs], values), requests
+        return BatchedData([env.shared_id for env in envs], values), requests
 
     def answerable(self, rng: Random, envs: list[Env]) -> BatchedData | None:
         """A batch of results, or a part of one, that has only such envs."""
@@ -440,6 +472,8 @@ class Play(Session):
                 await self.done(self.group.collect_async(**rules))
             return
         self.collecting, nothing = True, not self.collectable()
+        if nothing and self.clients:  # It waits for one to join.
+            rules = {"deadline": 30.0} | rules
         try:
             batch, flags = await self.done(self.group.collect_async(**rules))
         except TimeoutError as error:
@@ -459,6 +493,7 @@ class Play(Session):
         except NothingPending as error:
             self.count(error)
             require(nothing or not self.collectable(), "nothing pending, and something is")
+            require(not self.clients, "nothing pending, and clients may join")
             return
         finally:
             self.collecting = False
@@ -476,12 +511,16 @@ class Play(Session):
 
     def check_count(self, batch: BatchedData, rules: dict[str, Any]) -> None:
         """As many results as the rules say."""
-        there = len(self.collectable())
-        most = min(rules.get("max_results") or there, there)
+        there = {env.env_id for env in self.collectable()}
+        for env_id in {*batch.env_ids()} - there:
+            require(self.model.envs[env_id].client, "a result that nobody asked for", env_id)
+        most = min(rules.get("max_results") or len(there), len(there))
         need = most if rules.get("wait_all") else min(rules.get("min_results", 1), most)
+        most = len(there.union(batch.env_ids()))
+        most = min(rules.get("max_results") or most, most)
         require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
-        order = list(self.model.envs)
-        places = [order.index(env_id) for env_id in batch.env_ids()]
+        order = [env_id for env_id, env in self.model.envs.items() if env.client is None]
+        places = [order.index(env_id) for env_id in batch.env_ids() if env_id in order]
         require(places == sorted(places), "not in the group's order", places)
 
     async def op_reset(self, rng: Random) -> None:
@@ -519,6 +558,10 @@ class Play(Session):
         if kind == "int":
             seed = rng.randrange(1000)
             seeds = [seed + env.first for env in envs]
+            first = sum(len(env.codes) for env in self.local(self.envs))
+            for env in envs:
+                if env.client is not None:
+                    requests[env.env_id].seeds = [seed + first + k for k in range(3)]
         elif kind == "list":
             seed = seeds = [rng.randrange(1000) for _ in envs]
         elif kind == "mapping":
@@ -572,7 +615,10 @@ class Play(Session):
         if not envs:
             return
         env, token = rng.choice(envs), rng.randrange(TOKENS)
-        if "raise" in self.features and rng.random() < 0.3:
+        if env.client is not None:
+            with self.expected(NotImplementedError, "a call of a client's method"):
+                await self.done(self.group[env.env_id].call("peek", token))
+        elif "raise" in self.features and rng.random() < 0.3:
             await self.call_fault(env, "raise", token)
         elif "die" in self.features and env.host.mortal and self.plan(env).placement != "loop":
             await self.call_fault(env, rng.choice(["plain", *DYING]), token)
@@ -612,7 +658,7 @@ class Play(Session):
         require(tuple(echo) == (token,), "another call's arguments", echo)
 
     async def op_send_calls(self, rng: Random) -> None:
-        envs = self.some(rng, self.model.idle())
+        envs = self.some(rng, self.local(self.model.idle()))
         if not envs or self.collecting_calls:
             return
         token = rng.randrange(TOKENS)
@@ -666,7 +712,7 @@ class Play(Session):
             self.take_value(env, value, token)
 
     async def op_mark(self, rng: Random) -> None:
-        envs = self.model.idle()
+        envs = self.local(self.model.idle())
         if not envs:
             return
         env = rng.choice(envs)
@@ -730,7 +776,7 @@ class Play(Session):
 
     async def op_episode(self, rng: Random) -> None:
         """Play an episode as an agent that is one coroutine."""
-        envs = self.model.idle()
+        envs = self.local(self.model.idle())
         if not envs or not self.is_async:
             return
         env = rng.choice(envs)
@@ -1036,14 +1082,14 @@ class Play(Session):
 
     async def op_misuse(self, rng: Random) -> None:
         """What is refused changes nothing."""
-        envs = self.some(rng, self.ready())
+        envs = self.some(rng, self.local(self.ready()))
         if not envs:
             return
         batch, _ = self.response(rng, envs)
         ids, values = list(batch.env_ids()), list(batch.values())
         # Of some, the results are handed out a little earlier; see `check_pending`.
         known = [one for one in self.model.pending() if one.env_id not in self.nested]
-        busy = [one for one in known if not self.is_lost(one)]
+        busy = [one for one in self.local(known) if not self.is_lost(one)]
         sized = ("vector", "single", "digits", "number")
         fits = [k for k, i in enumerate(ids) if self.model.envs[i].entry.controls in sized]
         kinds = ["unknown", "double", "count"] + ["shape"] * bool(fits)
@@ -1081,6 +1127,12 @@ class Play(Session):
         limbo = any(env.limbo and env.host.mortal for env in envs)
         with self.expected((wrong, WorkerDied, *[EnvBusy] * limbo), kind):
             self.group.step_async(BatchedData(ids, values))
+
+    async def op_client(self, rng: Random) -> None:
+        """Start a client, or do something to it."""
+        client = rng.choice(self.clients)
+        if not client.is_alive:
+            client.start(self.address)
 
     async def op_look(self, rng: Random) -> None:
         """What is asked of a group without waiting."""

@@ -11,6 +11,7 @@ from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
+from simulator.clients import Client
 from simulator.model import Entry, Env, Host, State
 from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, TIMEOUT, broken
 from simulator.world import Faults
@@ -26,6 +27,8 @@ FEATURES = (
     "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
     "interrupts",
 )  # fmt: skip
+CLIENTS: Final = "clients"
+"""A feature of few groups, beside those of `FEATURES`; see `_with_clients`."""
 _OF_OTHERS = (("resume", "die", "processes", "ends", "stacked"), ("processes", "hang", "faults"))
 THEMES: dict[str, tuple[tuple[str, ...], ...]] = {
     "group": (
@@ -83,6 +86,7 @@ class Plan:
     on_error: str = "raise"
     timeout: float | None = None
     start: str = ""
+    heartbeat: float = 5.0
 
     def config(self, number: int) -> dict[str, Any]:
         """The fields of the entry, the `number`-th."""
@@ -123,6 +127,15 @@ class Plan:
             found["start_timeout"] = 5.0
         return found | {"task": makers}
 
+    def served(self) -> dict[str, Any]:
+        """The fields of an env_server."""
+        found = {
+            "name": self.name, "backend": "env_server", "max_episode_steps": self.limit,
+            "step_timeout": self.timeout, "reset_timeout": self.timeout,
+            "env_kwargs": {"heartbeat": self.heartbeat, "connect_timeout": 900.0},
+        }  # fmt: skip
+        return {name: value for name, value in found.items() if value is not None}
+
     def codes(self, number: int, worker: int) -> list[int]:
         """Of the sub-environments of one env."""
         first = number * 64 + worker * (8 if self.form == "stacked" else 1)
@@ -154,7 +167,10 @@ class Program:
     faults: Faults
 
     def configs(self) -> list[dict[str, Any]]:
-        return [plan.config(number) for number, plan in enumerate(self.plans)]
+        return [
+            plan.served() if plan.placement == "client" else plan.config(number)
+            for number, plan in enumerate(self.plans)
+        ]
 
     def envs(self, workers: list[dict[str, Any]], world: World | None) -> list[Env]:
         """The model's envs, on the hosts that `get_workers` names."""
@@ -173,6 +189,10 @@ class Program:
             entry = plan.entry()
             for worker in range(plan.num_workers):
                 env_id, codes = f"{plan.name}-{worker}", plan.codes(number, worker)
+                if plan.placement == "client":
+                    assert world is not None
+                    envs.append(Client(world, worker, entry).env)
+                    continue
                 # On an event loop each is replaced alone.
                 host = Host(mortal=True) if plan.placement == "loop" else host_of[env_id]
                 envs.append(Env(env_id, entry, codes, first, host, State(codes, entry)))
@@ -206,6 +226,7 @@ OPS: dict[str, tuple[int, str | None]] = {
     "look": (3, None),
     "trace": (2, "timeline"),
     "kill": (3, "die"),
+    "client": (4, CLIENTS),
 }
 """Weight of each operation of a group, and the feature that it needs."""
 ROWS: dict[str, tuple[int, str | None]] = {
@@ -222,6 +243,8 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
 """Kinds of programs: the weight of each, and its operations; see `draw` for that of attempts."""
 _ATTEMPTS: Final = 0.06
 """The share of programs that are of attempts, in place of what else they would be."""
+_CLIENTS: Final = 0.2
+"""The share of programs of groups that have clients."""
 
 
 def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60) -> Program:
@@ -248,6 +271,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
+    if kind == "group" and apart.random() < _CLIENTS:
+        features, plans = _with_clients(apart, features, plans)
     ops_of_kind = KINDS[kind][1]
     names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
     # A few of them make up most of a program.
@@ -279,6 +304,26 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
     if plan.form == "stacked" and kind == "sb3":
         plan = replace(plan, mode="same_step")
     return features, [plan]
+
+
+def _with_clients(
+    rng: Random, features: frozenset[str], plans: list[Plan]
+) -> tuple[frozenset[str], list[Plan]]:
+    """The same and an env_server, perhaps in place of all else."""
+    robots = Plan(
+        "robots", "base", rng.choice([*FIXED, "number", "text", "part"]),
+        rng.choice([c for c in CONTROLS if c != "anything"]), num_workers=rng.randint(1, 3),
+        limit=rng.choice([None, 3]), placement="client", heartbeat=rng.choice([5.0, 30.0]),
+    )  # fmt: skip
+    features = features - _UNLIKE_CLIENTS | {CLIENTS}
+    return features, [*(plans if rng.random() < 0.6 else ()), robots]
+
+
+_UNLIKE_CLIENTS: Final = {
+    "cancel", "timeouts", "tasks", "interrupts", "snapshots", "die", "hang", "raise", "rubbish",
+    "faults",
+}  # fmt: skip
+"""Features that programs with clients leave out."""
 
 
 def _restarted(rng: Random, plan: Plan) -> Plan:

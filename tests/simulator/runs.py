@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from simulator.attempting import Attempts
 from simulator.coverage import watch
 from simulator.play import Play
-from simulator.program import draw
+from simulator.program import CLIENTS, draw
 from simulator.training import Evaluations, Training
 from simulator.vectors import Singles, Vectors
 from simulator.world import World
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from simulator.session import Session
 
 
-WORLDLY: Final = frozenset({"ray", "faults"})
+WORLDLY: Final = frozenset({"ray", "faults", CLIENTS})
 """Features that only a world has."""
 
 SESSIONS: Final[dict[str, type[Session]]] = {

@@ -641,9 +641,13 @@ class ScriptedBase(BaseEnv):
         observation, info = self.env.reset(seed=seed, options=options)
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
-    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+    def act_of(self, policy_resp: PolicyResponse) -> Act:
+        """What a response has it do."""
         effect, token = decoded(self.env.controls, self._preprocess_fn(policy_resp))
-        token = (token + int(getattr(policy_resp, "shift", 0))) % TOKENS
+        return effect, (token + int(getattr(policy_resp, "shift", 0))) % TOKENS
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        effect, token = self.act_of(policy_resp)
         perform(effect, token)
         observation, reward, terminated, truncated, info = self.env._stepped((effect, token))
         return EnvRet(

@@ -1,0 +1,221 @@
+"""Clients of an env_server: what they lend, what happens to them, and what a group may show of it.
+
+A client lives in processes of the world, one after the other, and has sessions with the server. As
+a session begins, its env is reset, and that result answers no request. A session may end only if
+something has happened to it: a broken connection, a stop or an end of the process, a request that
+took too long, or the trainer's abort. Then its client's next result is marked, and what follows is
+the first result of a later session.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from simulator.model import COLLECTOR, Env, Host, Request, State, compare, require
+from simulator.scripted import RAISING, ScriptedBase
+
+from rlightning_aio import EnvConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from simulator.model import Entry, Expected, Model, Row
+    from simulator.network import ClientProcess
+    from simulator.scripted import Script
+    from simulator.world import World
+
+    from rlightning_aio import EnvRet, PolicyResponse
+
+__all__ = ["Client"]
+
+_FIRST_CODE = 1024
+"""Each process of a client has another code, so that their states differ."""
+
+
+class Begun(NamedTuple):
+    """A session: its env before the reset that begins it, and the client's troubles until then."""
+
+    before: State
+    troubles: int
+
+
+class Lent(ScriptedBase):
+    """The env that a client lends, which notes what is done to it."""
+
+    def __init__(self, client: Client, code: int) -> None:
+        entry = client.env.entry
+        kwargs = {"first_code": code, "layout": entry.layout, "controls": entry.controls}
+        config = EnvConfig(name="lent", backend="simulated", task="-", env_kwargs=kwargs)
+        super().__init__(config)
+        self.is_finished = False
+        self._client = client
+        self._troubles: int | None = client.troubles
+
+    @property
+    def script(self) -> Script:
+        return self.env.scripts.subs[0]
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> EnvRet:
+        if self._troubles is None:
+            self._client.done.append(("reset", 0))
+        else:
+            before = State([self.script.code], self._client.env.entry)
+            before.scripts.subs = [self.script]
+            self._client.sessions.append(Begun(before.copy(), self._troubles))
+            self._troubles = None
+        return super().reset(seed=seed, options=options)
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        self._client.done.append(self.act_of(policy_resp))
+        return super().step(policy_resp)
+
+    def on_disconnect(self) -> None:
+        self._troubles = self._client.troubles
+
+    def is_finish(self) -> bool:
+        return self.is_finished
+
+
+class Client:
+    """One client, by its name at the server.
+
+    Args:
+        number: among the clients of its server.
+        entry: of that server.
+
+    Attributes:
+        name: at the server.
+        env: what the model knows of its env.
+        sessions: that have begun at the client.
+        session: whose results the trainer has got last; -1 before the first.
+        is_out: the trainer knows that it has ended.
+        withdrawn: what was sent to it since then.
+        troubles: what has happened to it that may end a session.
+        asked, done: steps and resets that were sent, and that were executed, in order.
+    """
+
+    def __init__(self, world: World, number: int, entry: Entry) -> None:
+        self.name = f"c{number}"
+        codes, host = [_FIRST_CODE + 256 * number], Host(mortal=False)
+        env_id, state = f"{entry.name}-0/{self.name}", State(codes, entry)
+        self.env = Env(env_id, entry, codes, -1, host, state, client=self)
+        self.sessions: list[Begun] = []
+        self.session = -1
+        self.is_out = True
+        self.withdrawn: dict[str, Any] | None = None
+        self.troubles = 0
+        self.asked: deque[tuple[str, int]] = deque()
+        self.done: list[tuple[str, int]] = []
+        self.process: ClientProcess | None = None
+        self._world = world
+        self._lent: Lent | None = None
+        self._code = codes[0]
+
+    # -- the client -----------------------------------------------------------------
+
+    @property
+    def is_alive(self) -> bool:
+        return self.process is not None and self.process.alive
+
+    def start(self, address: str) -> None:
+        """Start another process of it."""
+        self._code += 1
+        self._lent = lent = Lent(self, self._code)
+        self.process = self._world.network.client(
+            lambda: lent, address, self.name, self._note_trouble
+        )
+
+    def leave(self) -> None:
+        """Have it end in order, soon."""
+        assert self._lent is not None
+        self._note_trouble()
+        self._lent.is_finished = True
+
+    def _note_trouble(self) -> None:
+        self.troubles += 1
+
+    # -- what the trainer may see ---------------------------------------------------
+
+    @property
+    def may_be_lost(self) -> bool:
+        """The session that the trainer knows may have ended."""
+        return self.is_out or self.troubles > self.sessions[self.session].troubles
+
+    @property
+    def may_be_back(self) -> bool:
+        return self.session + 1 < len(self.sessions)
+
+    def note_pending(self, *, is_pending: bool) -> None:
+        """Note whether a result of it waits or is awaited, which may be without a request."""
+        request = self.env.request
+        if is_pending and request is None:
+            require(self.may_be_back, "pending, and nobody has asked or come", self.env.env_id)
+            self.env.request = Request("join", sent=self.withdrawn)
+        elif not is_pending and request is not None and request.owner == COLLECTOR:
+            gone = self.is_out or (request.resets and self.may_be_lost)
+            require(gone and request.kind != "join", "nobody answers", self.env.env_id, request)
+            self.withdraw(request)
+
+    def withdraw(self, request: Request) -> None:
+        """Note that it is away: its next first result answers the request."""
+        self.withdrawn, self.is_out, self.env.request = request.sent, True, None
+
+    def judge(self, model: Model, request: Request, row: Row) -> None:
+        """Compare a result with what was asked of its env, and with what it has done."""
+        env = self.env
+        if "client_lost" in row.info:
+            self._judge_lost(model, request, row)
+            return
+        played = list(self._played(model, request))
+        found = [one for one in played if one[2].outcome.words == row.words]
+        require(found, "in none of the states", [tuple(one[2].outcome.words[0]) for one in played])
+        number, state, expected = found[0]
+        effects = [effect for effect, _ in request.acts] if number == self.session else []
+        require(not {*effects} & {*RAISING, "rubbish"}, "a result where there is none")
+        if env.first < 0 and row.index is not None:
+            others = [other.first + len(other.codes) for other in model.envs.values()]
+            require(row.index[0] not in [n - 1 for n in others], "the index of another", row.index)
+            env.first = row.index[0]
+        compare(env, expected, row)
+        env.episodes += [episode for episode in expected.episodes if episode is not None]
+        model.counts["first results"] += number != self.session
+        self.session, self.is_out, self.withdrawn = number, False, None
+        env.adopt(state)
+
+    def _played(self, model: Model, request: Request) -> Iterator[tuple[int, State, Expected]]:
+        """How a result may have come about: of which session it is, and the state after it."""
+        if not self.is_out and request.kind != "join":
+            for one in request.alternatives():
+                state = self.env.state.copy()
+                yield self.session, state, state.play(one, model.limit_of(self.env))
+        is_plain = request.seed is None and not request.options and not request.seeds
+        for number in range(self.session + 1, len(self.sessions)):
+            state = self.sessions[number].before.copy()
+            first = state.play(Request("reset"))
+            if self.is_out or (is_plain and request.resets):
+                yield number, state, first
+            if request.resets or (self.is_out and model.context is not None):
+                for one in request.alternatives():
+                    again = state.copy()
+                    yield number, again, again.play(replace(one, due=True))
+
+    def _judge_lost(self, model: Model, request: Request, row: Row) -> None:
+        require(not self.is_out, "lost again, and it was not back")
+        require(self.may_be_lost, "lost, and nothing has happened to it", self.troubles)
+        model.judge_heads(row, "client_lost")
+        seen = [self.env.state.scripts.words]
+        if request.resets:  # Which may have dropped a first result.
+            seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
+        require(row.words in seen, "not its last observation", seen)
+        self.is_out, self.env.dirty = True, False
+        model.counts["clients lost"] += 1
+
+    def check_done(self) -> None:
+        """What it was asked was done once at most, in order, and nothing else."""
+        for act in self.done:
+            while self.asked and self.asked[0] != act:
+                self.asked.popleft()
+            require(self.asked, "done, and not asked, or twice", self.env.env_id, act)
+            self.asked.popleft()
