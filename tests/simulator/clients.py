@@ -68,7 +68,10 @@ class Lent(ScriptedBase):
         return super().reset(seed=seed, options=options)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        self._client.done.append(self.act_of(policy_resp))
+        act = self.act_of(policy_resp)
+        self._client.done.append(act)
+        if act[0] == "hang":
+            self._client.note_hang()
         return super().step(policy_resp)
 
     def on_disconnect(self) -> None:
@@ -93,6 +96,7 @@ class Client:
         is_out: the trainer knows that it has ended.
         withdrawn: what was sent to it since then.
         troubles: what has happened to it that may end a session.
+        hangs: its env does not return any more.
         asked, done: steps and resets that were sent, and that were executed, in order.
     """
 
@@ -109,6 +113,7 @@ class Client:
         self.asked: deque[tuple[str, int]] = deque()
         self.done: list[tuple[str, int]] = []
         self.process: ClientProcess | None = None
+        self.hangs = False
         self._world = world
         self._lent: Lent | None = None
         self._code = codes[0]
@@ -123,6 +128,7 @@ class Client:
         """Start another process of it."""
         self._code += 1
         self._lent = lent = Lent(self, self._code)
+        self.hangs = False
         self.process = self._world.network.client(
             lambda: lent, address, self.name, self._note_trouble
         )
@@ -135,6 +141,11 @@ class Client:
 
     def _note_trouble(self) -> None:
         self.troubles += 1
+
+    def note_hang(self) -> None:
+        """Note that its env does not return any more."""
+        self.troubles += 1
+        self.hangs = True
 
     # -- what the trainer may see ---------------------------------------------------
 
@@ -161,6 +172,13 @@ class Client:
     def withdraw(self, request: Request) -> None:
         """Note that it is away: its next first result answers the request."""
         self.withdrawn, self.is_out, self.env.request = request.sent, True, None
+
+    def note_away(self, request: Request) -> None:
+        """Check an error that says that it is not connected."""
+        gone = self.is_out or (request.resets and self.may_be_lost)
+        require(gone, "away, and its loss was not reported", self.env.env_id, request)
+        self.withdrawn = None if self.withdrawn is None else request.sent
+        self.is_out = True
 
     def judge(self, model: Model, request: Request, row: Row) -> None:
         """Compare a result with what was asked of its env, and with what it has done."""
@@ -202,14 +220,15 @@ class Client:
                     yield number, again, again.play(replace(one, due=True))
 
     def _judge_lost(self, model: Model, request: Request, row: Row) -> None:
-        require(not self.is_out, "lost again, and it was not back")
+        # A reset may be sent to one that is about to come back.
+        require(not self.is_out or request.resets, "lost again, and it was not back")
         require(self.may_be_lost, "lost, and nothing has happened to it", self.troubles)
         model.judge_heads(row, "client_lost")
         seen = [self.env.state.scripts.words]
         if request.resets:  # Which may have dropped a first result.
             seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
         require(row.words in seen, "not its last observation", seen)
-        self.is_out, self.env.dirty = True, False
+        self.is_out, self.env.dirty, self.withdrawn = True, False, None
         model.counts["clients lost"] += 1
 
     def check_done(self) -> None:

@@ -29,7 +29,7 @@ from simulator.scripted import (
     words_of,
 )
 
-from rlightning_aio.errors import EnvHung, EnvRaised, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvHung, EnvRaised, WorkerDied
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -446,7 +446,8 @@ class Model:
 
     def send(self, env: Env, request: Request) -> None:
         """Note a request that was accepted."""
-        require(env.idle, "a busy env was asked again", env.env_id)
+        is_idle = env.idle or not (env.is_known or env.request)
+        require(is_idle, "a busy env was asked again", env.env_id)
         request.before, request.deaths = (env.limbo, env.state.cut), env.deaths
         context = self.context
         if env.client is not None:
@@ -730,10 +731,15 @@ class Model:
             self.gone(env, fault)
             env.seen = max(env.seen + 1, request.deaths)
             return
+        if env.client is not None and isinstance(fault, EnvAway):
+            env.client.note_away(request)
+            return
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
-        if request.kind == "call":
-            return
+        if request.kind != "call":
+            self._judge_raised(env, request, fault)
+
+    def _judge_raised(self, env: Env, request: Request, fault: EnvRaised) -> None:
         if request.interrupted and fault.exception_type == "KeyboardInterrupt":
             self.counts["Ctrl-C in an env"] += 1
             after = [state.copy() for state in (env.state, *env.loose)]

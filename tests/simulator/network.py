@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import zmq
 from simulator.processes import Killed, Process
 
+from rlightning_aio.protocol.net.wire import PINGS_PER_HEARTBEAT
 from rlightning_aio.remote import client as client_module
 from rlightning_aio.remote.client import RemoteEnvClient
 
@@ -101,11 +102,14 @@ class ClientProcess(Process):
     def stop(self, seconds: float) -> None:
         self.on_trouble()
         super().stop(seconds)
+        if self.dealer is not None and seconds > self.dealer.silence:
+            self.world.after(self.dealer.silence, self.cut)
 
     def end(self, code: int) -> None:
-        if self.alive:
+        if self.alive and self.dealer is not None:
             self.on_trouble()
-            self.cut()
+            is_machine = self.world.rng.random() < 0.3  # Then nobody says that it is gone.
+            self.world.after(self.dealer.silence if is_machine else 0.0, self.cut)
         super().end(code)
 
     def cut(self) -> None:
@@ -166,6 +170,7 @@ class _Listener:
         self.connections: dict[bytes, _Connection] = {}
         self._network = network
         self._sessions = sessions
+        self.silence = 3 * settings.heartbeat / PINGS_PER_HEARTBEAT
         self._port = settings.port
         self._descriptor = -1
         self._has_more = False
@@ -278,6 +283,11 @@ class _Dealer:
 
     def set(self, option: int, value: Any) -> None:
         """Do nothing: all options are about what is not simulated."""
+
+    @property
+    def silence(self) -> float:
+        """Seconds after which heartbeats of ZMQ break the connection to an end that is silent."""
+        return 0.0 if self._connection is None else self._connection.listener.silence
 
     def get_monitor_socket(self) -> _Monitor:
         return self._monitor

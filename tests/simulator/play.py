@@ -136,10 +136,16 @@ class Play(Session):
         # env whose worker has died takes no further part in a restore.
         nested = {env.env_id for env in owed if env.env_id in self.nested or self.is_lost(env)}
         found = set(self.group.pending) - nested
-        for client in self.clients:
-            client.note_pending(is_pending=client.env.env_id in found)
+        self.note_clients()
         pending = {env.env_id for env in self.model.pending()} - nested
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
+
+    def note_clients(self) -> None:
+        """Note which clients have joined, and which requests were withdrawn from absent ones."""
+        if self.clients:
+            pending = self.group.pending
+            for client in self.clients:
+                client.note_pending(is_pending=client.env.env_id in pending)
 
     def is_lost(self, env: Env) -> bool:
         """A call waits for it that its worker may have been lost in."""
@@ -175,15 +181,15 @@ class Play(Session):
 
     async def expect(self, client: Client) -> None:
         """Have a client be there, and what it still owes collected."""
-        if not client.is_alive:
-            client.start(self.address)
-        for _ in range(100):
-            if client.env.request is None and not client.may_be_lost:
+        for _ in range(30):
+            if client.hangs and client.process is not None:
+                client.process.end(-9)
+            if not client.is_alive:
+                client.start(self.address)
+            if client.env.idle and await self.reset([client.env]) and not client.is_out:
                 return
-            await self.interruptible(self.collect(deadline=30.0))
+            await self.collect(deadline=30.0)
             self.check_pending()
-            if client.env.idle and client.may_be_lost:
-                await self.interruptible(self.reset([client.env]))
         raise Violation(f"client {client.name} does not come")
 
     # -- comparing
@@ -208,10 +214,20 @@ class Play(Session):
             if next(iter(requests.values())).kind == "call":
                 self.fail_values(fault, requests)
             else:
+                if next(iter(requests.values())).kind == "reset":
+                    results = [] if fault.results is None else fault.results.env_ids()
+                    named = [env_id for one in (fault, *fault.others) for env_id in ids_of(one)]
+                    there = self.there(requests, [*results, *named])
+                    requests = {env_id: requests[env_id] for env_id in there}
                 self.fail(fault, requests, owner)
             return False
         except EnvBusy:
             self.refuse_busy(requests)
+            return False
+        except TimeoutError as error:  # Of a reset of everyone.
+            require(all(client.may_be_lost for client in self.clients), "too few", repr(error))
+            self.counts["too few clients"] += 1
+            self.withdraw(requests)
             return False
         except asyncio.CancelledError:
             self.model.orphan(owner)
@@ -471,6 +487,7 @@ class Play(Session):
             with self.expected(RLightningError, "a second collect"):
                 await self.done(self.group.collect_async(**rules))
             return
+        self.note_clients()
         self.collecting, nothing = True, not self.collectable()
         if nothing and self.clients:  # It waits for one to join.
             rules = {"deadline": 30.0} | rules
@@ -529,17 +546,34 @@ class Play(Session):
             await self.reset(envs, rng)
 
     async def reset(self, envs: list[Env], rng: Random | None = None) -> bool:
+        others = [env for env in self.model.envs.values() if all(env is not e for e in envs)]
+        everyone = all(map(is_unasked, others)) and rng is not None and rng.random() < 0.7
+        if everyone:  # Also clients that may have joined.
+            envs = list(self.model.envs.values())
+            for env in others:
+                env.request = None
         seed, options, requests = self.resets(envs, rng)
-        everyone = len(envs) == len(self.model.envs) and envs == list(self.model.envs.values())
-        ids = None if everyone and rng is not None and rng.random() < 0.7 else [*requests]
+        ids = None if everyone else [*requests]
 
         def take(found: Any) -> None:
             batch, flags = found
-            require(flags == [False] * len(envs), "flags", flags)
-            require(batch.env_ids() == [*requests], "another order", batch.env_ids())
-            self.take(batch, flags, self.owner_of(requests))
+            require(flags == [False] * len(batch), "flags", flags)
+            owner = self.owner_of(requests)
+            there = self.there(requests, batch.env_ids()) if everyone else requests
+            require(sorted(batch.env_ids()) == sorted(there), "other envs", batch.env_ids())
+            local = [env_id for env_id in batch.env_ids() if self.model.envs[env_id].client is None]
+            require(local == [i for i in there if i in local], "another order", batch.env_ids())
+            self.take(batch, flags, owner)
 
         return await self.answer(requests, lambda: self.group.reset(seed, options, ids), take)
+
+    def there(self, requests: dict[str, Request], found: Iterable[str]) -> list[str]:
+        """Those that were asked: all, but for clients that were not there."""
+        envs = [self.model.envs[env_id] for env_id in {*requests} - {*found}]
+        for env in envs:
+            if env.client is not None and env.client.may_be_lost:
+                self.model.withdraw(env)
+        return [env_id for env_id in requests if self.model.envs[env_id].request is not None]
 
     def resets(
         self, envs: list[Env], rng: Random | None
@@ -554,7 +588,8 @@ class Play(Session):
             if "raise" in self.features and rng.random() < 0.3:
                 options["effect"] = rng.choice(["raise", "raise oddly"])
         seed: Any = None
-        kind = rng.choice(["none", "int", "list", "mapping"])
+        is_known = all(env.client is None for env in envs) or len(envs) < len(self.model.envs)
+        kind = rng.choice(["none", "int", *["list", "mapping"] * is_known])
         if kind == "int":
             seed = rng.randrange(1000)
             seeds = [seed + env.first for env in envs]
@@ -584,9 +619,16 @@ class Play(Session):
     async def op_enter(self, rng: Random) -> None:
         if self.nested:
             return
-        entries = [env.entry for env in self.model.envs.values()]
-        lacks = any(e.limit is None and e.mode == "disabled" for e in entries)
-        limit = rng.choice([math.inf, 1, 2, 3, 5, *[None] * (1 if lacks else 6)])
+        lacking = [
+            env
+            for env in self.model.envs.values()
+            if env.entry.limit is None and env.entry.mode == "disabled"
+        ]
+        lacks = bool(lacking)
+        own = [None] * (1 if lacks else 6)
+        if lacks and not any(env.is_known for env in lacking):  # One may join at any moment.
+            own = []
+        limit = rng.choice([math.inf, 1, 2, 3, 5, *own])
         on_done = rng.random() < 0.7
         context = self.group.auto_reset(limit, on_done)
         if self.context is not None:
@@ -1130,9 +1172,22 @@ class Play(Session):
 
     async def op_client(self, rng: Random) -> None:
         """Start a client, or do something to it."""
-        client = rng.choice(self.clients)
-        if not client.is_alive:
+        client, process = rng.choice(self.clients), None
+        process = client.process
+        if process is None or not process.alive:
             client.start(self.address)
+            return
+        kind = rng.choice(["cut", "stop", "kill", "leave", "nothing"])
+        self.counts[f"clients: {kind}"] += 1
+        delay = rng.choice([0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0])
+        act = {
+            "cut": process.cut,
+            "stop": partial(process.stop, rng.choice([0.03, 1.0, 5.0, 40.0])),
+            "kill": partial(process.end, -9),
+            "leave": client.leave,
+            "nothing": lambda: None,
+        }[kind]
+        self.world.after(delay, lambda: self.is_calm or not process.alive or act())
 
     async def op_look(self, rng: Random) -> None:
         """What is asked of a group without waiting."""
@@ -1168,6 +1223,12 @@ class Play(Session):
             self.tracing.stop()
             self.trace.cleanup()
             self.trace = None
+
+
+def is_unasked(env: Env) -> bool:
+    """A client that has joined, or may have."""
+    unseen = env.request is None and not env.is_known
+    return unseen or (env.request is not None and env.request.kind == "join")
 
 
 def ids_of(fault: EnvFault) -> Sequence[str]:

@@ -271,7 +271,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
-    if kind == "group" and apart.random() < _CLIENTS:
+    has_clients = kind == "group" and apart.random() < _CLIENTS
+    if has_clients:
         features, plans = _with_clients(apart, features, plans)
     ops_of_kind = KINDS[kind][1]
     names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
@@ -290,6 +291,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
         kinds = [kind for kind in kinds if rng.random() < 0.4]
     chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds}
     faults = Faults(**chances) if "faults" in features else Faults()
+    if has_clients and apart.random() < 0.5:
+        faults = replace(faults, cuts=apart.choice([0.003, 0.03, 0.1]))
     return Program(seed, kind, features, tuple(plans), (*first, *ops), faults)
 
 
@@ -314,15 +317,13 @@ def _with_clients(
         "robots", "base", rng.choice([*FIXED, "number", "text", "part"]),
         rng.choice([c for c in CONTROLS if c != "anything"]), num_workers=rng.randint(1, 3),
         limit=rng.choice([None, 3]), placement="client", heartbeat=rng.choice([5.0, 30.0]),
+        timeout=TIMEOUT if "hang" in features and rng.random() < 0.7 else None,
     )  # fmt: skip
     features = features - _UNLIKE_CLIENTS | {CLIENTS}
     return features, [*(plans if rng.random() < 0.6 else ()), robots]
 
 
-_UNLIKE_CLIENTS: Final = {
-    "cancel", "timeouts", "tasks", "interrupts", "snapshots", "die", "hang", "raise", "rubbish",
-    "faults",
-}  # fmt: skip
+_UNLIKE_CLIENTS: Final = {"cancel", "timeouts", "tasks", "interrupts", "snapshots"}
 """Features that programs with clients leave out."""
 
 

@@ -255,6 +255,11 @@ class Session:
     def faults_of(self, env: Env) -> list[str]:
         """The faults that an env may have."""
         features, entry = self.features, env.entry
+        if env.client is not None:
+            faults = ["raise"] * ("raise" in features)
+            faults += ["rubbish"] * ("rubbish" in features and entry.layout in (*FIXED, "number"))
+            faults += [*DYING, "raise oddly"] * ("die" in features)
+            return faults + ["hang"] * (self.plan(env).timeout is not None)
         faults = ["keep state"] * ("snapshots" in features and entry.every is None)
         if "raise" in features:
             # What resumes has a grudge again, or never had it.
