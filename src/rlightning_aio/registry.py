@@ -143,7 +143,8 @@ BACKENDS: dict[str, Backend] = {
                 install=_of_extra("aloha"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.lerobot_tasks",)),
         Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets", "websockets",
-                install=_of_extra("websockets"), awaitable=True),
+                install=_of_extra("websockets"), awaitable=True,
+                preload=("rlightning_aio.envs.openenv.env",)),
     )
 }
 # fmt: on

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest_asyncio
+import uvloop
 from attempts.rooms import PLACES, openenv, rooms, serving
 from group import conftest as on_group
 
@@ -21,14 +22,17 @@ if on_group.ON_RAY:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """On Ray, deselect what doesn't hold for every place, and one of the two loops."""
+    """Deselect servers on uvloop (see `serving`), which would start only to be skipped; on Ray,
+    what doesn't hold for every place, and one of the two loops.
+    """
     on_group.deselect(config, items, Path(__file__).parent, _is_other)
 
 
 def _is_other(item: pytest.Item) -> bool:
     params = item.callspec.params if hasattr(item, "callspec") else {}
-    on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
-    return on_group.ON_RAY and ("place" not in params or on_asyncio)
+    if on_group.ON_RAY:
+        return "place" not in params or asyncio.new_event_loop in params.values()
+    return params.get("place") == "openenv" and uvloop.new_event_loop in params.values()
 
 
 @pytest_asyncio.fixture(params=[name for name in PLACES if (name == "ray") == on_group.ON_RAY])

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from attempts.rooms import Room
+from attempts.room import Room
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, play
