@@ -511,6 +511,55 @@ async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn
         again.join()
 
 
+async def test_a_client_that_returns_before_its_absence_is_raised_joins() -> None:
+    """Its first result waits until the call that asks it has ended."""
+    go_on = threading.Event()
+    slow, leaver = CountingEnv(0), CountingEnv(1)
+    leaver.on_step = lambda: setattr(leaver, "finished", True)
+    async with rlightning_aio.build_env_group(entry(min_clients=2)) as group:
+        server, address = group["robots-0"], group["robots-0"].address
+        with clients(group, slow, leaver) as threads:
+            batch, _ = await group.reset()
+            last = batch.env_ids().index("robots-0/c1")
+            group.step_async(batch.take([last]).respond(action=np.zeros((1, 2), np.float32)))
+            (step, _) = await group.collect_async(deadline=HANG)
+            threads[1].join()
+            lost, _ = await group.step(step.respond(action=actions(step)))
+            assert "client_lost" in lost.info()[0]
+            slow.on_step = lambda: go_on.wait(HANG)
+            stepping = asyncio.create_task(group.step(batch.respond(action=actions(batch))))
+            await asyncio.sleep(0)
+            again = ClientThread(address, "c1", CountingEnv(5))
+            async with asyncio.timeout(HANG):
+                while len(server.clients) < 2:  # noqa: ASYNC110  # There is no event for it.
+                    await asyncio.sleep(0)
+            go_on.set()
+            with pytest.raises(EnvAway, match="robots-0/c1") as caught:
+                await stepping
+            assert caught.value.results is not None
+            assert caught.value.results.env_ids() == ["robots-0/c0"]
+            first, _ = await group.collect_async(deadline=HANG)
+            assert first.observation.tolist() == [[5, -1, 0]]
+            await group.close()
+        again.join()
+
+
+def test_a_client_that_joins_changes_no_result_that_was_returned() -> None:
+    """Although nobody has asked it, and observations are views."""
+    with sync.build_env_group(entry(), zero_copy=True) as group:
+        with clients(group, env := CountingEnv(0)):
+            batch, _ = group.reset()
+            env.on_step = lambda: setattr(env, "finished", True)
+            group.step(batch.respond(action=actions(batch)))
+            lost, _ = group.step(batch.respond(action=actions(batch)))
+        again = ClientThread(group["robots-0"].address, "c0", CountingEnv(5))
+        first, _ = group.collect_async(deadline=HANG)
+        assert lost.observation.tolist() == [[0, -1, 1]]
+        assert first.observation.tolist() == [[5, -1, 0]]
+        group.close()
+        again.join()
+
+
 async def test_closing_a_group_ends_a_collect_that_waits_for_clients() -> None:
     """With time limits it checks all hosts again, although the env_server is gone by then."""
     released = threading.Event()

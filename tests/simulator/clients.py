@@ -93,7 +93,8 @@ class Client:
         env: what the model knows of its env.
         sessions: that have begun at the client.
         session: whose results the trainer has got last; -1 before the first.
-        is_out: the trainer knows that it has ended.
+        is_in: it may go on; is_out: the trainer may know that it has ended. After an abort, both
+            are true.
         withdrawn: what was sent to it since then.
         troubles: what has happened to it that may end a session.
         hangs: its env does not return any more.
@@ -107,6 +108,7 @@ class Client:
         self.env = Env(env_id, entry, codes, -1, host, state, client=self)
         self.sessions: list[Begun] = []
         self.session = -1
+        self.is_in = False
         self.is_out = True
         self.withdrawn: dict[str, Any] | None = None
         self.troubles = 0
@@ -171,14 +173,28 @@ class Client:
 
     def withdraw(self, request: Request) -> None:
         """Note that it is away: its next first result answers the request."""
-        self.withdrawn, self.is_out, self.env.request = request.sent, True, None
+        self.withdrawn, self.env.request = request.sent, None
+        self.is_in, self.is_out = False, True
 
     def note_away(self, request: Request) -> None:
         """Check an error that says that it is not connected."""
         gone = self.is_out or (request.resets and self.may_be_lost)
         require(gone, "away, and its loss was not reported", self.env.env_id, request)
         self.withdrawn = None if self.withdrawn is None else request.sent
-        self.is_out = True
+        self.is_in, self.is_out = False, True
+
+    def note_aborted(self) -> None:
+        """Note that the trainer has dropped a result, or has ended the session."""
+        request, self.env.request = self.env.request, None
+        for state in (self.env.state, *self.env.loose):
+            if request is not None and request.kind != "join":
+                done = state.copy()
+                done.play(request)
+                done.count = state.count if request.kind == "step" else 0
+                self.env.loose.append(done)
+        self.troubles += 1
+        self.is_in = self.is_in or (request is not None and request.kind == "join")
+        self.is_out, self.withdrawn = True, None
 
     def judge(self, model: Model, request: Request, row: Row) -> None:
         """Compare a result with what was asked of its env, and with what it has done."""
@@ -199,36 +215,42 @@ class Client:
         compare(env, expected, row)
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         model.counts["first results"] += number != self.session
-        self.session, self.is_out, self.withdrawn = number, False, None
+        self.session, self.is_in, self.is_out, self.withdrawn = number, True, False, None
         env.adopt(state)
 
     def _played(self, model: Model, request: Request) -> Iterator[tuple[int, State, Expected]]:
         """How a result may have come about: of which session it is, and the state after it."""
-        if not self.is_out and request.kind != "join":
+        limit = model.limit_of(self.env)
+        if self.is_in and request.kind != "join":
             for one in request.alternatives():
-                state = self.env.state.copy()
-                yield self.session, state, state.play(one, model.limit_of(self.env))
+                for state in map(State.copy, (self.env.state, *self.env.loose)):
+                    yield self.session, state, state.play(one, limit)
         is_plain = request.seed is None and not request.options and not request.seeds
         for number in range(self.session + 1, len(self.sessions)):
             state = self.sessions[number].before.copy()
             first = state.play(Request("reset"))
             if self.is_out or (is_plain and request.resets):
                 yield number, state, first
-            if request.resets or (self.is_out and model.context is not None):
-                for one in request.alternatives():
+            for one in request.alternatives():
+                if request.resets or (self.is_out and model.context is not None):
                     again = state.copy()
                     yield number, again, again.play(replace(one, due=True))
+                if (
+                    self.is_in and self.is_out and request.kind != "join"
+                ):  # Its first result was dropped.
+                    again = state.copy()
+                    yield number, again, again.play(one, limit)
 
     def _judge_lost(self, model: Model, request: Request, row: Row) -> None:
         # A reset may be sent to one that is about to come back.
-        require(not self.is_out or request.resets, "lost again, and it was not back")
+        require(self.is_in or request.resets, "lost again, and it was not back")
         require(self.may_be_lost, "lost, and nothing has happened to it", self.troubles)
         model.judge_heads(row, "client_lost")
-        seen = [self.env.state.scripts.words]
-        if request.resets:  # Which may have dropped a first result.
+        seen = [state.scripts.words for state in (self.env.state, *self.env.loose)]
+        if request.resets or self.is_out:  # Which may have dropped a first result.
             seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
         require(row.words in seen, "not its last observation", seen)
-        self.is_out, self.env.dirty, self.withdrawn = True, False, None
+        self.is_in, self.is_out, self.env.dirty, self.withdrawn = False, True, False, None
         model.counts["clients lost"] += 1
 
     def check_done(self) -> None:

@@ -489,6 +489,9 @@ class Model:
 
     def abort(self, env: Env) -> None:
         """Note that nobody gets what a request leads to: it may have been done, or its env lost."""
+        if env.client is not None:
+            env.client.note_aborted()
+            return
         before = [env.state.copy(), env.fresh(), *env.after_loss()]
         # Without a request it was a call that was given up before.
         done = [] if env.request is None else [env.request, Request("reset")]

@@ -230,6 +230,8 @@ class Play(Session):
             self.withdraw(requests)
             return False
         except asyncio.CancelledError:
+            if self.clients:  # It may have waited for clients.
+                self.interrupted(requests, owner)
             self.model.orphan(owner)
             raise
         except KeyboardInterrupt:
@@ -265,6 +267,7 @@ class Play(Session):
             and self.model.envs[env_id].host.mortal  # Others end it by themselves.
             for env_id, request in requests.items()
         )
+        limbo = limbo or any(client.may_be_back for client in self.clients)
         require(limbo, "busy, and nothing was asked", *requests)
         self.withdraw(requests)
 
@@ -490,7 +493,7 @@ class Play(Session):
         self.note_clients()
         self.collecting, nothing = True, not self.collectable()
         if nothing and self.clients:  # It waits for one to join.
-            rules = {"deadline": 30.0} | rules
+            rules["deadline"] = min(rules.get("deadline", 30.0), 30.0)
         try:
             batch, flags = await self.done(self.group.collect_async(**rules))
         except TimeoutError as error:
@@ -548,6 +551,7 @@ class Play(Session):
     async def reset(self, envs: list[Env], rng: Random | None = None) -> bool:
         others = [env for env in self.model.envs.values() if all(env is not e for e in envs)]
         everyone = all(map(is_unasked, others)) and rng is not None and rng.random() < 0.7
+        everyone = everyone and not (self.clients and "tasks" in self.features)
         if everyone:  # Also clients that may have joined.
             envs = list(self.model.envs.values())
             for env in others:

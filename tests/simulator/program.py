@@ -323,7 +323,7 @@ def _with_clients(
     return features, [*(plans if rng.random() < 0.6 else ()), robots]
 
 
-_UNLIKE_CLIENTS: Final = {"cancel", "timeouts", "tasks", "interrupts", "snapshots"}
+_UNLIKE_CLIENTS: Final = {"snapshots"}
 """Features that programs with clients leave out."""
 
 

@@ -186,8 +186,10 @@ class AgentSteps:
         for slot, fault in ticket.errors.items():
             if not (reply := self._ended(slot)).done():
                 reply.set_exception(fault)
+        failed = [*ticket.errors]
         ticket.errors.clear()
         slots = self._requests.settle_ended(ticket)
+        self._steps.note_freed(failed)
         if len(slots):
             batch, _ = self._steps.hand_out(slots, synchronous=True)
             self._resolve(batch, slots)

@@ -77,9 +77,9 @@ class Arrivals:
         self._results.keep(slot, completion.write() or {})
 
     def admit(self, slots: NDArray[np.intp], now: float) -> None:
-        """Accept envs that came back to `slots`, whose rows are free now."""
+        """Accept envs that came back to those of `slots` whose rows are free now."""
         for slot in slots.tolist():
-            if slot in self.held_back:
+            if slot in self.held_back and self._requests.is_idle(slot):
                 self._accept(self.held_back.pop(slot), slot, now)
 
     def withdraw(self, slot: int) -> None:

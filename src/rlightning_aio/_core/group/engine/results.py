@@ -316,7 +316,9 @@ class Results:
                 for row, kept in out_of_band.items()
             }
             return columns, beside
-        contiguous = _contiguous(rows) if self._zero_copy else None
+        # The rows of envs that join change without a request.
+        has_views = self._zero_copy and slab.sent_ns is None
+        contiguous = _contiguous(rows) if has_views else None
         if contiguous is None:
             return gather(slab.observation, rows), out_of_band
 

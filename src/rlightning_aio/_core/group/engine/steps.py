@@ -35,6 +35,8 @@ from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import CollectRules
@@ -242,7 +244,12 @@ class Steps:
 
     def note_raised(self, fault: EnvFault) -> None:
         """Note that an error of the collector is raised, so that its envs are free."""
-        self._arrivals.admit(self._requests.collector.take_fault(fault), self._intake.now)
+        self.note_freed(self._requests.collector.take_fault(fault))
+
+    def note_freed(self, slots: Iterable[int]) -> None:
+        """Let envs join that came back before the errors of `slots` were raised."""
+        if self._arrivals.held_back:
+            self._arrivals.admit(np.fromiter(slots, np.intp), self._intake.now)
 
     # -- check, write, send -----------------------------------------------------------
 
@@ -379,6 +386,7 @@ class Steps:
                 raise
             others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
             fault.add_note(f"the results of {others} of the same call are in the error's `results`")
+        self.note_freed(ticket.errors)
         raise fault
 
     def hand_out(
