@@ -480,6 +480,37 @@ async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> N
         again.join()
 
 
+async def test_a_step_of_a_client_that_is_back_returns_its_first_result() -> None:
+    """Beside the results of others, in the given order, or by a handle."""
+    leaver = CountingEnv(0)
+    leaver.on_step = lambda: setattr(leaver, "finished", True)
+    async with rlightning_aio.build_env_group(entry(min_clients=2)) as group:
+        server = group["robots-0"]
+        with clients(group, leaver, stays := CountingEnv(1)) as threads:
+            batch, _ = await group.reset(seed=0)
+            for back in (5, 6):
+                batch, _ = await group.step(batch.respond(action=actions(batch)))
+                threads[0].join()
+                lost, _ = await group.step(batch.respond(action=actions(batch)))
+                assert lost.restarted.tolist() == [True, False]
+                threads[0] = ClientThread(server.address, "c0", again := CountingEnv(back))
+                async with asyncio.timeout(HANG):
+                    while len(server.clients) < 2:  # noqa: ASYNC110  # There is no event for it.
+                        await asyncio.sleep(0)
+                if back == 6:
+                    ret = await group["robots-0/c0"].step(np.zeros(2, np.float32))
+                    assert ret.observation.tolist() == [6, -1, 0]
+                    break
+                batch, _ = await group.step(lost.respond(action=actions(lost), tag=["a", "b"]))
+                assert batch.env_ids() == lost.env_ids()
+                assert batch.observation.tolist() == [[5, -1, 0], [1, 1, stays.steps]]
+                assert batch.is_reset.tolist() == [True, False]
+                assert batch.sent.tag == ["a", "b"]
+                again.on_step = lambda again=again: setattr(again, "finished", True)
+            assert group.pending == []
+            await group.close()
+
+
 async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn() -> None:
     """The marked result comes first, then the first result of the new session."""
 

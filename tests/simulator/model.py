@@ -446,6 +446,9 @@ class Model:
 
     def send(self, env: Env, request: Request) -> None:
         """Note a request that was accepted."""
+        if env.client is not None and env.request is not None and env.request.kind == "join":
+            env.request = None
+            self.counts["asked as they were back"] += 1
         is_idle = env.idle or not (env.is_known or env.request)
         require(is_idle, "a busy env was asked again", env.env_id)
         request.before, request.deaths = (env.limbo, env.state.cut), env.deaths

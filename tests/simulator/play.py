@@ -345,8 +345,9 @@ class Play(Session):
     # -- drawing
 
     def ready(self) -> list[Env]:
-        """Envs that can be stepped."""
-        return [env for env in self.model.idle() if env.was_reset and not env.dirty]
+        """Envs that can be stepped; the first results of clients that are back answer that."""
+        back = [env for env in self.model.envs.values() if is_back(env)]
+        return [env for env in self.model.idle() if env.was_reset and not env.dirty] + back
 
     def local(self, envs: list[Env]) -> list[Env]:
         """Those that no client lends."""
@@ -1176,12 +1177,15 @@ class Play(Session):
 
     async def op_client(self, rng: Random) -> None:
         """Start a client, or do something to it."""
-        client, process = rng.choice(self.clients), None
+        if rng.random() < 0.3:  # Let it come back.
+            await self.rest(rng.choice([10, 100, 400]))
+            return
+        client = rng.choice(self.clients)
         process = client.process
         if process is None or not process.alive:
             client.start(self.address)
             return
-        kind = rng.choice(["cut", "stop", "kill", "leave", "nothing"])
+        kind = rng.choice(["cut", "stop", "kill", "leave"])
         self.counts[f"clients: {kind}"] += 1
         delay = rng.choice([0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0])
         act = {
@@ -1189,9 +1193,11 @@ class Play(Session):
             "stop": partial(process.stop, rng.choice([0.03, 1.0, 5.0, 40.0])),
             "kill": partial(process.end, -9),
             "leave": client.leave,
-            "nothing": lambda: None,
         }[kind]
         self.world.after(delay, lambda: self.is_calm or not process.alive or act())
+        if rng.random() < 0.6:  # Somebody starts it again.
+            again = lambda: client.is_alive or client.start(self.address)  # noqa: E731
+            self.world.after(delay + rng.choice([0.0, 0.1, 3.0, 30.0]), again)
 
     async def op_look(self, rng: Random) -> None:
         """What is asked of a group without waiting."""
@@ -1229,10 +1235,14 @@ class Play(Session):
             self.trace = None
 
 
+def is_back(env: Env) -> bool:
+    """A client that the trainer knows is back, and its first result was not collected."""
+    return env.is_known and env.request is not None and env.request.kind == "join"
+
+
 def is_unasked(env: Env) -> bool:
     """A client that has joined, or may have."""
-    unseen = env.request is None and not env.is_known
-    return unseen or (env.request is not None and env.request.kind == "join")
+    return is_back(env) or not env.is_known
 
 
 def ids_of(fault: EnvFault) -> Sequence[str]:

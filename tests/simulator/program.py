@@ -226,7 +226,7 @@ OPS: dict[str, tuple[int, str | None]] = {
     "look": (3, None),
     "trace": (2, "timeline"),
     "kill": (3, "die"),
-    "client": (4, CLIENTS),
+    "client": (10, CLIENTS),
 }
 """Weight of each operation of a group, and the feature that it needs."""
 ROWS: dict[str, tuple[int, str | None]] = {

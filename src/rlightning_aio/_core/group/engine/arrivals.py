@@ -32,6 +32,8 @@ class Arrivals:
     Attributes:
         held_back: by slot, envs that came back before the result that reports their loss was
             collected; see `admit`.
+        asked: slots of the last batch of responses; back: those of them that `without_gone` has
+            dropped, because their first results answer them.
     """
 
     def __init__(self, tables: Tables, results: Results, stats: Stats) -> None:
@@ -43,6 +45,7 @@ class Arrivals:
         self._stats = stats
         self.held_back: dict[int, Joined] = {}
         self._withdrawn: set[int] = set()
+        self.asked = self.back = np.zeros(0, np.intp)
 
     def join(self, completion: Joined, first_slot: int, now: float) -> None:
         """Record that an env joined a host, and keep its first result for the collector.
@@ -95,6 +98,7 @@ class Arrivals:
         Such an env is back, or another has its slot. The response was meant for the episode that
         was lost. The first result of an env that is back, which waits to be collected, answers it.
         """
+        self.asked, self.back = slots, slots[:0]
         names, is_current = self._envs.names, names_of(batch) is self._envs.names
         if is_current and not self._requests.collector.num_ready:
             return batch, slots
@@ -106,8 +110,9 @@ class Arrivals:
         if not gone.any():
             return batch, slots
         if back.any():
-            columns = response_columns(_chosen(batch, back), slots[back], self._layout)
-            self._results.note_sent(slots[back], columns)
+            self.back = slots[back]
+            columns = response_columns(_chosen(batch, back), self.back, self._layout)
+            self._results.note_sent(self.back, columns)
         return _chosen(batch, ~gone), slots[~gone]
 
 

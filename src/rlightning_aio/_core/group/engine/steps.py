@@ -29,13 +29,13 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
-from rlightning_aio.errors import BadAction, NothingPending, RLightningError
+from rlightning_aio.errors import BadAction, EnvAway, NothingPending, RLightningError
 from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -177,6 +177,8 @@ class Steps:
             at_once = at_once and not (self._conditions.unusual or self._continuity.due[0])
             if not (at_once and self._step_at_once(now)):
                 send = partial(self.send, slots, packed, now)
+                if self._supervisor.members.possible:
+                    send, slots = self._with_back(batch, send, slots), self._arrivals.asked
                 ticket, now = yield from self._waiting.ask(now, slots, send)
                 if ticket.errors:
                     self._raise_faults(ticket)
@@ -185,6 +187,23 @@ class Steps:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("step", began)
         return results, flags if self._continuity.auto_reset_is_open else None
+
+    def _with_back(
+        self, batch: BatchedData, send: Callable[[Ticket], None], slots: NDArray[np.intp]
+    ) -> Callable[[Ticket], None]:
+        """Have the first results of envs that are back answer their responses, too."""
+        arrivals = self._arrivals
+        if len(slots) + len(arrivals.back) < len(arrivals.asked):
+            raise EnvAway(
+                "a client of the batch has left, and another has taken its place; nothing was sent",
+                env_id=next(i for i in batch.env_ids() if i not in self._envs.names.env_ids),
+            )
+
+        def send_and_claim(ticket: Ticket) -> None:
+            self._requests.claim(arrivals.back, ticket)
+            send(ticket)
+
+        return send_and_claim if len(arrivals.back) else send
 
     def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
         """Wait for results by the rules of `EnvGroup.collect_async`, and return them."""
