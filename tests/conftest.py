@@ -7,6 +7,7 @@ task behind.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import gc
 import importlib.util
 import os
@@ -22,6 +23,8 @@ import pytest
 import pytest_asyncio
 import uvloop
 from hypothesis import HealthCheck, settings
+
+from rlightning_aio.registry import BACKENDS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -70,6 +73,13 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("any machine")
+
+
+# Many envs are in modules of tests, which import pytest: longer than all else that a worker does to
+# start. A fork server does that once.
+BACKENDS["callable"] = dataclasses.replace(
+    BACKENDS["callable"], preload=(*BACKENDS["callable"].preload, "pytest")
+)
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
@@ -155,9 +165,10 @@ def _shared_memory() -> set[str]:
     """
     found: set[str] = set()
     for line in Path("/proc/self/maps").read_text().splitlines():
-        _, _, _, _, inode, *path = line.split(maxsplit=5)
-        if path and path[0].startswith(("/memfd:", "/dev/shm/")):
-            found.add(f"shared memory: {path[0]}, inode {inode}")
+        if "/memfd:" in line or "/dev/shm/" in line:
+            _, _, _, _, inode, path = line.split(maxsplit=5)
+            if path.startswith(("/memfd:", "/dev/shm/")):
+                found.add(f"shared memory: {path}, inode {inode}")
     return found
 
 
@@ -194,9 +205,11 @@ def implementation(request: pytest.FixtureRequest) -> Iterator[str]:
 def nothing_left_behind() -> Iterator[None]:
     before = _held()
     yield
-    if _held().keys() - before:
+    after = _held()
+    if after.keys() - before.keys():
         gc.collect()  # Ignore garbage.
-    left = [shown for name, shown in _held().items() if name not in before]
+        after = _held()
+    left = [shown for name, shown in after.items() if name not in before]
     assert not left, f"the test left behind {sorted(left)}"
 
 
