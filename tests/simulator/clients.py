@@ -95,7 +95,8 @@ class Client:
         session: whose results the trainer has got last; -1 before the first.
         is_in: it may go on; is_out: the trainer may know that it has ended. After an abort, both
             are true.
-        withdrawn: what was sent to it since then.
+        is_known: the trainer has its id; last: the observation that it has got last.
+        withdrawn: what was sent to it since it was out.
         troubles: what has happened to it that may end a session.
         hangs: its env does not return any more.
         asked, done: steps and resets that were sent, and that were executed, in order.
@@ -108,8 +109,9 @@ class Client:
         self.env = Env(env_id, entry, codes, -1, host, state, client=self)
         self.sessions: list[Begun] = []
         self.session = -1
-        self.is_in = False
+        self.is_in = self.is_known = False
         self.is_out = True
+        self.last = state.scripts.words
         self.withdrawn: dict[str, Any] | None = None
         self.troubles = 0
         self.asked: deque[tuple[str, int]] = deque()
@@ -165,6 +167,7 @@ class Client:
         request = self.env.request
         if is_pending and request is None:
             require(self.may_be_back, "pending, and nobody has asked or come", self.env.env_id)
+            self.is_known = True
             self.env.request = Request("join", sent=self.withdrawn)
         elif not is_pending and request is not None and request.owner == COLLECTOR:
             gone = self.is_out or (request.resets and self.may_be_lost)
@@ -206,7 +209,8 @@ class Client:
         found = [one for one in played if one[2].outcome.words == row.words]
         require(found, "in none of the states", [tuple(one[2].outcome.words[0]) for one in played])
         number, state, expected = found[0]
-        effects = [effect for effect, _ in request.acts] if number == self.session else []
+        is_step = number == self.session and not request.resets
+        effects = [effect for effect, _ in request.acts] if is_step else []
         require(not {*effects} & {*RAISING, "rubbish"}, "a result where there is none")
         if env.first < 0 and row.index is not None:
             others = [other.first + len(other.codes) for other in model.envs.values()]
@@ -216,6 +220,7 @@ class Client:
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         model.counts["first results"] += number != self.session
         self.session, self.is_in, self.is_out, self.withdrawn = number, True, False, None
+        self.is_known, self.last = True, row.words
         env.adopt(state)
 
     def _played(self, model: Model, request: Request) -> Iterator[tuple[int, State, Expected]]:
@@ -246,7 +251,7 @@ class Client:
         require(self.is_in or request.resets, "lost again, and it was not back")
         require(self.may_be_lost, "lost, and nothing has happened to it", self.troubles)
         model.judge_heads(row, "client_lost")
-        seen = [state.scripts.words for state in (self.env.state, *self.env.loose)]
+        seen = [self.last, *(state.scripts.words for state in self.env.loose)]
         if request.resets or self.is_out:  # Which may have dropped a first result.
             seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
         require(row.words in seen, "not its last observation", seen)

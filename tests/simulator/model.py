@@ -327,7 +327,7 @@ class Env:
     @property
     def is_known(self) -> bool:
         """The trainer knows its id."""
-        return self.client is None or self.client.session >= 0
+        return self.client is None or self.client.is_known
 
     @property
     def shared_id(self) -> str:

@@ -155,6 +155,8 @@ class Play(Session):
         await self.look_at_tasks(wait=True)
         while self.calls:
             await self.interruptible(self.op_collect_calls(Random(0)))
+        for client in self.clients:
+            await self.lose(client)
         while self.model.pending(COLLECTOR):
             await self.interruptible(self.collect(deadline=self.hang))
         if self.context is not None:
@@ -178,6 +180,24 @@ class Play(Session):
         while env.request is not None:
             await self.collect(deadline=self.hang)
         return await self.reset([env]) and await self.step_on([env])
+
+    async def lose(self, client: Client) -> None:
+        """A client that is killed as it owes a result is found soon."""
+        env, heartbeat = client.env, self.plan(client.env).heartbeat
+        if not client.is_alive or client.may_be_lost or not (env.idle and env in self.ready()):
+            return
+        batch, requests = self.response(Random(0), [env], plain=True)
+        if [*requests] != [env.env_id]:
+            return
+        self.send_async(requests, lambda: self.group.step_async(batch))
+        assert client.process is not None
+        client.process.end(-9)
+        began = self.world.now_ns
+        while client.env.request is not None:
+            await self.collect(deadline=self.hang)
+        took = (self.world.now_ns - began) / 1e9
+        require(took <= 1.5 * heartbeat + 30.0, "a dead client is found late", client.name, took)
+        self.counts["clients found dead"] += 1
 
     async def expect(self, client: Client) -> None:
         """Have a client be there, and what it still owes collected."""
@@ -249,8 +269,11 @@ class Play(Session):
         """Find out what of an interrupted call was sent; its results wait for a collect."""
         pending = self.group.pending
         for env_id, request in requests.items():
+            client = self.model.envs[env_id].client
             if env_id not in pending and request.kind != "call":
                 self.model.withdraw(self.model.envs[env_id])
+            elif client is not None and client.may_be_back:
+                request.sent = None  # It may be pending with its first result alone.
         self.model.orphan(owner)
 
     def withdraw(self, requests: dict[str, Request]) -> None:
@@ -1237,12 +1260,13 @@ class Play(Session):
 
 def is_back(env: Env) -> bool:
     """A client that the trainer knows is back, and its first result was not collected."""
-    return env.is_known and env.request is not None and env.request.kind == "join"
+    return env.was_reset and env.request is not None and env.request.kind == "join"
 
 
 def is_unasked(env: Env) -> bool:
     """A client that has joined, or may have."""
-    return is_back(env) or not env.is_known
+    has_come = env.request is not None and env.request.kind == "join"
+    return has_come or not env.is_known
 
 
 def ids_of(fault: EnvFault) -> Sequence[str]:

@@ -319,12 +319,8 @@ def _with_clients(
         limit=rng.choice([None, 3]), placement="client", heartbeat=rng.choice([5.0, 30.0]),
         timeout=TIMEOUT if "hang" in features and rng.random() < 0.7 else None,
     )  # fmt: skip
-    features = features - _UNLIKE_CLIENTS | {CLIENTS}
+    features = features - {"snapshots"} | {CLIENTS}
     return features, [*(plans if rng.random() < 0.6 else ()), robots]
-
-
-_UNLIKE_CLIENTS: Final = {"snapshots"}
-"""Features that programs with clients leave out."""
 
 
 def _restarted(rng: Random, plan: Plan) -> Plan:
