@@ -15,8 +15,10 @@ import shutil
 import signal
 import subprocess
 import sys
+import traceback
+from asyncio.constants import DEBUG_STACK_DEPTH
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import _pytest.runner
 import pytest
@@ -36,6 +38,19 @@ uvloop.new_event_loop().close()
 
 # For loops that tests make themselves; pytest-asyncio has an option for its own loops.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
+
+# These checks keep the stack of each future that is made, for a warning. The whole of it is mostly
+# pytest's, and to read its lines takes an eighth of the time of async tests.
+_extracted = traceback.StackSummary.extract
+
+
+def _where(frames: Any, *, limit: int | None = None, **options: Any) -> traceback.StackSummary:
+    if limit is None and frames.__name__ == "walk_stack":
+        return _extracted(frames, limit=DEBUG_STACK_DEPTH, lookup_lines=False)
+    return _extracted(frames, limit=limit, **options)
+
+
+traceback.StackSummary.extract = _where
 
 # Every group that a test builds checks what happens to its requests: `group/state/checked.py`.
 os.environ["RLIGHTNING_AIO_DEBUG"] = "1"

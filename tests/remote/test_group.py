@@ -743,7 +743,8 @@ def test_a_client_process_that_dies_or_stops_is_found_by_its_silence(
         lost: list[Any] = []
         steps = 0
         while not lost:
-            group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
+            if steps < 20:  # Then only the lost client is waited for.
+                group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
             batch, _ = group.collect_async(deadline=HANG)
             lost = [ret for ret in batch.values() if "client_lost" in ret.info]
             steps += len(batch) - len(lost)
