@@ -271,7 +271,7 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
-    has_clients = kind == "group" and apart.random() < _CLIENTS
+    has_clients = kind == "group" and apart.random() < _CLIENTS and CLIENTS not in without
     if has_clients:
         features, plans = _with_clients(apart, features, plans)
     ops_of_kind = KINDS[kind][1]
