@@ -122,9 +122,9 @@ def waiting(rollout: Rollout) -> dict[str, float]:
     """Average numbers of environments that stepped, waited for the policy, or for the learner."""
     seconds = rollout.seconds
     return {
-        "stepping": seconds.env_busy / seconds.elapsed,
-        "waiting_for_policy": seconds.waited_for_policy / seconds.elapsed,
-        "waiting_for_learner": seconds.waited_for_learner / seconds.elapsed,
+        "stepping": seconds["env_busy"] / seconds["elapsed"],
+        "waiting_for_policy": seconds["waited_for_policy"] / seconds["elapsed"],
+        "waiting_for_learner": seconds["waited_for_learner"] / seconds["elapsed"],
     }
 
 
@@ -150,7 +150,7 @@ async def train(args: Args | CartPole) -> Run:
                     player.take(learner.agent)
                 collector.policy_version += 1
                 figures |= waiting(rollout) | {"lag": rollout.lag.mean()}
-                returns = [episode.total_reward for episode in rollout.episodes]
+                returns = rollout.episodes["total_reward"].tolist()
                 run.record(len(rollout), returns, **figures)
                 if len(run.rows) % args.save_every == 0:
                     run.save(learner.state())

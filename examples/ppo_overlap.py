@@ -142,7 +142,7 @@ async def train(args: Args | CartPole) -> Run:
                         player.take(learner.agent)
                         collector.policy_version += 1
                     figures |= waiting(rollout) | {"lag": lag.clip(max=MOST_LAG).mean()}
-                    returns = [episode.total_reward for episode in rollout.episodes]
+                    returns = rollout.episodes["total_reward"].tolist()
                     run.record(len(rollout), returns, **figures)
                     rollout = collecting.result()
                     if len(run.rows) % args.save_every == 0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -11,12 +12,15 @@ import pytest
 
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
-from rlightning_aio.export import EpisodeJoiner, WholeEpisode, save_lerobot, save_minari
+from rlightning_aio.collecting.whole_episodes import whole_episodes
+from rlightning_aio.export import save_lerobot, save_minari
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from rlightning_aio import BatchedData
+    from rlightning_aio.collecting import Rollout
 
 
 class Counting(gym.Env[Any, Any]):
@@ -49,20 +53,18 @@ def halves(batch: BatchedData) -> dict[str, Any]:
     return {"action": np.full((len(batch), 1), 0.5, np.float32)}
 
 
-def played(num_steps: int, rollouts: int, *, wait_all: bool = False) -> list[WholeEpisode]:
+def rollouts_of(num_steps: int, count: int, *, wait_all: bool = False) -> Iterator[Rollout]:
     entry = {"name": "env", "task": Counting, "num_workers": 2, "placement": "inline"}
-    joiner, found = EpisodeJoiner(), []
     with sync.build_env_group(entry) as group, group.auto_reset(9):
         collector = Collector(group, halves, num_transitions=num_steps, wait_all=wait_all)
-        for _ in range(rollouts):
-            found += joiner.add(collector.collect())
-    return found
+        for _ in range(count):
+            yield collector.collect()
 
 
 @pytest.mark.parametrize("wait_all", [False, True])
 def test_rollouts_are_joined_to_whole_episodes(wait_all: bool) -> None:
     """Wherever they were cut: here after two steps of each env."""
-    episodes = played(4, 6, wait_all=wait_all)
+    episodes = list(whole_episodes(rollouts_of(4, 6, wait_all=wait_all)))
     assert len(episodes) == 8
     for episode in episodes:
         number = episode.observation["agent_pos"][0, 0]
@@ -72,6 +74,13 @@ def test_rollouts_are_joined_to_whole_episodes(wait_all: bool) -> None:
         np.testing.assert_array_equal(episode.terminated, [False, False, True])
         assert not episode.truncated.any()
         assert episode.action.shape == (3, 1)
+
+
+def test_copies_of_rollouts_can_be_kept_for_later() -> None:
+    """As a program with an asynchronous group does, whose `collect` is awaited."""
+    kept = [copy.deepcopy(rollout) for rollout in rollouts_of(4, 6)]
+    numbers = [one.observation["agent_pos"][0, 0] for one in whole_episodes(kept)]
+    assert sorted(numbers) == sorted([1, 2, 3, 4] * 2)
 
 
 class Dying(Counting):
@@ -98,7 +107,7 @@ def test_an_episode_that_lost_its_begin_is_left_out(
         entry |= {"on_worker_death": "resume", "snapshot_every": snapshot_every}
     with sync.build_env_group(entry) as group, group.auto_reset(9):
         rollout = Collector(group, halves, num_transitions=9, wait_all=True).collect()
-    episodes = EpisodeJoiner().add(rollout)
+    episodes = list(whole_episodes([rollout]))
     for episode in episodes:
         np.testing.assert_array_equal(episode.observation["agent_pos"][:, 1], range(4))
     assert len(episodes) == 2
@@ -107,10 +116,9 @@ def test_an_episode_that_lost_its_begin_is_left_out(
 def test_an_episode_with_its_begin_in_a_rollout_that_was_not_added_is_left_out() -> None:
     with sync.build_env_group({"name": "env", "task": Counting}) as group, group.auto_reset(9):
         collector = Collector(group, halves, num_transitions=2, wait_all=True)
-        rollouts = [collector.collect() for _ in range(2)]
-        joiner = EpisodeJoiner()
-        assert joiner.add(rollouts[1]) == []
-        (episode,) = joiner.add(collector.collect())
+        collector.collect()
+        rollouts = (collector.collect() for _ in range(2))
+        (episode,) = whole_episodes(rollouts)
         assert episode.observation["agent_pos"][0].tolist() == [2.0, 0.0]
 
 
@@ -120,12 +128,12 @@ def test_minari_reads_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """With the observations, actions, rewards and ends that were played."""
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    episodes = played(12, 1)
+    rollouts = list(rollouts_of(12, 1))
     spaces = Counting.observation_space, Counting.action_space
-    save_minari(episodes, "counting/half-v0", *spaces, jpeg_encoding=False)
+    save_minari(rollouts, "counting/half-v0", *spaces, jpeg_encoding=False)
     dataset = minari.load_dataset("counting/half-v0")
     assert dataset.total_episodes == 4
-    for episode, read in zip(episodes, dataset.iterate_episodes(), strict=True):
+    for episode, read in zip(whole_episodes(rollouts), dataset.iterate_episodes(), strict=True):
         for name, of in episode.observation.items():
             np.testing.assert_array_equal(read.observations[name], of)
         np.testing.assert_array_equal(read.actions, episode.action)
@@ -144,9 +152,10 @@ def datasets() -> Any:
 @pytest.mark.simulators
 def test_lerobot_reads_the_episodes(datasets: Any, tmp_path: Path) -> None:
     """With their numbers as they were played, and pictures as its codec keeps them."""
-    episodes = played(12, 1)
-    save_lerobot(episodes, "counting/half", tmp_path / "half", fps=10, task="count")
+    rollouts = list(rollouts_of(12, 1))
+    save_lerobot(rollouts, "counting/half", tmp_path / "half", fps=10, task="count")
     dataset = datasets.LeRobotDataset("counting/half", root=tmp_path / "half")
+    episodes = list(whole_episodes(rollouts))
     assert (dataset.num_episodes, len(dataset)) == (4, 12)
     for position, frame in enumerate(dataset):
         episode, step = divmod(position, 3)
@@ -158,5 +167,5 @@ def test_lerobot_reads_the_episodes(datasets: Any, tmp_path: Path) -> None:
         assert float(frame["next.reward"]) == step + 1
         assert bool(frame["next.done"]) == (step == 2)
         assert frame["task"] == "count"
-    with pytest.raises(ValueError, match="no episode"):
+    with pytest.raises(ValueError, match="no whole episode"):
         save_lerobot([], "counting/none", tmp_path / "none", fps=10)

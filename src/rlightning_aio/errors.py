@@ -22,7 +22,6 @@ __all__ = [
     "BadAction",
     "ClientRefused",
     "ConfigError",
-    "EnvAborted",
     "EnvAway",
     "EnvBusy",
     "EnvError",
@@ -31,11 +30,9 @@ __all__ = [
     "EnvRaised",
     "EpisodeLost",
     "GroupClosed",
-    "NotInitialised",
     "NothingPending",
     "PolicyServerError",
     "RLightningError",
-    "ReplayDiverged",
     "SnapshotError",
     "StartFailed",
     "UnknownEnv",
@@ -45,6 +42,9 @@ __all__ = [
 
 class RLightningError(Exception):
     """Base of all errors of this package.
+
+    It is the class of those that no program needs to tell from others: a group was used before
+    `init`, a replay can't follow its record.
 
     They can be pickled and copied, with their attributes; a cause that is not an error of this
     package is converted to its text.
@@ -102,16 +102,8 @@ class PolicyServerError(RLightningError, ConnectionError):
     """A policy server is missing or silent, reports an error, or breaks its protocol."""
 
 
-class ReplayDiverged(RLightningError, RuntimeError):
-    """A replay can't follow the recorded order of results; the message names the first call."""
-
-
 class GroupClosed(RLightningError, RuntimeError):
-    """The group isn't open: it was used after ``close``, or before ``init`` (`NotInitialised`)."""
-
-
-class NotInitialised(GroupClosed):
-    """The group was used before ``init``."""
+    """The group was used after ``close``, or was closed while a call was waiting."""
 
 
 class SnapshotError(RLightningError, ValueError):
@@ -274,24 +266,18 @@ class EnvAway(EnvFault):
     _outcome = "env_away", "infrastructure"
 
 
-class EnvAborted(EnvFault):
-    """`abort` or `drain` of the group has ended the request of an env that another call waits for.
+class EpisodeLost(EnvFault):
+    """A call has no result, because the episode of its env has ended without one.
 
-    The env is free; its episode is over.
+    Its env was replaced during a step of an `EnvEpisode` (whose `lost` is the outcome), or `abort`
+    or `drain` of the group has ended the request. The env can be reset.
+
+    Attributes:
+        results: where the env was replaced, the first result of the episode that it has begun; None
+            for further steps.
     """
 
     _outcome = "cancelled", "caller"
-
-
-class EpisodeLost(EnvFault):
-    """The step of an `EnvEpisode` has no result: its env was replaced, and the episode is over.
-
-    The cause is in the message, and in `EnvEpisode.lost`.
-
-    Attributes:
-        results: the first result of the episode that the env has begun in its place; None for
-            further steps.
-    """
 
 
 class StartFailed(EnvFault):

@@ -345,7 +345,7 @@ class OpenEnvServer:
         """Wait for a reply, and abort what the env does if its client has left.
 
         Raises:
-            EnvAborted: that was so.
+            EpisodeLost: that was so.
         """
         replying = asyncio.ensure_future(reply)
         await asyncio.wait({replying, left}, return_when=asyncio.FIRST_COMPLETED)

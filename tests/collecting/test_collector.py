@@ -192,9 +192,7 @@ def test_an_info_becomes_a_column_that_is_nan_where_it_is_missing(value: Any) ->
     assert rollout.done.any()
     np.testing.assert_array_equal(rollout.success, np.where(rollout.done, float(value), np.nan))
     assert np.isnan(rollout.absent).all()
-    assert [episode.info for episode in rollout.episodes] == [{"success": value}] * len(
-        rollout.episodes
-    )
+    assert rollout.episodes["info"] == [{"success": value}] * rollout.done.sum()
 
 
 @pytest.mark.parametrize("value", ["yes", [1.0, 2.0], {"a": 1}, np.zeros(2)])
@@ -213,7 +211,7 @@ def test_an_info_that_no_env_reports_is_warned_of_once() -> None:
         with pytest.raises(UserWarning, match=r"no info has had 'sucess'.*mean 'success'"):
             collector.collect()  # Warnings are errors here; they lose nothing.
         rollouts = [collector.collect() for _ in range(2)]
-    lengths = [episode.length for rollout in rollouts for episode in rollout.episodes]
+    lengths = [rollout.episodes["length"].sum() for rollout in rollouts]
     assert rollouts[0].first[0]
     assert sum(lengths) <= 120
     assert rollouts[0].success[rollouts[0].done].all()
@@ -257,10 +255,9 @@ def test_each_agent_has_its_own_rewards_and_ends() -> None:
         assert rollout.terminated["tall"].tolist() == [0, 1, 1, 0, 1, 0, 1, 1, 0]
         assert rollout.terminated["small"].tolist() == [0, 0, 1, 0, 0, 0, 0, 1, 0]
         assert rollout.ends.tolist() == [4, 8, 2, 7]
-        assert [(e.index, e.total_reward, e.length) for e in rollout.episodes] == [
-            (0, 5.0, 3),
-            (1, 5.0, 3),
-        ]
+        assert rollout.episodes["index"].tolist() == [0, 1]
+        assert rollout.episodes["total_reward"].tolist() == [5.0, 5.0]
+        assert rollout.episodes["length"].tolist() == [3, 3]
         values = {agent: np.zeros(4) for agent in ("tall", "small")}
         found = rollout.advantages(rollout.value, values, 1.0, 1.0)
         assert found["small"].tolist() == [3, 2, 1, 2, 1, 3, 2, 1, 1]
@@ -600,10 +597,10 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
     with poles(2) as group:
         collector = Collector(group, zeros, num_transitions=60, min_results=2, seed=0)
         rollouts = [collector.collect() for _ in range(2)]
-        assert all(len(rollout.episodes) > 2 for rollout in rollouts)
+        assert all(len(rollout.episodes["length"]) > 2 for rollout in rollouts)
         with group.auto_reset(5):
             collector.collect()  # Episodes that were longer end.
-            assert {episode.length for episode in collector.collect().episodes} == {5}
+            assert set(collector.collect().episodes["length"]) == {5}
         with group.auto_reset(math.inf):
             pass
     endless = {"name": "endless", "task": Endless, "num_workers": 2, "placement": "inline"}
@@ -643,13 +640,13 @@ def test_a_rollout_reports_its_times() -> None:
         collector = Collector(group, zeros, num_transitions=20, min_results=2, seed=0)
         seconds = [collector.collect().seconds for _ in range(3)]
     for own in seconds:
-        assert 0 < own.policy <= own.collecting <= own.elapsed
-        assert own.env_busy > 0
-        assert own.waited_for_policy > 0
-        assert own.waited_for_learner >= 0
-    elapsed = sum(own.elapsed for own in seconds)
-    waited = sum(own.waited_for_policy + own.waited_for_learner for own in seconds)
-    assert sum(own.env_busy for own in seconds) + waited <= 2 * elapsed
+        assert 0 < own["policy"] <= own["collecting"] <= own["elapsed"]
+        assert own["env_busy"] > 0
+        assert own["waited_for_policy"] > 0
+        assert own["waited_for_learner"] >= 0
+    elapsed = sum(own["elapsed"] for own in seconds)
+    in_states = ("env_busy", "waited_for_policy", "waited_for_learner")
+    assert sum(own[name] for own in seconds for name in in_states) <= 2 * elapsed
 
 
 @pytest.mark.parametrize(

@@ -68,10 +68,9 @@ class Model:
                 followed = k + 1 < len(chain) and not flat("first")[chain[k + 1]]
                 assert (row in ends) == (not followed)
         ended: dict[int, list[tuple[float, int, float, bool]]] = {}
-        for episode in rollout.episodes:
-            told = episode.info["acted"], bool(episode.info.get("odd", False))
-            about = (episode.total_reward, episode.length, *told)
-            ended.setdefault(episode.index, []).append(about)
+        for index, total, length, info in zip(*rollout.episodes.values(), strict=True):
+            told = info["acted"], bool(info.get("odd", False))
+            ended.setdefault(index, []).append((total, length, *told))
         assert ended == over
         ages = version - flat("policy_version")
         assert (flat("lag") == ages).all()

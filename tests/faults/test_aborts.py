@@ -20,7 +20,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio._core.group.supervision import hang_detector
-from rlightning_aio.errors import EnvAborted
+from rlightning_aio.errors import EpisodeLost
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -200,7 +200,7 @@ async def test_a_wait_for_an_aborted_step_ends_though_nothing_else_happens() -> 
         aborting = asyncio.ensure_future(group.abort([ids[0]]))
         await asyncio.sleep(0)
         aborting.cancel()
-        with pytest.raises(EnvAborted) as aborted:
+        with pytest.raises(EpisodeLost) as aborted:
             await stepping
         assert aborted.value.results.ids() == ids[1:]
         assert np.asarray(aborted.value.results.restarted).tolist() == [True, False, False]

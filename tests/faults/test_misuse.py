@@ -21,7 +21,6 @@ from rlightning_aio.errors import (
     EnvBusy,
     GroupClosed,
     NothingPending,
-    NotInitialised,
     RLightningError,
     UnknownEnv,
 )
@@ -195,7 +194,7 @@ def test_use_before_init_and_after_close_is_refused(build: Start) -> None:
     """It doesn't hang, and the error says what to do."""
     group = build(entry())
     for use in USES.values():
-        with pytest.raises(NotInitialised, match="call init"):
+        with pytest.raises(RLightningError, match="call init"):
             use(group)
     group.init()
     group.close()

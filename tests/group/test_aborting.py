@@ -12,7 +12,7 @@ from group.sample_envs import Gate
 from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
 from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio._core.group.state.conditions import ABORTING, DEATH, LOST_EPISODE
-from rlightning_aio.errors import EnvAborted, EnvRaised, GroupClosed
+from rlightning_aio.errors import EnvRaised, EpisodeLost, GroupClosed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -126,11 +126,11 @@ async def test_a_call_can_be_aborted(start: Any, entry: Any) -> None:
     await group.abort(IDS[:1])
     batch, _ = await group.step(steps(IDS[0]))
     (outcome,) = await asyncio.gather(collect_calls(group), return_exceptions=True)
-    if isinstance(outcome, EnvAborted):
+    if isinstance(outcome, EpisodeLost):
         assert outcome.env_id == IDS[0]
     else:
         assert outcome == ["outer"] * 2  # It had ended before.
-    assert batch.restarted.tolist() == [isinstance(outcome, EnvAborted)]
+    assert batch.restarted.tolist() == [isinstance(outcome, EpisodeLost)]
     await group.step(steps(*IDS))
 
 

@@ -39,7 +39,6 @@ import rlightning_aio.sync
 from rlightning_aio._core.group.drivers.aio_driver import AioDriver
 from rlightning_aio.errors import (
     ConfigError,
-    EnvAborted,
     EnvBusy,
     EnvHung,
     EnvRaised,
@@ -323,7 +322,7 @@ async def test_a_call_that_waits_for_an_env_learns_that_it_was_aborted(
         collecting = asyncio.ensure_future(group.collect_async())
         await asyncio.sleep(0)
         await group.abort(["e-1", "e-2"])
-        with pytest.raises(EnvAborted, match=r"the step of env 'e-1'.* was aborted") as aborted:
+        with pytest.raises(EpisodeLost, match=r"the step of env 'e-1'.* was aborted") as aborted:
             await stepping
         assert aborted.value.results.ids() == ["e-0"]
         with pytest.raises(NothingPending):

@@ -1,4 +1,4 @@
-"""`PredictPolicy`: models with a `predict`, whose recurrent state belongs to one episode."""
+"""Models with a `predict`, whose recurrent state belongs to one episode."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from run_python import output_of
 
 from rlightning_aio import sync
 from rlightning_aio.evaluation import evaluate
-from rlightning_aio.policies import PredictPolicy
 
 
 class Recurrent:
@@ -43,7 +42,7 @@ def test_recurrent_state_belongs_to_one_episode() -> None:
     """It follows its env through batches of other envs, and is lost with its episode."""
     fields = {"env_kwargs": {"breaks": True}}
     with group_of(3, **fields) as group, group.auto_reset(100):
-        check(evaluate(group, PredictPolicy(Recurrent()), QUEUE, min_results=1))
+        check(evaluate(group, Recurrent(), QUEUE, min_results=1))
 
 
 def test_sub_environments_have_a_state_each() -> None:
@@ -57,7 +56,7 @@ def test_sub_environments_have_a_state_each() -> None:
 
     entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2}
     with sync.build_env_group({**entry, "placement": "inline"}) as group, group.auto_reset(2):
-        evaluate(group, PredictPolicy(Model()), 1)
+        evaluate(group, Model(), 1)
     assert seen == [((2, 4), [True, True]), ((2, 4), [False, False])]
 
 
@@ -77,7 +76,7 @@ def test_models_of_stable_baselines3() -> None:
         expected.append(total)
     entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
     with sync.build_env_group({**entry, "placement": "inline"}) as group, group.auto_reset(500):
-        found = evaluate(group, PredictPolicy(model), QUEUE)
+        found = evaluate(group, model, QUEUE)
     returns = {one.spec.seed: one.reward for one in found.attempts}
     assert [returns[spec.seed] for spec in QUEUE] == expected
 

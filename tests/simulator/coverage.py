@@ -58,16 +58,13 @@ ROWS: Final[dict[str, str]] = {
 _OTHERS: Final = ELSEWHERE + "tests/group/test_aborting.py; programs abort no call of another task"
 OTHERS: Final[dict[str, str]] = {
     "BUSY TICKET ABORTED": _OTHERS,
-    "EnvAborted": _OTHERS,
     "GroupClosed": ELSEWHERE + "tests/group/test_core.py; programs use no closed group",
-    "NotInitialised": ELSEWHERE + "tests/faults/test_misuse.py; programs begin with init",
     "INTACT GIVEN_UP": ELSEWHERE + "nowhere: what is intact is not in the table of losses",
 }
 """The same for transitions and errors that no program reaches."""
 
 NOT_OF_GROUPS: Final = {
-    "ClientRefused", "PolicyServerError", "ReplayDiverged",
-    "RLightningError", "EnvFault", "ConfigError",
+    "ClientRefused", "PolicyServerError", "RLightningError", "EnvFault", "ConfigError",
 }  # fmt: skip
 """Errors that are bases of others, or that no group of local envs raises."""
 

@@ -281,8 +281,8 @@ class Training(InContext):
             self.counts["transitions"] += 1
             ended.setdefault(index, []).extend(trail.ended[number:])
         found: dict[int, list[tuple[float, int]]] = {index: [] for index in ended}
-        for episode in rollout.episodes:
-            found.setdefault(episode.index, []).append((episode.total_reward, episode.length))
+        for index, total, length, _ in zip(*rollout.episodes.values(), strict=True):
+            found.setdefault(int(index), []).append((float(total), int(length)))
         require(found == ended, "episodes", found, ended)
 
 

@@ -8,11 +8,6 @@ Rule: it uses only the public `EnvGroup` and NumPy; torch shares the arrays.
 from __future__ import annotations
 
 from rlightning_aio.collecting.collector import Collector
-from rlightning_aio.collecting.rollout import EndedEpisode, Rollout, Seconds
+from rlightning_aio.collecting.rollout import Rollout
 
-__all__ = [
-    "Collector",
-    "EndedEpisode",
-    "Rollout",
-    "Seconds",
-]
+__all__ = ["Collector", "Rollout"]

@@ -1,4 +1,4 @@
-"""`Clock`: measures the times of a rollout (`rollout.Seconds`)."""
+"""`Clock`: measures the times of a rollout (`Rollout.seconds`)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import time
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from rlightning_aio.collecting.rollout import Seconds
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
@@ -62,17 +60,17 @@ class Clock:
         self._for_policy += waited - learner
         self._busy += int(np.add.reduce(batch.busy_ns))
 
-    def seconds(self) -> Seconds:
+    def seconds(self) -> dict[str, float]:
         """Return the sums since the last call. Call this right before `collect` returns."""
         now = time.monotonic_ns()
-        found = Seconds(
-            elapsed=(now - self._began) / 1e9,
-            collecting=(self._collecting + now - self._entered) / 1e9,
-            policy=self._policy / 1e9,
-            env_busy=self._busy / 1e9,
-            waited_for_policy=self._for_policy / 1e9,
-            waited_for_learner=self._for_learner / 1e9,
-        )
+        found = {
+            "elapsed": (now - self._began) / 1e9,
+            "collecting": (self._collecting + now - self._entered) / 1e9,
+            "policy": self._policy / 1e9,
+            "env_busy": self._busy / 1e9,
+            "waited_for_policy": self._for_policy / 1e9,
+            "waited_for_learner": self._for_learner / 1e9,
+        }
         self._began = now
         self._start()
         # Compensates for the time before `now`, which `leave` will add.

@@ -214,7 +214,7 @@ class Collector(Generic[G, R]):
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
                 takes part again in the next call, and one whose worker is not replaced doesn't.
             RLightningError: a robot's or a client's env has raised and was not reset since.
-            ReplayDiverged: the results are not those of `replay`, or it has ended.
+            RLightningError: the results are not those of `replay`, or it has ended.
             OSError: the order can't be written to `record`; the next call tries again.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """

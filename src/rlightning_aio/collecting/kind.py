@@ -9,8 +9,8 @@ import numpy as np
 
 from rlightning_aio.batch import BatchedData, joined
 from rlightning_aio.batch.contents import columns_of_responses
-from rlightning_aio.collecting.results import ResultRows, result_rows
-from rlightning_aio.collecting.rollout import Ends, Rollout, Seconds
+from rlightning_aio.collecting.results import ResultRows, columns_of_episodes, result_rows
+from rlightning_aio.collecting.rollout import Ends, Rollout
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
@@ -191,7 +191,7 @@ class EnvKind:
     def _space(self) -> gym.Space[Any] | None:
         return self._action_space
 
-    def rollout(self, held: ResultRows | None, version: int, seconds: Seconds) -> Rollout:
+    def rollout(self, held: ResultRows | None, version: int, seconds: dict[str, float]) -> Rollout:
         """Return the completed transitions as columns.
 
         `held` has the results without an answer; `version` is that of the newest policy.
@@ -210,7 +210,7 @@ class EnvKind:
         else:
             end_observation = mapped(lambda leaf: leaf[:0], columns["observation"])
         columns["lag"] = version - columns["policy_version"]
-        episodes = staging.episodes
+        episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
         found = Ends(ends, end_observation)
         return Rollout(columns, shape, found, full.num_chains, episodes, seconds)

@@ -20,7 +20,7 @@ from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch import joined
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.collecting.procedure import Procedure, run_as_one_call
-from rlightning_aio.errors import EnvFault, NothingPending, ReplayDiverged
+from rlightning_aio.errors import EnvFault, NothingPending, RLightningError
 from rlightning_aio.files import write_file
 from rlightning_aio.sealing import seal, unseal
 
@@ -247,15 +247,15 @@ class ReplayedGroup(_WrappedGroup[G]):
         """Collect the next recorded results, awaitable if the wrapped group is asynchronous.
 
         Raises:
-            ReplayDiverged: the record has ended; or an env can't answer as recorded, because it has
-                no request or another one, or because its worker was replaced.
+            RLightningError: the record has ended; or an env can't answer as recorded, because it
+                has no request or another one, or because its worker was replaced.
         """
         given = _COLLECT.bind(self.group, *args, **options).arguments
         return run_as_one_call(self._collect(given.get("deadline")), self.group)
 
     def _collect(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._place == len(self._record):
-            raise ReplayDiverged(
+            raise RLightningError(
                 f"the record ends after {self._calls} calls of collect_async; what was not "
                 "recorded can't be replayed"
             )
@@ -288,7 +288,7 @@ class ReplayedGroup(_WrappedGroup[G]):
         """Return True if an env has answered with a result of `kind`.
 
         Raises:
-            ReplayDiverged: it has answered with another kind.
+            RLightningError: it has answered with another kind.
         """
         if kind == _FAULT and env_id in self._faults:
             return True
@@ -302,8 +302,8 @@ class ReplayedGroup(_WrappedGroup[G]):
             raise self._diverged(env_id, now)
         return True
 
-    def _diverged(self, env_id: str, why: str) -> ReplayDiverged:
-        return ReplayDiverged(
+    def _diverged(self, env_id: str, why: str) -> RLightningError:
+        return RLightningError(
             f"the replay differs from its record in call {self._calls + 1} of collect_async (of "
             f"{self._record.num_calls}): env {env_id!r} is next there, but {why}; replay the same "
             "program with the same seeds and settings"

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
 from rlightning_aio.batch.contents import all_agents, ended_episodes, plain_columns
 from rlightning_aio.batch.infos import joined_infos, listed
-from rlightning_aio.collecting.rollout import EndedEpisode
 from rlightning_aio.collecting.trees import rows_of
 from rlightning_aio.protocol.columns import Tree, mapped
 
@@ -18,7 +17,10 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["ResultRows", "result_rows"]
+__all__ = ["Ended", "ResultRows", "columns_of_episodes", "result_rows"]
+
+Ended: TypeAlias = "tuple[int, float, int, dict[str, Any]]"
+"""An episode that has ended: a row of `Rollout.episodes`."""
 
 
 @dataclass(slots=True)
@@ -89,12 +91,12 @@ class ResultRows:
             parts.append(cast("dict[str, Any]", final))
         return {name for part in parts for name in part if f"_{name}" in part}
 
-    def episodes(self, rows: NDArray[np.intp]) -> list[EndedEpisode]:
+    def episodes(self, rows: NDArray[np.intp]) -> list[Ended]:
         """Episodes that ended in `rows`."""
         count = self.num_sub_envs
         chosen: list[int] = rows.tolist()
         several = len(self.head) > 1
-        found: list[EndedEpisode] = []
+        found: list[Ended] = []
         reported = ended_episodes(self.batch, [row // count for row in chosen])
         for row, (sums, info) in zip(chosen, reported, strict=True):
             if not sums:
@@ -105,8 +107,18 @@ class ResultRows:
                 total, length = total[sub_env], length[sub_env]
                 own = listed(joined_infos([info], count), count)[sub_env]
             own = own.get("final_info", own)
-            found.append(EndedEpisode(int(self.index[row]), float(total), int(length), own))
+            found.append((int(self.index[row]), float(total), int(length), own))
         return found
+
+
+def columns_of_episodes(ended: list[Ended]) -> dict[str, Any]:
+    """Return the columns of `Rollout.episodes`."""
+    return {
+        "index": np.array([index for index, *_ in ended], np.int64),
+        "total_reward": np.array([total for _, total, *_ in ended], np.float64),
+        "length": np.array([length for *_, length, _ in ended], np.int64),
+        "info": [info for *_, info in ended],
+    }
 
 
 def _numbers(name: str, columns: dict[str, Any], head: tuple[int, ...]) -> NDArray[np.float64]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -16,48 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["EndedEpisode", "Ends", "Rollout", "Seconds"]
+__all__ = ["Ends", "Rollout"]
 
 _Pair: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
-
-
-class EndedEpisode(NamedTuple):
-    """An episode whose last transition is in a rollout.
-
-    Attributes:
-        index: of the env in the group; see `BatchedData.index`.
-        total_reward: the undiscounted return since the reset, summed over agents.
-        length: steps since the reset.
-        info: of the last step, without that of the next episode.
-    """
-
-    index: int  # pyright: ignore[reportIncompatibleMethodOverride] -- the word for this everywhere
-    total_reward: float
-    length: int
-    info: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Seconds:
-    """Times of a rollout, in seconds.
-
-    Attributes:
-        elapsed: since the previous rollout was complete, or since the first call of `collect`.
-        collecting: inside `Collector.collect`; a learner that runs in between waits that long.
-        policy: in calls of the policy.
-        env_busy: in steps and resets, summed over envs.
-        waited_for_policy: between the result of an env and its next request, summed over envs,
-            minus `waited_for_learner`: envs wait for the policy, or for results of other envs to
-            fill a batch.
-        waited_for_learner: likewise, while no call of `collect` was in progress.
-    """
-
-    elapsed: float
-    collecting: float
-    policy: float
-    env_busy: float
-    waited_for_policy: float
-    waited_for_learner: float
 
 
 class Ends(NamedTuple):
@@ -95,10 +55,19 @@ class Rollout:
         first: True if an episode begins with the transition, or continues after a loss.
         ends: ``[k]``, positions of the ends (for ``[T, N]``, in the flattened block). The last
             transitions of chains come first, in the order of chains.
-        episodes: those that ended in this rollout, in the order of arrival: terminated, truncated,
-            or cut by the step limit, but not lost with a worker. They may have begun earlier.
+        episodes: columns of those that ended in this rollout, in the order of arrival: terminated,
+            truncated, or cut by the step limit, but not lost with a worker. They may have begun
+            earlier. ``index`` is that of the env in the group, ``total_reward`` the undiscounted
+            return since the reset, summed over agents, ``length`` the steps since the reset, and
+            ``info`` a list: the info of the last step, without that of the next episode.
         num_chains: number of envs with transitions in this rollout.
-        seconds: times of the rollout.
+        seconds: times by name. ``elapsed``: since the previous rollout was complete, or since the
+            first call of `collect`. ``collecting``: inside `Collector.collect`; a learner that runs
+            in between waits that long. ``policy``: in calls of the policy. ``env_busy``: in steps
+            and resets, summed over envs. ``waited_for_policy``: between the result of an env and
+            its next request, summed over envs, minus ``waited_for_learner``: envs wait for the
+            policy, or for results of other envs to fill a batch. ``waited_for_learner``: likewise,
+            while no call of `collect` was in progress.
     """
 
     observation: Tree
@@ -118,8 +87,8 @@ class Rollout:
         shape: tuple[int, ...],
         ends: Ends,
         num_chains: int,
-        episodes: list[EndedEpisode],
-        seconds: Seconds,
+        episodes: dict[str, Any],
+        seconds: dict[str, float],
     ) -> None:
         self._columns = columns
         self.shape = shape

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.collecting.results import ResultRows
-    from rlightning_aio.collecting.rollout import EndedEpisode
+    from rlightning_aio.collecting.results import Ended, ResultRows
     from rlightning_aio.protocol.columns import Rows, Tree
 
 __all__ = ["Full", "Staging"]
@@ -65,7 +64,7 @@ class Staging:
     def __init__(self, quota: int, infos: Sequence[str]) -> None:
         self._quota = quota
         self._infos = infos
-        self.episodes: list[EndedEpisode] = []
+        self.episodes: list[Ended] = []
         self.info_names: set[str] = set()
         self.columns: dict[str, Tree] = {}
         self.complete = 0

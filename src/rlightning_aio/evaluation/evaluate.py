@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import index
-from typing import TYPE_CHECKING, Any, SupportsIndex, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, overload
 
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.attempts.queue import AttemptQueue
@@ -14,6 +14,7 @@ from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation.episode_video import EpisodeVideo
 from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.evaluation.playing import Options, PolicyPlay
+from rlightning_aio.policies.predicting import Model, PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
@@ -29,11 +30,13 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluate"]
 
+Policy: TypeAlias = "Callable[[BatchedData], Any] | Model"
+
 
 @overload
 def evaluate(
     group: SyncEnvGroup,
-    policy: Callable[[BatchedData], Any] | None,
+    policy: Policy | None,
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -50,7 +53,7 @@ def evaluate(
 @overload
 def evaluate(
     group: AsyncEnvGroup,
-    policy: Callable[[BatchedData], Any] | None,
+    policy: Policy | None,
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -66,7 +69,7 @@ def evaluate(
 
 def evaluate(
     group: Any,
-    policy: Callable[[BatchedData], Any] | None,
+    policy: Policy | None,
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -86,7 +89,8 @@ def evaluate(
         group: with nothing `pending` and without env_servers.
         policy: called with a batch of results (`BatchedData`). It returns actions, or columns by
             name with ``action``, or what `BatchedData.respond` returns, or a list of such; with an
-            asynchronous group, it may be awaitable. None: random actions.
+            asynchronous group, it may be awaitable. Or a model with the `predict` of
+            Stable-Baselines3, for its most probable actions. None: random actions.
         episodes: a number for each env, and for each sub-environment; or a queue of episodes,
             each to be played once by any free env.
         seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
@@ -115,15 +119,14 @@ def evaluate(
         OSError: nothing can be written into the folder `video`.
     """
     is_number = isinstance(episodes, SupportsIndex)
-    _check_numbers({"min_results": min_results} | ({"episodes": episodes} if is_number else {}))
+    _check_numbers({"min_results": min_results, "episodes": episodes if is_number else None})
     _check(group, one_each=video is not None or not is_number)
     films = None if video is None else EpisodeVideo(video, video_if, video_failed)
     queue = AttemptQueue(group, Rules(retries=retries), results)
     tasks = _filled(group, queue, episodes, seed)
-    policy, min_results = policy or _random(group, seed), min_results or default_min_results(group)
-    play = PolicyPlay(group, policy, queue, Evaluation(), Options(min_results, films, on_episode))
-    play.note_known(tasks)
-    return run(_resetting(play, group), group)
+    options = Options(min_results or default_min_results(group), films, on_episode)
+    play = PolicyPlay(group, _called(policy, group, seed), queue, Evaluation(), options)
+    return run(_resetting(play, tasks, group), group)
 
 
 def _filled(
@@ -155,13 +158,17 @@ def _each(group: Any, queue: AttemptQueue, episodes: int, seed: int | None) -> l
     return tasks
 
 
-def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
+def _resetting(play: PolicyPlay, tasks: list[TaskInPlay], group: Any) -> Procedure[Evaluation]:
+    play.note_known(tasks)
     with ensure_auto_reset(group):
         return (yield from play.to_the_end())
 
 
-def _random(group: Any, seed: int | None) -> RandomPolicy:
-    return RandomPolicy({meta.env_id: meta.action_space for meta in group.metas}.get, seed)
+def _called(policy: Policy | None, group: Any, seed: int | None) -> Callable[[BatchedData], Any]:
+    """Return a policy as a function of a batch."""
+    if policy is None:
+        return RandomPolicy({meta.env_id: meta.action_space for meta in group.metas}.get, seed)
+    return policy if callable(policy) else PredictPolicy(policy)
 
 
 def _check_numbers(numbers: dict[str, Any]) -> None:

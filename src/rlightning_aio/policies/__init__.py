@@ -8,6 +8,5 @@ from __future__ import annotations
 
 from rlightning_aio.policies.chunks import ActionChunks
 from rlightning_aio.policies.lerobot import LeRobotPolicy
-from rlightning_aio.policies.predicting import PredictPolicy
 
-__all__ = ["ActionChunks", "LeRobotPolicy", "PredictPolicy"]
+__all__ = ["ActionChunks", "LeRobotPolicy"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -12,21 +12,26 @@ from rlightning_aio.protocol.columns import mapped
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["PredictPolicy"]
+__all__ = ["Model", "PredictPolicy"]
+
+
+class Model(Protocol):
+    """A model that predicts actions, as `PredictPolicy` asks it to."""
+
+    predict: Any
 
 
 class PredictPolicy:
-    """Returns the actions of a model's `predict`.
+    """Returns the most probable actions of a model, by its `predict`.
 
     Args:
         model: a model of Stable-Baselines3, or any object whose ``predict(observation, state,
             episode_start, deterministic)`` returns actions and the state of a recurrent network, a
             tuple of arrays ``[layers, n, …]``, or None.
-        deterministic: return the most probable actions; otherwise they are drawn.
     """
 
-    def __init__(self, model: Any, *, deterministic: bool = True) -> None:
-        self._model, self._deterministic = model, deterministic
+    def __init__(self, model: Model) -> None:
+        self._model = model
         self._states: dict[int, tuple[Any, ...]] = {}
         """State of the network by position in the group, sub-environments counted."""
 
@@ -41,7 +46,7 @@ class PredictPolicy:
             observation,
             state=self._gathered(places),
             episode_start=begins(batch).reshape(-1),
-            deterministic=self._deterministic,
+            deterministic=True,
         )
         if state is not None:
             for row, place in enumerate(places):

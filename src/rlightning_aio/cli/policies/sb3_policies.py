@@ -13,7 +13,7 @@ import zipfile
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.policies import PredictPolicy
+from rlightning_aio.policies.predicting import PredictPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -149,7 +149,7 @@ class GroupInterface(Facade):
 
         The episodes are over: reset the envs, or step them, which resets them first and marks the
         result as after a restart. Robots move only when they are reset. Another call that waits
-        for one of the envs raises `EnvAborted`; `collect_async` waits for the rest. Errors that
+        for one of the envs raises `EpisodeLost`; `collect_async` waits for the rest. Errors that
         were not collected stay for the next collect. Cancelled, it ends the requests all the same.
 
         Raises:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio._core.group.state.request_states import COLLECTOR
-from rlightning_aio.errors import EnvAborted
+from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.registry import ENVS
@@ -93,9 +93,9 @@ class Aborts:
         self._arrivals.admit(slots, self._intake.now)
         return now
 
-    def _fault(self, slot: int) -> EnvAborted:
+    def _fault(self, slot: int) -> EpisodeLost:
         doing = Operation(self._requests.numbering.op(slot)).name.lower()
-        return EnvAborted(
+        return EpisodeLost(
             f"the {doing} of {self._envs.describe(slot)} was aborted by the group's abort() or "
             "drain(), or by the end of its episode(); its episode is over: reset it to go on",
             env_id=self._envs.env_ids[slot],

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rlightning_aio.errors import EnvAborted, NothingPending, RLightningError
+from rlightning_aio.errors import EpisodeLost, NothingPending, RLightningError
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Calls:
         for ticket in tickets:
             self._requests.settle(ticket)
         faults = [fault for ticket in tickets for fault in ticket.faults]
-        return [fault for fault in faults if not isinstance(fault, EnvAborted)]
+        return [fault for fault in faults if not isinstance(fault, EpisodeLost)]
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
         """Wait for all calls of `send_calls`, and return their values in order of sending."""

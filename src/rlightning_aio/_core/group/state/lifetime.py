@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rlightning_aio._core.group.state.conditions import CLOSED
-from rlightning_aio.errors import GroupClosed, NotInitialised
+from rlightning_aio.errors import GroupClosed, RLightningError
 
 if TYPE_CHECKING:
     from rlightning_aio._core.group.state.conditions import Conditions
@@ -37,10 +37,10 @@ class Lifetime:
         self._conditions.note(CLOSED, True)
 
     def check_open(self) -> None:
-        """Raise `NotInitialised` before `init`, and `GroupClosed` after `close`."""
+        """Raise `RLightningError` before `init`, and `GroupClosed` after `close`."""
         if self.closed:
             raise GroupClosed("this group is closed; build a new one")
         if not self.open:
-            raise NotInitialised(
+            raise RLightningError(
                 "this group has not been initialised; call init() first, or use it in a with block"
             )
