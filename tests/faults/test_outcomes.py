@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import math
-import os
 import pickle
-import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from faults.deeds import BLAME, CUT, DIE, END, GO, HANG, RAISE, Awaited, Deeds, Fails
 
 import rlightning_aio as rl
 from rlightning_aio.outcomes import TimeSpent
@@ -23,52 +21,6 @@ if TYPE_CHECKING:
     from faults.driven import Driven
 
     Start: TypeAlias = Callable[..., Driven]
-
-GO, END, CUT, RAISE, BLAME, DIE, HANG = range(7)
-
-
-class Deeds:
-    """Its action, or the option ``deed`` of its reset, says what it does."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(7)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        del seed
-        self._do((options or {}).get("deed", GO))
-        return np.zeros(1), {}
-
-    def step(self, action: Any) -> Any:
-        self._do(action)
-        return np.ones(1), 1.0, bool(action == END), bool(action == CUT), {}
-
-    def _do(self, deed: int) -> None:
-        if deed == RAISE:
-            raise ValueError("as asked")
-        if deed == BLAME:
-            raise rl.EnvError("the action is nonsense", blame="policy")
-        if deed == DIE:
-            os._exit(3)
-        if deed == HANG:
-            time.sleep(3600)
-
-
-class Fails(Deeds, gym.Env[Any, Any]):
-    """The same as an env of Gymnasium."""
-
-
-class Awaited(Deeds):
-    """The same with coroutines."""
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        if (options or {}).get("deed") == HANG:
-            await asyncio.sleep(3600)
-        return super().reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        if action == HANG:
-            await asyncio.sleep(3600)
-        return super().step(action)
 
 
 def entry(**fields: Any) -> dict[str, Any]:

@@ -13,12 +13,11 @@ from collections import Counter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from faults.test_outcomes import CUT, DIE, GO, RAISE, Fails
-from faults.test_outcomes import END as FAIL_END
-from faults.test_outcomes import HANG as HANG_UP
+from faults.deeds import CUT, DIE, GO, RAISE
+from faults.deeds import END as FAIL_END
+from faults.deeds import HANG as HANG_UP
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
 from patience import HANG
@@ -32,7 +31,6 @@ from rlightning_aio.metrics import FIGURES, _Reader
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-gym.register("Fails-v0", Fails)
 OF_LOOP = {"loop_lag_seconds_p99", "loop_lag_seconds_max"}
 OF_GROUP = {"batch_size", "seconds_waiting_for_envs", "seconds_in_trainer"} | OF_LOOP
 OF_ENVS = [
@@ -285,7 +283,7 @@ def test_a_killed_worker_is_counted() -> None:
 def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None:
     """In batches and in errors, of every kind; steps that are aborted are cancelled."""
     rng, counted = random.Random(1), Counter[str]()
-    task = {"backend": "gymnasium", "task": "group.test_metrics:Fails-v0", **fields}
+    task = {"backend": "gymnasium", "task": "faults.deeds:Fails-v0", **fields}
     config = {"name": "f", **task, "step_timeout": 0.3, "max_restarts": 100}
 
     def note(batch: rlightning_aio.BatchedData | None) -> None:
