@@ -14,6 +14,7 @@ from faults.driven import kill, stop
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from vector.numbered import Walk, counted
 from vector.toys import Mortal, assert_alike
 
 from rlightning_aio.errors import ConfigError, WorkerDied
@@ -454,23 +455,6 @@ def test_a_masked_reset_is_refused_where_a_death_has_ended_other_episodes(
     envs.close()
 
 
-class Walk(gym.Env[Any, Any]):
-    """Observes its number of steps; action 2 ends the episode, and action 3 its worker."""
-
-    observation_space = gym.spaces.Box(-1, 99, (1,), np.float64)
-    action_space = gym.spaces.Discrete(4)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = 0
-        return np.zeros(1), {}
-
-    def step(self, action: Any) -> Any:
-        if action == 3:
-            os._exit(1)
-        self.count += 1
-        return np.array([float(self.count)]), 1.0, bool(action == 2), False, {}
-
-
 @pytest.mark.parametrize("on_worker_death", ["restart", "resume"])
 def test_a_masked_reset_is_refused_where_a_neighbour_has_taken_the_worker_along(
     on_worker_death: str,
@@ -494,24 +478,6 @@ def test_a_masked_reset_is_refused_where_a_neighbour_has_taken_the_worker_along(
     envs.close()
 
 
-class Counted(gym.Env[Any, Any]):
-    """Observes [episode, step]; action 1 ends the episode."""
-
-    observation_space = gym.spaces.Box(-1, 99, (2,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    episode = 0
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.episode += 1
-        self.count = 0
-        return np.array([self.episode, 0.0]), {"begun": self.episode}
-
-    def step(self, action: Any) -> Any:
-        self.count += 1
-        info = {"count": self.count}
-        return np.array([self.episode, self.count], float), 1.0, bool(action), False, info
-
-
 SAVED = {
     "a reset": ([0], 0),
     "a step": ([0, 0, 0], 2),
@@ -532,13 +498,6 @@ def fits(mode: AutoresetMode, on_worker_death: str, saved: str, width: int) -> b
 
 
 CASES = [case for case in product(MODES, ["restart", "resume"], SAVED, [0, 2]) if fits(*case)]
-
-
-def counted(width: int, mode: AutoresetMode) -> list[Callable[[], Any]]:
-    """Two callables, each of a single env or of `width` that are stepped together."""
-    if not width:
-        return [Counted] * 2
-    return [lambda: SyncVectorEnv([Counted] * width, autoreset_mode=mode)] * 2
 
 
 def ending(lost: Any, saved: str) -> Any:

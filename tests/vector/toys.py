@@ -12,8 +12,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.vector.lazy_infos import LazyColumns
-
 
 class Toy(gym.Env[Any, Any]):
     """Ends at random, by its own generator; reports many infos."""
@@ -97,6 +95,9 @@ def toy() -> gym.Env[Any, Any]:
 
 def assert_alike(found: Any, expected: Any, where: str = "") -> None:
     """Equal in structure, type, dtype, shape and value; the order of keys doesn't matter."""
+    # Not at the top: workers, which import this module, don't compare anything.
+    from rlightning_aio.vector.lazy_infos import LazyColumns
+
     found, expected = (
         dict(each) if isinstance(each, LazyColumns) else each for each in (found, expected)
     )
