@@ -38,6 +38,8 @@ MODULES: Final = {
 ONLY: Final = {"registry": ["Backend"], "envs.fast_path": ["FastPath"]}
 """Modules of which it imports these alone."""
 PACKAGE: Final = "rlightning_aio"
+PYDANTICS: Final = {"model_config", "model_post_init"}
+"""Attributes that pydantic puts into the classes of its models."""
 
 
 @dataclass
@@ -71,7 +73,7 @@ def _count(name: str, value: Any, row: Row) -> None:
     if inspect.isclass(value):
         own = [c for c in value.__mro__ if c.__module__.startswith(PACKAGE)]
         members = {m for c in own for m in (*vars(c), *vars(c).get("__annotations__", ()))}
-        public = sorted(m for m in members if not m.startswith("_") and m != "model_config")
+        public = sorted(m for m in members if not m.startswith("_") and m not in PYDANTICS)
         row.members += [f"{name}.{member}" for member in public]
         methods = [inspect.getattr_static(value, member, None) for member in public]
         takes = value.__init__ if any("__init__" in vars(c) for c in own) else None

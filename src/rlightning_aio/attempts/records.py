@@ -1,4 +1,8 @@
-"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task."""
+"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task.
+
+Rule: only this package makes records, so the public classes have no constructor, and those that it
+makes (`MadeAttempt`, `MadeGroup`) have one.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +19,10 @@ from rlightning_aio.outcomes import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["Attempt", "AttemptGroup", "attempt_of"]
+__all__ = ["Attempt", "AttemptGroup", "MadeAttempt", "MadeGroup", "attempt_of"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, init=False)
 class Attempt:
     """One attempt at a task, after its last try; or an episode of `evaluate`.
 
@@ -83,6 +87,11 @@ class Attempt:
         return finite(row)
 
 
+@dataclass(slots=True)
+class MadeAttempt(Attempt):
+    """An attempt with a constructor."""
+
+
 def attempt_of(row: Mapping[str, Any]) -> Attempt:
     """Make an attempt from what `Attempt.to_json` returned.
 
@@ -97,7 +106,7 @@ def attempt_of(row: Mapping[str, Any]) -> Attempt:
     reward = fields.pop("reward")
     if reward is None and not outcome.is_failure:  # It was not finite.
         reward = math.nan
-    return Attempt(
+    return MadeAttempt(
         spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
     )
 
@@ -109,7 +118,7 @@ def _json_or_none(value: Any) -> Any:
         return None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, init=False)
 class AttemptGroup(Sequence[Attempt]):
     """All attempts at one task, in the order of their indices.
 
@@ -144,3 +153,8 @@ class AttemptGroup(Sequence[Attempt]):
 
     def __iter__(self) -> Iterator[Attempt]:
         return iter(self.attempts)
+
+
+@dataclass(slots=True)
+class MadeGroup(AttemptGroup):
+    """All attempts at one task, with a constructor."""
