@@ -74,12 +74,9 @@ class ClientThread:
     def __init__(
         self, address: str, name: str, env: CountingEnv | None = None, **options: Any
     ) -> None:
-        host, _, port = address.removeprefix("tcp://").rpartition(":")
         self.env = env or CountingEnv()
         self.error: BaseException | None = None
-        self.client = RemoteEnvClient(
-            self.env, host, int(port), name=name, **{"heartbeat": 5.0, **options}
-        )
+        self.client = RemoteEnvClient(self.env, address, name=name, **{"heartbeat": 5.0, **options})
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 

@@ -22,6 +22,7 @@ from rlightning_aio._core.hosts.env_server import (
     listener,
     rate_limiter,
 )
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, ClientHello, Ping, Writer
 from rlightning_aio.remote import RemoteEnvClient
@@ -282,3 +283,11 @@ def test_clients_are_admitted_although_many_connections_come_and_go(
         group.close()
         for friend in friends:
             friend.join()
+
+
+@pytest.mark.parametrize(
+    "given", [("127.0.0.1",), ("tcp://127.0.0.1",), ("tcp://127.0.0.1:5555", 5555), ("ipc://x", 1)]
+)
+def test_an_address_that_is_not_whole_or_given_twice_is_refused(given: Any) -> None:
+    with pytest.raises(ConfigError, match=r"give a host and a port, or tcp://127.0.0.1:5555"):
+        RemoteEnvClient(CountingEnv(), *given)

@@ -76,8 +76,8 @@ class RemoteEnvClient:
 
     Args:
         env: newly built. The client owns it, initialises it and closes it.
-        hostname: of the server.
-        port: of the server.
+        hostname: of the server, or its whole address, such as ``group["arms"].address``.
+        port: of the server; None with a whole address.
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
         name: unique at the server; by default this machine's name and the process id.
@@ -90,15 +90,15 @@ class RemoteEnvClient:
         num_sessions: sessions so far.
 
     Raises:
-        ConfigError: the name is too long, the env's spaces can't be announced, or the keys
-            can't be read.
+        ConfigError: the name is too long, the address is incomplete, the env's spaces can't be
+            announced, or the keys can't be read.
     """
 
     def __init__(
         self,
         env: BaseEnv,
         hostname: str,
-        port: int,
+        port: int | None = None,
         *,
         keys: str | os.PathLike[str] | None = None,
         name: str | None = None,
@@ -112,7 +112,7 @@ class RemoteEnvClient:
         self.num_steps = 0
         self.num_sessions = 0
         self._env = env
-        self._address = f"tcp://{f'[{hostname}]' if ':' in hostname else hostname}:{port}"
+        self._address = _address(hostname, port)
         self._keys = None if keys is None else read_client_keys(keys)
         self._heartbeat = heartbeat
         try:
@@ -377,3 +377,15 @@ _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server uses other security: keys on one side only?",
     zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the handshake was not completed: is the key right?",
 }
+
+
+def _address(hostname: str, port: int | None) -> str:
+    """Return ``tcp://host:port``; an IPv6 host is in brackets."""
+    if hostname.startswith("tcp://") and port is None and hostname.rpartition(":")[2].isdigit():
+        return hostname
+    if "://" in hostname or port is None:
+        raise ConfigError(
+            f"RemoteEnvClient: {hostname!r} with port {port} is no address; give a host and a "
+            "port, or tcp://127.0.0.1:5555 alone"
+        )
+    return f"tcp://{f'[{hostname}]' if ':' in hostname else hostname}:{port}"
