@@ -737,9 +737,11 @@ class Model:
             self.gone(env, fault)
             env.seen = max(env.seen + 1, request.deaths)
             return
-        if env.client is not None and isinstance(fault, EnvAway):
-            env.client.note_away(request)
-            return
+        if env.client is not None:
+            env.client.is_known = True
+            if isinstance(fault, EnvAway):
+                env.client.note_away(request)
+                return
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
         if request.kind != "call":
@@ -778,6 +780,12 @@ class Model:
             env.state.infos = []
             env.dirty = True
 
+    def _most_errors(self, env: Env) -> int:
+        """How often in a row an env may have raised, also in its request before its worker died."""
+        request = env.request if env.entry.on_error == "restart" else None
+        may_raise = request is not None and bool(self._raising(env, request))
+        return env.errors[1] + may_raise
+
     def gone(self, env: Env, fault: WorkerDied) -> None:
         """Check an error that says that an env's worker has ended for good, or during a call."""
         host, entry = env.host, env.entry
@@ -789,7 +797,7 @@ class Model:
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind == "call"
         if entry.on_death == "raise" or not in_call:
-            errors = [one.errors[1] for one in self.envs.values() if one.host is host]
+            errors = [self._most_errors(one) for one in self.envs.values() if one.host is host]
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
             require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
             for other in self.envs.values():

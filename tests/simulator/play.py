@@ -574,13 +574,19 @@ class Play(Session):
 
     async def reset(self, envs: list[Env], rng: Random | None = None) -> bool:
         others = [env for env in self.model.envs.values() if all(env is not e for e in envs)]
-        everyone = all(map(is_unasked, others)) and rng is not None and rng.random() < 0.7
-        everyone = everyone and not (self.clients and "tasks" in self.features)
+        in_order = [env.env_id for env in envs] == [
+            env_id for env_id in self.model.envs if env_id in {env.env_id for env in envs}
+        ]
+        everyone = in_order and rng is not None and all(map(is_unasked, others))
+        if rng is not None and self.clients:
+            everyone = everyone and "tasks" not in self.features and rng.random() < 0.7
         if everyone:  # Also clients that may have joined.
             envs = list(self.model.envs.values())
             for env in others:
                 env.request = None
         seed, options, requests = self.resets(envs, rng)
+        if rng is not None and not self.clients:
+            everyone = everyone and rng.random() < 0.7
         ids = None if everyone else [*requests]
 
         def take(found: Any) -> None:
