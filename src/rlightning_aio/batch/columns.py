@@ -233,16 +233,18 @@ class ResultColumns(msgspec.Struct):
             reward = self.reward.item(row)
             terminated = self.flags.item(row, TERMINATED)
             truncated = self.flags.item(row, TRUNCATED)
+            info = self.info_of(row) if terminated or truncated else self.reported_info_of(row)
         else:
             heads = self.reward, self.terminated, self.truncated
             reward, terminated, truncated = (self.head_of(head, row) for head in heads)
+            info = self.info_of(row)
         fields = {
             "env_id": self.names.env_ids[self.slots.item(row)],
             "observation": self.observation_of(row),
             "last_reward": reward,
             "last_terminated": terminated,
             "last_truncated": truncated,
-            "info": self.info_of(row),
+            "info": info,
             "ts_env_sent_ns": self.sent_ns_of(row),
         }
         return unchecked(MultiAgentEnvRet if self.agents else EnvRet, fields, kept.get("extra"))
