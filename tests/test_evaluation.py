@@ -15,12 +15,7 @@ from rlightning_aio import sync
 from rlightning_aio.attempts.file import log_of
 from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, endless, evaluate
-from rlightning_aio.evaluation.estimates import (
-    Estimate,
-    MadeEstimate,
-    mean_estimate,
-    wilson_estimate,
-)
+from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -461,12 +456,12 @@ def test_what_nothing_is_known_of() -> None:
 @pytest.mark.parametrize(
     ("estimate", "printed"),
     [
-        (MadeEstimate(4.876, 4.281, 5.471, 80), "4.88 [4.28, 5.47] (n=80)"),
-        (MadeEstimate(1234.5, 1199.2, 1269.8, 9), "1234 [1199, 1270] (n=9)"),
-        (MadeEstimate(0.0123, 0.0119, 0.0127, 9), "0.01230 [0.01190, 0.01270] (n=9)"),
-        (MadeEstimate(500.0, 500.0, 500.0, 3), "500.00 [500.00, 500.00] (n=3)"),
-        (MadeEstimate(7.0, None, None, 1), "7 (n=1)"),
-        (MadeEstimate(float("nan"), None, None, 4), "nan (n=4)"),
+        (Estimate(4.876, 4.281, 5.471, 80), "4.88 [4.28, 5.47] (n=80)"),
+        (Estimate(1234.5, 1199.2, 1269.8, 9), "1234 [1199, 1270] (n=9)"),
+        (Estimate(0.0123, 0.0119, 0.0127, 9), "0.01230 [0.01190, 0.01270] (n=9)"),
+        (Estimate(500.0, 500.0, 500.0, 3), "500.00 [500.00, 500.00] (n=3)"),
+        (Estimate(7.0, None, None, 1), "7 (n=1)"),
+        (Estimate(float("nan"), None, None, 4), "nan (n=4)"),
     ],
 )
 def test_an_estimate_prints_what_is_known(estimate: Estimate, printed: str) -> None:

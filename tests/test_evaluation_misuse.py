@@ -14,8 +14,8 @@ from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
 from rlightning_aio import Outcome
+from rlightning_aio.attempts import Attempt
 from rlightning_aio.attempts.file import log_of
-from rlightning_aio.attempts.records import MadeAttempt
 from rlightning_aio.evaluation import EpisodeSpec, ResultsFile
 
 
@@ -114,7 +114,7 @@ def test_failures_of_a_task_that_is_there_twice_are_counted_apart(tmp_path: Path
         log_of(results).add_failure(spec, 0, 0, first)
         log_of(results).add_failure(spec, 0, 0, second)
         ended = Outcome("terminated", "policy", "its episode ended", "env-0", attempt=1)
-        log_of(results).add(MadeAttempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
+        log_of(results).add(Attempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
         assert log_of(results).failures(spec, 0) == [second]
     with ResultsFile(path) as results:
         assert log_of(results).failures(spec, 0) == [second]

@@ -9,12 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.collecting.rollout import Ends, MadeRollout
+from rlightning_aio.collecting import Rollout
+from rlightning_aio.collecting.rollout import Ends
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from rlightning_aio.collecting import Rollout
 
 
 def rollout_of(
@@ -33,7 +32,7 @@ def rollout_of(
     others = np.union1d(np.flatnonzero(columns["done"]), np.array(cuts, int))
     places = np.concatenate([lasts, np.setdiff1d(others, lasts)]).astype(np.intp)
     empty = np.zeros((len(places), 1))
-    return MadeRollout(columns, reward.shape, Ends(places, empty), len(lasts), {}, {})
+    return Rollout(columns, reward.shape, Ends(places, empty), len(lasts), {}, {})
 
 
 def cleanrl(
@@ -170,7 +169,7 @@ def test_each_agent_has_its_own_advantages() -> None:
         name: {"a": block[name], "b": 2 * block[name] if name == "reward" else ~block[name]}
         for name in ("reward", "terminated", "truncated", "done")
     }
-    both = MadeRollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, {}, {})
+    both = Rollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, {}, {})
     values = {"a": np.zeros(2), "b": np.zeros(2)}
     found = both.advantages(values, {"a": [9.0], "b": [9.0]}, 0.5, 1.0)
     assert found["a"].tolist() == [1 + 0.5 * 2, 2.0]
@@ -251,7 +250,7 @@ def test_values_after_an_agents_end_are_ignored(number: float) -> None:
     block = rollout_of([1, 2, 3], [0, 1, 0], [0, 0, 0], lengths=[3])
     ends = np.array([2], np.intp)
     columns = {name: {"a": block[name]} for name in ("reward", "terminated", "truncated", "done")}
-    rollout = MadeRollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, {}, {})
+    rollout = Rollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, {}, {})
     values = {"a": np.array([0.0, 0.0, number])}
     gains = rollout.advantages(values, {"a": [9.0]}, 0.5, 1.0)
     assert gains["a"][:2].tolist() == [1 + 0.5 * 2, 2.0]

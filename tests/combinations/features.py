@@ -17,7 +17,7 @@ from timelines import Seen
 
 from rlightning_aio.collecting import Collector, Rollout
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
-from rlightning_aio.collecting.rollout import Ends, MadeRollout
+from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.evaluation import evaluate
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def copied(rollout: Rollout) -> Rollout:
     """One whose arrays nobody else writes to."""
     columns = {name: rollout[name].copy() for name in rollout}
     ends = Ends(rollout.ends, rollout.end_observation.copy())
-    return MadeRollout(
+    return Rollout(
         columns,
         rollout.shape,
         ends,

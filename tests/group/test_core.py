@@ -21,6 +21,7 @@ from rlightning_aio.errors import (
     EnvRaised,
     GroupClosed,
     NothingPending,
+    RLightningError,
     WorkerDied,
 )
 from rlightning_aio.types import PolicyResponse
@@ -230,14 +231,15 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
         group.steps.step_async(steps(0), group.now)
         group.finish(0)
         group.close()
-    hint = "init" if moment == "before init" else "build a new one"
-    with pytest.raises(GroupClosed, match=hint):
+    before = moment == "before init"
+    error, hint = (RLightningError, "init") if before else (GroupClosed, "build a new one")
+    with pytest.raises(error, match=hint):
         collect(group).result()
-    with pytest.raises(GroupClosed, match=hint):
+    with pytest.raises(error, match=hint):
         group.steps.step_async(steps(0), group.now)
-    with pytest.raises(GroupClosed, match=hint):
+    with pytest.raises(error, match=hint):
         group.begin(group.core.reset(group.now, None, None, None)).result()
-    with pytest.raises(GroupClosed, match=hint):
+    with pytest.raises(error, match=hint):
         group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))).result()
     group.close()
 

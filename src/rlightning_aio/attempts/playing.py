@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.queue import AttemptQueue
-from rlightning_aio.attempts.records import Attempt, AttemptGroup, MadeAttempt, MadeGroup
+from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
 from rlightning_aio.attempts.tasks import TaskSource
 from rlightning_aio.attempts.tries import Try, surely
@@ -235,12 +235,12 @@ class _Engine:
             left += self._queue.withdraw(task)
         for job in left:
             cancelled = Outcome("cancelled", "caller", _SURPLUS, attempt=len(job.failures))
-            task.attempts[job.index] = MadeAttempt(
+            task.attempts[job.index] = Attempt(
                 task.spec, job.index, cancelled, failures=tuple(job.failures)
             )
         attempts = [task.attempts[index] for index in sorted(task.attempts)]
         is_complete = task.num_whole >= needed(self._rules, self._size)
-        self.done.append(MadeGroup(task.spec, attempts, is_complete))
+        self.done.append(AttemptGroup(task.spec, attempts, is_complete))
         self.news.set()
 
     # -- envs that are not there ------------------------------------------------------

@@ -1,8 +1,4 @@
-"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task.
-
-Rule: only this package makes records, so the public classes have no constructor, and those that it
-makes (`MadeAttempt`, `MadeGroup`) have one.
-"""
+"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task."""
 
 from __future__ import annotations
 
@@ -19,10 +15,10 @@ from rlightning_aio.outcomes import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["Attempt", "AttemptGroup", "MadeAttempt", "MadeGroup", "attempt_of"]
+__all__ = ["Attempt", "AttemptGroup", "attempt_of"]
 
 
-@dataclass(slots=True, init=False)
+@dataclass(slots=True)
 class Attempt:
     """One attempt at a task, after its last try; or an episode of `evaluate`.
 
@@ -87,11 +83,6 @@ class Attempt:
         return finite(row)
 
 
-@dataclass(slots=True)
-class MadeAttempt(Attempt):
-    """An attempt with a constructor."""
-
-
 def attempt_of(row: Mapping[str, Any]) -> Attempt:
     """Make an attempt from what `Attempt.to_json` returned.
 
@@ -106,7 +97,7 @@ def attempt_of(row: Mapping[str, Any]) -> Attempt:
     reward = fields.pop("reward")
     if reward is None and not outcome.is_failure:  # It was not finite.
         reward = math.nan
-    return MadeAttempt(
+    return Attempt(
         spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
     )
 
@@ -118,7 +109,7 @@ def _json_or_none(value: Any) -> Any:
         return None
 
 
-@dataclass(slots=True, init=False)
+@dataclass(slots=True)
 class AttemptGroup(Sequence[Attempt]):
     """All attempts at one task, in the order of their indices.
 
@@ -153,8 +144,3 @@ class AttemptGroup(Sequence[Attempt]):
 
     def __iter__(self) -> Iterator[Attempt]:
         return iter(self.attempts)
-
-
-@dataclass(slots=True)
-class MadeGroup(AttemptGroup):
-    """All attempts at one task, with a constructor."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 
 from rlightning_aio._core.hosts.running.copied import copied
-from rlightning_aio.attempts.records import Attempt, MadeAttempt
+from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
@@ -199,7 +199,7 @@ class Try:
         agent = max(seconds - view.seconds, 0.0)
         spent = TimeSpent(env=view.seconds, agent=agent, waiting=self._waited)
         last = None if view.first is None else copied(view.last.observation)
-        return MadeAttempt(
+        return Attempt(
             view.spec,
             view.index,
             replace(ended, seconds=spent),

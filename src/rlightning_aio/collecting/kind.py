@@ -10,7 +10,7 @@ import numpy as np
 from rlightning_aio.batch import BatchedData, joined
 from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.collecting.results import ResultRows, columns_of_episodes, result_rows
-from rlightning_aio.collecting.rollout import Ends, MadeRollout, Rollout
+from rlightning_aio.collecting.rollout import Ends, Rollout
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
@@ -213,7 +213,7 @@ class EnvKind:
         episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
         found = Ends(ends, end_observation)
-        return MadeRollout(columns, shape, found, full.num_chains, episodes, seconds)
+        return Rollout(columns, shape, found, full.num_chains, episodes, seconds)
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Ends", "MadeRollout", "Rollout"]
+__all__ = ["Ends", "Rollout"]
 
 _Pair: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
 
@@ -81,14 +81,22 @@ class Rollout:
     index: NDArray[np.int64]
     first: NDArray[np.bool_]
 
-    shape: tuple[int, ...]
-    ends: NDArray[np.intp]
-    num_chains: int
-    episodes: dict[str, Any]
-    seconds: dict[str, float]
-    _columns: dict[str, Tree]
-    _end_observation: Tree
-    _segments: Segments | None
+    def __init__(
+        self,
+        columns: dict[str, Tree],
+        shape: tuple[int, ...],
+        ends: Ends,
+        num_chains: int,
+        episodes: dict[str, Any],
+        seconds: dict[str, float],
+    ) -> None:
+        self._columns = columns
+        self.shape = shape
+        self.ends, self._end_observation = ends
+        self.num_chains = num_chains
+        self.episodes = episodes
+        self.seconds = seconds
+        self._segments: Segments | None = None
 
     # -- columns ------------------------------------------------------------------
 
@@ -293,24 +301,3 @@ class Rollout:
                 f"the rollout's shape {list(self.shape)}"
             )
         return array.reshape(-1)
-
-
-class MadeRollout(Rollout):
-    """A rollout with a constructor, which only a collector calls."""
-
-    def __init__(
-        self,
-        columns: dict[str, Tree],
-        shape: tuple[int, ...],
-        ends: Ends,
-        num_chains: int,
-        episodes: dict[str, Any],
-        seconds: dict[str, float],
-    ) -> None:
-        self._columns = columns
-        self.shape = shape
-        self.ends, self._end_observation = ends
-        self.num_chains = num_chains
-        self.episodes = episodes
-        self.seconds = seconds
-        self._segments: Segments | None = None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Estimate", "MadeEstimate", "mean_estimate", "wilson_estimate"]
+__all__ = ["Estimate", "mean_estimate", "wilson_estimate"]
 
 _Z: Final = NormalDist().inv_cdf(0.975)
 _T: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
@@ -19,7 +19,7 @@ _SHOWN_DIGITS: Final = 2
 """Of half of an interval, where an estimate is printed."""
 
 
-@dataclass(frozen=True, slots=True, init=False)
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """A mean with its 95 % confidence interval.
 
@@ -45,11 +45,6 @@ class Estimate:
         return f"{mean} [{low}, {high}] (n={self.count})"
 
 
-@dataclass(frozen=True, slots=True)
-class MadeEstimate(Estimate):
-    """An estimate with a constructor, which only this module calls."""
-
-
 def mean_estimate(values: Sequence[float]) -> Estimate | None:
     """Mean of `values` with Student's t interval; None without values.
 
@@ -59,16 +54,16 @@ def mean_estimate(values: Sequence[float]) -> Estimate | None:
         return None
     count = len(values)
     if not all(map(math.isfinite, values)):
-        return MadeEstimate(sum(values), None, None, count)
+        return Estimate(sum(values), None, None, count)
     # Scaling by a power of two is exact, and keeps the sum of large values finite.
     _, exponent = math.frexp(max(map(abs, values)))
     scaled = [math.ldexp(value, -exponent) for value in values]
     mean = fmean(scaled)
     if count == 1:
-        return MadeEstimate(values[0], None, None, 1)
+        return Estimate(values[0], None, None, 1)
     half = _student_quantile(count - 1) * stdev(scaled) / math.sqrt(count)
     low, middle, high = (_grown(value, exponent) for value in (mean - half, mean, mean + half))
-    return MadeEstimate(middle, low, high, count)
+    return Estimate(middle, low, high, count)
 
 
 def _grown(value: float, exponent: int) -> float:
@@ -93,7 +88,7 @@ def wilson_estimate(successes: int, count: int) -> Estimate | None:
     # Avoids rounding errors where the exact bounds are 0 and 1.
     low = 0.0 if successes == 0 else middle - half
     high = 1.0 if successes == count else middle + half
-    return MadeEstimate(share, low, high, count)
+    return Estimate(share, low, high, count)
 
 
 def _student_quantile(freedom: int) -> float:

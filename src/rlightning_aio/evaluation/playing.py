@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.attempts.records import Attempt, MadeAttempt
+from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.errors import EnvFault, WorkerDied
@@ -273,7 +273,7 @@ class PolicyPlay:
         job = self._jobs.pop(place, None)
         if job is None:
             return
-        attempt = MadeAttempt(job.spec, job.index, outcome, sub_env=job.sub_env)
+        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
         if not outcome.is_failure:
             attempt.reward, attempt.success = float(self._reward[place]), success
             attempt.length = int(self._length[place])
