@@ -123,10 +123,10 @@ def evaluate(
     _check(group, one_each=video is not None or not is_number)
     films = None if video is None else EpisodeVideo(video, video_if, video_failed)
     queue = AttemptQueue(group, Rules(retries=retries), results)
-    tasks = _filled(group, queue, episodes, seed)
     options = Options(min_results or default_min_results(group), films, on_episode)
     play = PolicyPlay(group, _called(policy, group, seed), queue, Evaluation(), options)
-    return run(_resetting(play, tasks, group), group)
+    play.note_known(_filled(group, queue, episodes, seed))
+    return run(_resetting(play, group), group)
 
 
 def _filled(
@@ -158,8 +158,7 @@ def _each(group: Any, queue: AttemptQueue, episodes: int, seed: int | None) -> l
     return tasks
 
 
-def _resetting(play: PolicyPlay, tasks: list[TaskInPlay], group: Any) -> Procedure[Evaluation]:
-    play.note_known(tasks)
+def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
     with ensure_auto_reset(group):
         return (yield from play.to_the_end())
 
