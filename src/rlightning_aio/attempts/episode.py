@@ -81,10 +81,7 @@ class AttemptEpisode:
             column = self.columns.setdefault(name, [])
             column += [None] * (steps - len(column))
             column.append(value)
-        reward = result.last_reward
-        self.rewards.append(
-            reward if isinstance(reward, float) else float(summed_rewards(reward).sum())
-        )
+        self.rewards.append(float(summed_rewards(result.last_reward).sum()))
         return result
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:

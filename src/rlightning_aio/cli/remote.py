@@ -7,7 +7,6 @@ robot to its safe stop. A config for a client has exactly one entry.
 from __future__ import annotations
 
 import contextlib
-import re
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -30,6 +29,7 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
 from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote.client import is_address
 from rlightning_aio.remote.keys import make_keys
 
 if TYPE_CHECKING:
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 __all__ = ["client", "keygen"]
 
 _REFRESHES_A_SECOND: Final = 4
-_MAX_PORT: Final = 65535
 
 
 def client(
@@ -77,14 +76,15 @@ def client(
         rlightning-aio client configs/cartpole.yaml --connect tcp://127.0.0.1:5555
         rlightning-aio client configs/piper.yaml --connect tcp://10.0.0.2:5555 --keys keys/left
     """
-    hostname, port = _split(connect)
+    if not is_address(connect):
+        raise ConfigError(f"--connect {connect!r}: should look like tcp://127.0.0.1:5555")
     entry = _the_entry(config, load_config(config, overrides or ()))
     served: RemoteEnvClient | None = None
     interrupted = False
     try:
         with interruptible(), _faults_of(entry):
             env = build_env(entry)
-            served = _client_of(env, hostname, port, keys, name)
+            served = _client_of(env, connect, keys, name)
             with served, _status(served, connect):
                 served.run()
     except KeyboardInterrupt:
@@ -93,14 +93,6 @@ def client(
     finally:
         if served is not None:
             _report(served, interrupted=interrupted, as_json=as_json)
-
-
-def _split(address: str) -> tuple[str, int]:
-    """Return host and port of ``tcp://host:port``; an IPv6 host is in brackets."""
-    match = re.fullmatch(r"tcp://(?:\[([0-9A-Fa-f:.]+)\]|([\w.-]+)):([0-9]{1,5})", address)
-    if match is None or not 0 < int(match[3]) <= _MAX_PORT:
-        raise ConfigError(f"--connect {address!r}: should look like tcp://127.0.0.1:5555")
-    return match[1] or match[2], int(match[3])
 
 
 def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
@@ -131,11 +123,9 @@ def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
     return entry
 
 
-def _client_of(
-    env: BaseEnv, hostname: str, port: int, keys: Path | None, name: str | None
-) -> RemoteEnvClient:
+def _client_of(env: BaseEnv, address: str, keys: Path | None, name: str | None) -> RemoteEnvClient:
     try:
-        return RemoteEnvClient(env, hostname, port, keys=keys, name=name)
+        return RemoteEnvClient(env, address, keys=keys, name=name)
     except BaseException:
         env.close()
         raise

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import socket
 import time
 from math import ceil
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.net.client_session import Event
 
-__all__ = ["RemoteEnvClient"]
+__all__ = ["RemoteEnvClient", "is_address"]
 
 _RECONNECT_MS: Final = (100, 5000)
 """Time between two attempts to connect: at first, and at most. Each attempt doubles it."""
@@ -61,6 +62,9 @@ _HANDSHAKE_MS: Final = 5000
 _REDIAL_SECONDS: Final = (1.0, 8.0)
 """Pauses before another attempt after a failed handshake, after which ZMQ itself gives up."""
 _LINGER_MS: Final = 500
+
+_ADDRESS: Final = re.compile(r"tcp://(?:\[[0-9A-Fa-f:.]+\]|[\w.-]+):([0-9]{1,5})")
+_MAX_PORT: Final = 65535
 
 _Socket = zmq.Socket[bytes]
 ENDING: Final = "end of an interrupted client's sockets"
@@ -379,9 +383,15 @@ _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
 }
 
 
+def is_address(text: str) -> bool:
+    """Return True for the whole address of a server: ``tcp://host:port``, IPv6 in brackets."""
+    match = _ADDRESS.fullmatch(text)
+    return match is not None and 0 < int(match[1]) <= _MAX_PORT
+
+
 def _address(hostname: str, port: int | None) -> str:
     """Return ``tcp://host:port``; an IPv6 host is in brackets."""
-    if hostname.startswith("tcp://") and port is None and hostname.rpartition(":")[2].isdigit():
+    if port is None and is_address(hostname):
         return hostname
     if "://" in hostname or port is None:
         raise ConfigError(
