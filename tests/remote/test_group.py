@@ -24,13 +24,14 @@ from rlightning_aio.errors import (
     BadAction,
     ClientRefused,
     EnvAway,
+    EnvError,
     EnvRaised,
     GroupClosed,
     UnknownEnv,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from rlightning_aio.types import EnvRet, PolicyResponse
 
@@ -620,13 +621,58 @@ def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:
         batch, _ = group.reset()
         env.on_step = fail
         group.step_async(batch.respond(action=actions(batch)))
-        with pytest.raises(EnvRaised, match="robots-0/c0 raised ZeroDivisionError") as caught:
+        with pytest.raises(EnvRaised, match=r"'robots-0/c0' .* raised in step: ZeroDiv") as caught:
             group.collect_async(deadline=HANG)
         assert "in fail" in caught.value.traceback_text
         env.on_step = lambda: None
         batch, _ = group.reset(env_ids=["robots-0/c0"], seed=4)
         assert batch.observation.tolist() == [[0, 4, 0]]
         group.close()
+
+
+def test_whom_a_client_blames_is_in_the_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of an env in a worker: `EnvError` has it, and a reset that raises has begun nothing."""
+    env = CountingEnv(0)
+    with sync.build_env_group(entry()) as group, clients(group, env):
+        batch, _ = group.reset()
+        env.on_step = raise_once(env)
+        with pytest.raises(EnvRaised) as caught:
+            group.step(batch.respond(action=actions(batch)))
+        monkeypatch.setattr(env, "reset", None)
+        with pytest.raises(EnvRaised) as again:
+            group.reset(env_ids=["robots-0/c0"])
+        group.close()
+    outcome = caught.value.outcome
+    assert (outcome.kind, outcome.blame) == ("env_raised", "policy")
+    assert outcome.cause == "rlightning_aio.errors.EnvError: not there"
+    assert (again.value.outcome.kind, again.value.outcome.blame) == ("not_started", "env")
+
+
+def test_a_client_that_raises_is_reset_where_exceptions_are_borne() -> None:
+    """By `on_env_error: restart`; the result is marked, as of an env that is rebuilt."""
+    env = CountingEnv(0)
+    fields = entry() | {"on_env_error": "restart"}
+    with sync.build_env_group(fields) as group, clients(group, env):
+        batch, _ = group.reset()
+        env.on_step = raise_once(env)
+        batch, _ = group.step(batch.respond(action=actions(batch)))
+        assert batch.restarted.tolist() == [True]
+        assert batch.outcome[0].blame == "policy"
+        assert batch.observation.tolist() == [[0, -1, 0]]
+        batch, _ = group.step(batch.respond(action=actions(batch)))
+        assert (batch.restarted.tolist(), batch.is_reset.tolist()) == ([False], [False])
+        assert group.num_restarts == 1
+        group.close()
+
+
+def raise_once(env: CountingEnv) -> Callable[[], None]:
+    """What an env does in a step that fails by its policy."""
+
+    def fail() -> None:
+        env.on_step = lambda: None
+        raise EnvError("not there", blame="policy")
+
+    return fail
 
 
 def test_auto_reset_reaches_clients() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
@@ -124,7 +125,7 @@ class Client:
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
         if self.raises and request.number:
-            self.session.fail(request.number, "Oops", "no", "trace")
+            self.session.fail(request.number, ErrorText("Oops", "no", "trace"))
         else:
             self.steps = 0 if isinstance(request, ResetRequest) else self.steps + 1
             self.session.finish(request.number, self.ret())

@@ -23,6 +23,7 @@ from simulator.scripted import (
     Outcome,
     Scripts,
     Words,
+    blame_of,
     decoded,
     element,
     slow_seconds,
@@ -772,7 +773,10 @@ class Model:
             self._put_away(env, request)
         elif raising:
             likely = [act for act in raising if str(act[1]) in fault.exception_text]
-            check_raised(fault, *(likely or raising)[0])
+            effect, token = (likely or raising)[0]
+            check_raised(fault, effect, token)
+            if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
+                check_outcome(fault, request, effect, token)
             self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
             require(is_rubbish and not request.resets, "an error of nobody", repr(fault), request)
@@ -808,7 +812,7 @@ class Model:
 def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
     """Compare an error with what an env was to raise."""
     text, kind, builtin = {
-        "raise": (f"as asked for: {token}", "ValueError", ValueError),
+        "raise": (f"as asked for: {token}", *_raised_class(token)),
         "raise oddly": (f"odd {token}", "Odd", EnvRaised),
         "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
     }[effect]
@@ -816,6 +820,19 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
     require(isinstance(fault, builtin), "another class", type(fault))
     require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")
+
+
+def _raised_class(token: int) -> tuple[str, type[Exception]]:
+    return ("EnvError", EnvRaised) if blame_of(token) else ("ValueError", ValueError)
+
+
+def check_outcome(fault: EnvRaised, request: Request, effect: str, token: int) -> None:
+    """Check who is said to be to blame: whom the env names, or else as docs/faults.md says."""
+    blame = blame_of(token) if effect == "raise" else None
+    usual = ("not_started", "env") if request.resets else ("env_raised", "either")
+    right = usual[0], blame or usual[1]
+    found = fault.outcome.kind, fault.outcome.blame
+    require(found == right, "another outcome", found, right)
 
 
 def compare(env: Env, expected: Expected, row: Row) -> None:

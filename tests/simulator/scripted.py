@@ -14,7 +14,7 @@ import signal
 import string
 import time
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
-from rlightning_aio import ENVS, BaseEnv, EnvRet
+from rlightning_aio import ENVS, BaseEnv, EnvError, EnvRet
+from rlightning_aio.outcomes import Blame
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
@@ -87,6 +88,11 @@ class Odd(BaseException):
         return f"odd {self.code}"
 
 
+def blame_of(token: int) -> Blame | None:
+    """Whom an env that is to raise something blames, if it says so."""
+    return get_args(Blame)[token // 3 % 5] if token % 3 == 1 else None
+
+
 def slow_seconds(token: int) -> float:
     """How long a slow step takes."""
     return (token + 1) / 50
@@ -116,7 +122,8 @@ async def perform_awaiting(effect: str, token: int) -> None:
 
 def _raise(effect: str, token: int) -> None:
     if effect == "raise":
-        raise ValueError(f"as asked for: {token}")
+        blame, text = blame_of(token), f"as asked for: {token}"
+        raise EnvError(text, blame=blame) if blame else ValueError(text)
     if effect == "raise oddly":
         raise Odd(code=token)
     if effect == "ctrl-c":

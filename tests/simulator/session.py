@@ -219,6 +219,7 @@ class Session:
         """Count an error by its public class."""
         kinds = [kind.__name__ for kind in type(error).__mro__]
         self.counts[next((k for k in kinds if k in errors.__all__), kinds[0])] += 1
+        self.counts["EnvError"] += getattr(error, "exception_type", "").endswith("EnvError")
 
     # -- drawing
 

@@ -347,8 +347,7 @@ class RemoteEnvClient:
             else:
                 self._step(request)
         except Exception as error:  # noqa: BLE001  # Any error of the env goes to the trainer.
-            text = ErrorText.of(error)
-            self._session.fail(request.number, text.type_name, text.text, text.traceback)
+            self._session.fail(request.number, ErrorText.of(error))
             self._flush()
 
     def _reset(self, request: ResetRequest) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
 from rlightning_aio.protocol.net.payload import Packed, ResultFields, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe
@@ -273,7 +274,7 @@ class ClientSession:
             action = self._actions.unpack(frames, message.texts)
         except WireError as error:
             self._complain(str(error), now)
-            self.fail(message.number, type(error).__name__, str(error), "")
+            self.fail(message.number, ErrorText(type(error).__name__, str(error), ""))
             return None
         return StepRequest(message.number, action, message.extras)
 
@@ -400,15 +401,16 @@ class ClientSession:
             )  # fmt: skip
         return parts
 
-    def fail(self, number: int, exception_type: str, text: str, traceback: str) -> None:
+    def fail(self, number: int, error: ErrorText) -> None:
         """Answer request `number` with the exception that the env raised."""
         if self._session is not None:
             failure = Failure(
                 session=self._session,
                 number=number,
-                exception_type=_encodable(exception_type),
-                text=_encodable(text),
-                traceback=_encodable(traceback),
+                exception_type=_encodable(error.type_name),
+                text=_encodable(error.text),
+                traceback=_encodable(error.traceback),
+                blame=error.blame,
             )
             self._answer(number, self._writer.write(failure))
 

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from rlightning_aio.errors import EnvRaised
+    from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.net.payload import ResultLayout, SpaceLayout
     from rlightning_aio.types import ClientTraits, EnvMeta
 
@@ -66,7 +66,7 @@ class RemoteResult:
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
     busy_ns: int = 0
     sent_ns: int = 0
-    error: EnvRaised | None = None
+    error: ErrorText | None = None
     is_reset: bool = False
     is_loss: bool = False
 

@@ -12,7 +12,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.errors import env_raised
+from rlightning_aio.outcomes import BLAMES
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.admission import Admission, Peer
 from rlightning_aio.protocol.net.client_registry import ClientRegistry
 from rlightning_aio.protocol.net.client_requests import ClientRequests
@@ -256,25 +257,21 @@ class ServerSessions:
 
     def _on_failure(self, session: Session, message: Failure) -> None:
         request = self._answered_request(session, message.number)
-        kind, text = in_one_line(message.exception_type), in_one_line(message.text)
+        error = ErrorText(
+            in_one_line(message.exception_type),
+            in_one_line(message.text),
+            in_lines(message.traceback),
+            message.blame if message.blame in BLAMES else "",
+        )
         if request is None:
             if _is_first(session, message.number):
-                self._registry.lose(session, f"its first reset raised {kind}: {text}")
+                self._registry.lose(session, f"its first reset raised {error.summary}")
             return
         if message.exception_type == STALE_REQUEST:
             # The server never sent a newer request, so the two ends disagree on numbers.
-            self._registry.dismiss(session, f"it lost count: {text}")
+            self._registry.dismiss(session, f"it lost count: {error.text}")
             return
         session.record.request = None
-        env_id = session.announced.meta.env_id
-        error = env_raised(
-            f"{env_id} raised {kind} in {request.operation}: "
-            f"{text}; it can be reset and used again",
-            env_id=env_id,
-            exception_type=kind,
-            exception_text=text,
-            traceback_text=in_lines(message.traceback),
-        )
         self._registry.results.append(
             RemoteResult(session.record.name, request.number, error=error)
         )

@@ -185,7 +185,7 @@ class ClientResult(Struct, tag="result", tag_field="type", kw_only=True, omit_de
     extra: dict[str, Any] = {}
 
 
-class Failure(Struct, tag="error", tag_field="type", kw_only=True):
+class Failure(Struct, tag="error", tag_field="type", kw_only=True, omit_defaults=True):
     """Client: request ``number`` raised."""
 
     session: Count
@@ -193,6 +193,8 @@ class Failure(Struct, tag="error", tag_field="type", kw_only=True):
     exception_type: str
     text: str
     traceback: str
+    blame: str = ""
+    """Whom the env names, see `Outcome`."""
 
 
 class Ping(Struct, tag="ping", tag_field="type", kw_only=True):

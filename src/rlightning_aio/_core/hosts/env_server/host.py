@@ -23,8 +23,8 @@ from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
     Closed,
-    Failed,
     Joined,
+    Raised,
     Reported,
     Result,
     Withdrawn,
@@ -298,7 +298,7 @@ class EnvServerHost:
                 continue
             row = self._rows[self._index_of[result.client]]
             if result.error is not None:
-                self._post(Failed(self.host_id, row.entry, result.error))
+                self._post(Raised(self.host_id, row.entry, result.error))
                 continue
             out_of_band = row.write(result)
             if out_of_band is None:
