@@ -1,4 +1,4 @@
-"""What does a film cost the envs that aren't filmed (`video` of an entry)?
+"""What does a film cost the envs that aren't filmed (`group.record_video`)?
 
 In addition to the envs whose steps are counted there is another one, in its own worker, whose every
 episode is filmed, or not. Ready envs are collected and stepped again. Envs that wait, for example
@@ -49,10 +49,10 @@ class Beside(Contender):
         entry = {"backend": "gymnasium", "task": self.task}
         others = {"name": "others", "num_workers": NUM_ENVS, "envs_per_process": self.share}
         extra: dict[str, Any] = {"name": "extra", "env_kwargs": {"render_mode": "rgb_array"}}
-        if self.filmed:
-            extra["video"] = {"folder": folder}
         group = sync.build_env_group([{**entry, **others}, {**entry, **extra}])
         self._group = self._stack.enter_context(group)
+        if self.filmed:
+            group.record_video(folder, ["extra-0"])
         self._batch, _ = group.reset(seed=0)
         self._stack.enter_context(group.auto_reset(max_episode_steps=200))
         self._actions = np.random.default_rng(0).integers(2, size=NUM_ENVS + 1)

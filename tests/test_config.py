@@ -20,7 +20,6 @@ from omegaconf import OmegaConf
 
 from rlightning_aio.config import (
     EnvConfig,
-    VideoConfig,
     check_installed,
     load_config,
     moved,
@@ -430,7 +429,6 @@ VALUES: dict[str, Any] = {
     "env_vars": {"A": "1"},
     "max_concurrency": 3,
     "ray_options": {"max_restarts": 0},
-    "video": {"folder": "films"},
 }
 """A value for each field that some place for envs refuses."""
 INLINE = HOPPER | {"placement": "inline"}
@@ -588,14 +586,12 @@ def test_env_config_lists_everything_that_is_wrong() -> None:
     """In the words of an entry that is a mapping, also for what is nested."""
     wrong: dict[str, Any] = {"name": "", "num_workers": "2", "placement": "moon"}
     with pytest.raises(ConfigError) as caught:
-        EnvConfig(**{**wrong, "video": {"folder": "", "every": 0}})
+        EnvConfig(**{**wrong, "imports": ["math", 3]})
     said = str(caught.value)
-    assert said.startswith("EnvConfig: 6 problems\n  name: String should have at least 1 character")
-    for field in ("backend", "num_workers", "video.folder", "video.every", "placement"):
+    assert said.startswith("EnvConfig: 5 problems\n  name: String should have at least 1 character")
+    for field in ("backend", "num_workers", "imports.1", "placement"):
         assert f"\n  {field}: " in said
     assert "http" not in said
-    with pytest.raises(ConfigError, match="VideoConfig: every: should be greater"):
-        VideoConfig(folder="films", every=0)
 
 
 @given(text=st.text() | st.text("envs:[]{}-, \n\tab'\"&*!?|>%#0.$"))

@@ -15,7 +15,6 @@ from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
 from rlightning_aio._core.hosts.env_server.settings import ServerSettings
-from rlightning_aio.config import VideoConfig
 
 DOCS = Path(__file__).parent.parent / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")
@@ -31,7 +30,6 @@ def test_every_argument_and_setting_has_its_row() -> None:
     building = inspect.signature(build_env_group).parameters.keys() - {"env_cfgs"}
     assert table_rows("collecting.md") == collecting | building
     assert table_rows("remote.md") - {"state"} == set(ServerSettings.model_fields)
-    assert set(VideoConfig.model_fields) <= table_rows("evaluating.md")
 
 
 def blocks(language: str, page: str) -> list[str]:

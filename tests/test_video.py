@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
-import sys
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -17,10 +16,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Generator, Iterator
     from pathlib import Path
 
 STEP = 8
@@ -87,16 +85,19 @@ def entry(make_env: Callable[[], Any], **fields: Any) -> dict[str, Any]:
     return {"name": "env", "task": make_env, "placement": "inline", **fields}
 
 
-def filmed(make_env: Callable[[], Any], folder: Path, **video: Any) -> dict[str, Any]:
-    """Return the fields of an entry that is filmed from its first episode on."""
-    return entry(make_env, video={"folder": str(folder), **video})
+@contextmanager
+def filming(config: dict[str, Any], folder: Path, **chosen: Any) -> Generator[sync.EnvGroup]:
+    """Yield a group whose envs are filmed from their first episode on."""
+    with sync.build_env_group(config) as group:
+        group.record_video(folder, **chosen)
+        yield group
 
 
 def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: Path) -> None:
     """A second run continues their numbers."""
-    config = {**filmed(Brighter, tmp_path / "films"), "name": "../mine"}
+    config = {**entry(Brighter), "name": "../mine"}
     for _ in range(2):
-        with sync.build_env_group(config) as group:
+        with filming(config, tmp_path / "films") as group:
             play(group, 3)
     assert [path.name for path in tmp_path.iterdir()] == ["films"]
     names = sorted(path.name for path in (tmp_path / "films").iterdir())
@@ -113,8 +114,8 @@ def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
 
 def test_each_episode_is_a_film_of_all_its_frames(tmp_path: Path) -> None:
     """From the frame of the reset to that of the last step, also in worker processes."""
-    config = filmed(Brighter, tmp_path, envs=[0, 2])
-    with sync.build_env_group({**config, "num_workers": 3, "placement": "process"}) as group:
+    config = entry(Brighter, num_workers=3, placement="process")
+    with filming(config, tmp_path, env_ids=["env-0", "env-2"]) as group:
         play(group, 7)
     whole = [0, 1, 2, 3]
     assert films(tmp_path) == {f"env-{k}-episode-{n}.mp4": whole for k in (0, 2) for n in range(2)}
@@ -122,7 +123,7 @@ def test_each_episode_is_a_film_of_all_its_frames(tmp_path: Path) -> None:
 
 def test_the_film_of_an_unfinished_episode_is_marked(tmp_path: Path) -> None:
     """It can be played after the group has closed."""
-    with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
+    with filming(entry(Brighter), tmp_path) as group:
         play(group, 5)
     assert films(tmp_path) == {
         "env-0-episode-0.mp4": [0, 1, 2, 3],
@@ -132,7 +133,7 @@ def test_the_film_of_an_unfinished_episode_is_marked(tmp_path: Path) -> None:
 
 def test_a_film_ends_where_a_state_is_restored(tmp_path: Path) -> None:
     """What follows is another past of the same episode; the next episode is filmed."""
-    with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
+    with filming(entry(Brighter), tmp_path) as group:
         batch, _ = group.reset()
         snapshot = group.snapshot()
         batch, _ = group.step(batch.respond(action=[0]))
@@ -148,7 +149,7 @@ def test_a_film_ends_where_a_state_is_restored(tmp_path: Path) -> None:
 
 def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
     """Also that of the group, by the reset that follows."""
-    with sync.build_env_group(filmed(Endless, tmp_path)) as group:
+    with filming(entry(Endless), tmp_path) as group:
         batch, _ = group.reset()
         with group.auto_reset(2):
             for _ in range(3):
@@ -161,7 +162,7 @@ def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
 )
 def test_episodes_are_chosen(tmp_path: Path, chosen: dict[str, Any], numbers: list[int]) -> None:
     """Every n-th, or those listed."""
-    with sync.build_env_group(filmed(Brighter, tmp_path, **chosen)) as group:
+    with filming(entry(Brighter), tmp_path, **chosen) as group:
         play(group, 4 * 4 - 1)
     assert list(films(tmp_path)) == [f"env-0-episode-{n}.mp4" for n in numbers]
 
@@ -173,8 +174,7 @@ def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: Autores
     def make() -> Any:
         return SyncVectorEnv([lambda: Brighter(start=100), Brighter], autoreset_mode=mode)
 
-    config = filmed(make, tmp_path, sub_env=1)
-    with sync.build_env_group(config) as group:
+    with filming(entry(make), tmp_path, sub_env=1) as group:
         batch, _ = group.reset()
         for _ in range(8):
             batch, _ = group.step(batch.respond(action=np.zeros((1, 2), np.int64)))
@@ -185,7 +185,7 @@ def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: Autores
 
 def test_frames_of_any_size_and_user_defined_envs(tmp_path: Path) -> None:
     """An odd width or height gets a border."""
-    with sync.build_env_group(filmed(Odd, tmp_path)) as group:
+    with filming(entry(Odd), tmp_path) as group:
         play(group, 3)
     (path,) = tmp_path.iterdir()
     said = ffmpeg(path).stderr.decode()
@@ -195,8 +195,7 @@ def test_frames_of_any_size_and_user_defined_envs(tmp_path: Path) -> None:
 
 def test_a_replaced_worker_continues_filming(tmp_path: Path) -> None:
     """The film of the lost episode is marked, until the next one takes its number."""
-    config = filmed(Brighter, tmp_path) | {"placement": "process"}
-    with sync.build_env_group(config) as group:
+    with filming(entry(Brighter, placement="process"), tmp_path) as group:
         play(group, 5)
         batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
         assert batch.restarted.all()
@@ -211,28 +210,103 @@ def test_a_replaced_worker_continues_filming(tmp_path: Path) -> None:
 def test_films_are_added_to_a_folder_of_films(tmp_path: Path) -> None:
     """No film is overwritten by another run."""
     for _ in range(2):
-        with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
+        with filming(entry(Brighter), tmp_path) as group:
             play(group, 3)
     assert list(films(tmp_path)) == ["env-0-episode-0.mp4", "env-0-episode-1.mp4"]
 
 
-def test_a_filmed_env_has_its_own_worker(tmp_path: Path) -> None:
-    """So no other env waits for its frames."""
-    fields = {"num_workers": 6, "env_kwargs": {"render_mode": "rgb_array"}}
-    video = {"folder": str(tmp_path), "envs": [2]}
-    with sync.build_env_group("CartPole-v1", **fields, video=video) as group:
-        envs_of = [worker["env_ids"] for worker in group.get_workers()]
-    assert ["CartPole-v1-2"] in envs_of
-    assert len(envs_of) <= 1 + num_cores()  # The others share workers.
+class Raises(Brighter):
+    """Raises in the step with action 8."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if action == 8:
+            raise OSError("lost")
+        return super().step(action)
+
+
+class Awaits:
+    """The same, awaitable."""
+
+    observation_space, action_space = Raises.observation_space, Raises.action_space
+    render_mode = "rgb_array"
+
+    def __init__(self) -> None:
+        self._env = Raises()
+
+    async def reset(self, **_: Any) -> Any:
+        return self._env.reset()
+
+    async def step(self, action: Any) -> Any:
+        return self._env.step(action)
+
+    def render(self) -> Any:
+        return self._env.render()
+
+
+async def test_an_awaitable_env_that_is_rebuilt_continues_to_be_filmed(tmp_path: Path) -> None:
+    """On the trainer's event loop."""
+    config = entry(Awaits, on_env_error="restart") | {"placement": "loop"}
+    async with rl.build_env_group(config) as group:
+        await group.record_video(tmp_path)
+        batch, _ = await group.reset()
+        batch, _ = await group.step(batch.respond(action=[8]))
+        assert batch.restarted.all()
+        for _ in range(3):
+            batch, _ = await group.step(batch.respond(action=[0]))
+    assert films(tmp_path) == {"env-0-episode-0.mp4": [0, 1, 2, 3]}
+
+
+def test_an_env_that_is_rebuilt_continues_to_be_filmed(tmp_path: Path) -> None:
+    """After an exception, as in a replaced worker."""
+    with filming(entry(Raises, on_env_error="restart"), tmp_path) as group:
+        play(group, 5)
+        batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 8)]))
+        assert batch.restarted.all()
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=[0]))
+    assert films(tmp_path) == {
+        "env-0-episode-0.mp4": [0, 1, 2, 3],
+        "env-0-episode-1.mp4": [0, 1, 2, 3],
+    }
+
+
+def test_a_replacement_that_cannot_film_plays_on(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Here a file takes the place of the folder; there is one warning."""
+    folder = tmp_path / "films"
+    with filming(entry(Raises, on_env_error="restart"), folder, episodes=[9]) as group:
+        batch, _ = group.reset()
+        folder.rmdir()
+        folder.touch()
+        batch, _ = group.step(batch.respond(action=[8]))
+        assert batch.restarted.all()
+        play(group, 9)
+    assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1
+
+
+@pytest.mark.parametrize("stop", [True, False])
+def test_a_replaced_worker_films_what_was_filmed_last(tmp_path: Path, stop: bool) -> None:
+    """Nothing, if that had ended; and of an env that shares it nothing, if that never was."""
+    with two() as group:
+        group.record_video(tmp_path / "first", ["env-0"])
+        group.record_video(None if stop else tmp_path / "second", ["env-0"])
+        play(group, 1)
+        group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+        play(group, 3)
+    whole = [0, 1, 2, 3]
+    seen = {folder.name: films(folder).get("env-0-episode-1.mp4") for folder in tmp_path.iterdir()}
+    assert seen == ({"first": None} if stop else {"first": None, "second": whole})
+    assert not list(tmp_path.glob("*/env-1*"))
 
 
 # -- a running group --------------------------------------------------------------------
 
 
-def two() -> sync.EnvGroup:
-    """Yield a group of two envs, which share a worker."""
+def two(**fields: Any) -> sync.EnvGroup:
+    """Return a group of two envs, which share a worker."""
     config = entry(Brighter, num_workers=2, placement="process", envs_per_process=2)
-    return sync.build_env_group(config)
+    return sync.build_env_group({**config, **fields})
 
 
 @pytest.fixture(scope="module")
@@ -286,16 +360,17 @@ def test_all_local_envs_are_filmed_by_default(tmp_path: Path) -> None:
 
 
 def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
-    """With all earlier frames; the replacement isn't filmed."""
-    with two() as group:
+    """With all earlier frames."""
+    with two(on_worker_death="raise") as group:
         group.record_video(tmp_path, group.env_ids)
         play(group, 2)
-        group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
-        play(group, 3)
-    for path in tmp_path.iterdir():
-        while ffmpeg(path, "-f", "null", "-").returncode:
+        with pytest.raises(rl.WorkerDied):
+            group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+    names = [f"env-{k}-episode-0.partial.mp4" for k in range(2)]
+    for name in names:
+        while ffmpeg(tmp_path / name, "-f", "null", "-").returncode:
             """The ffmpeg of the worker that has died is about to end."""
-    assert films(tmp_path) == {f"env-{k}-episode-0.partial.mp4": [0, 1, 2] for k in range(2)}
+    assert films(tmp_path) == dict.fromkeys(names, [0, 1, 2])
 
 
 async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
@@ -322,8 +397,12 @@ def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
             group.record_video(tmp_path, ["env-0"], sub_env=2)
         with pytest.raises(rl.UnknownEnv, match="'env_0'"):
             group.record_video(tmp_path, ["env_0"])
-        with pytest.raises(rl.ConfigError, match=r"record_video: every: .* got 0"):
-            group.record_video(tmp_path, ["env-0"], every=0)
+        wrong: dict[str, Any]
+        for wrong in ({"every": 0}, {"sub_env": -1}):
+            with pytest.raises(rl.ConfigError, match=r"record_video: (every|sub_env): .* got"):
+                group.record_video(tmp_path, ["env-0"], **wrong)
+        with pytest.raises(rl.ConfigError, match="folder: should not be empty"):
+            group.record_video("", ["env-0"])
         (tmp_path / "file").touch()
         with pytest.raises(rl.EnvRaised, match="File exists"):
             group.record_video(tmp_path / "file", ["env-0"])
@@ -334,55 +413,12 @@ def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
 # -- errors -----------------------------------------------------------------------------
 
 
-def test_an_unwritable_folder_raises_before_anything_starts(tmp_path: Path) -> None:
-    """By the entry and the field."""
-    (tmp_path / "file").touch()
-    config = filmed(Brighter, tmp_path / "file" / "films")
-    with pytest.raises(rl.ConfigError, match=r"entry 'env', video.folder: .*file/films"):
-        sync.build_env_group(config)
-
-
-def test_a_missing_package_raises_before_anything_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With the command that installs it."""
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(rl.ConfigError, match=r"pip install 'rlightning-aio\[video\]'"):
-        sync.build_env_group(filmed(Brighter, tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("video", "words"),
-    [
-        ({"envs": [2]}, "there is no env 2; num_workers: 1"),
-        ({"sub_env": 4}, "no sub-environment 4; num_envs: 3"),
-        ({}, "render_mode: rgb_array"),
-        ({"folder": ""}, "video.folder: String should have at least 1 character"),
-        ({"every": 0}, "video.every: should be greater than or equal to 1"),
-    ],
-)
-def test_a_config_that_cannot_be_filmed_raises(video: dict[str, Any], words: str) -> None:
-    """By the field, when it is read."""
-    fields = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 3}
-    with pytest.raises(rl.ConfigError, match=words):
-        sync.build_env_group({**fields, "video": {"folder": "films", **video}})
-
-
-def test_an_env_that_renders_nothing_raises_at_its_start(tmp_path: Path) -> None:
-    """It can't be known earlier, because a callable of the user makes the env."""
-    config = filmed(lambda: Brighter(None), tmp_path)
-    with pytest.raises(
-        rl.StartFailed, match="env 'env-0' can't be filmed: its render_mode is None"
-    ):
-        sync.build_env_group(config).init()
-
-
 def test_training_continues_if_a_film_cannot_be_written(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Here its folder is removed; there is one warning."""
     folder = tmp_path / "films"
-    with sync.build_env_group(filmed(Brighter, folder)) as group:
+    with filming(entry(Brighter), folder) as group:
         folder.rmdir()
         play(group, 9)
     assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1
@@ -401,11 +437,7 @@ class Blind(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 def test_vector_envs_that_render_nothing_raise(tmp_path: Path) -> None:
-    """Those of Atari before anything starts."""
-    atari = {"name": "env", "backend": "ale", "task": "ALE/Pong-v5", "num_envs": 2}
-    if importlib.util.find_spec("ale_py"):
-        with pytest.raises(rl.ConfigError, match=r"entry 'env', video: .*num_envs: 2.*nothing"):
-            sync.build_env_group({**atari, "video": {"folder": str(tmp_path)}})
+    """The error says so."""
     with (
         sync.build_env_group({"name": "env", "task": Blind, "placement": "inline"}) as group,
         pytest.raises(rl.EnvRaised, match="'env-0' can't be filmed: a Blind renders nothing"),

@@ -303,7 +303,6 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "truncated result, and the client may come back",
             "max_restarts": "it has no workers; a client that is lost may come back",
             "snapshot_every": "it has no workers; a client that comes back begins a new session",
-            "video": _CLIENTS_OWN,
         },
     ),
 }

@@ -11,7 +11,7 @@ MOST = {
     "names": 70,
     "members": 344,
     "arguments": 394,
-    "fields": 25,
+    "fields": 24,
     "commands": 9,
     "options": 31,
     "extras": 15,

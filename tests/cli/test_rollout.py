@@ -13,6 +13,10 @@ from cli.command import CARTPOLE, TESTS, invoke, invoke_json, run, write_config
 from cli.stub_envs import Stub
 from timelines import Seen
 
+from rlightning_aio import load_config
+from rlightning_aio._core.group.setup.start_orders import start_orders
+from rlightning_aio.cli.playing.films import films_of
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -187,7 +191,7 @@ def test_random_actions_fit_entries_with_different_spaces(tmp_path: Path) -> Non
 
 
 def test_rollout_films_the_first_env_of_each_entry(tmp_path: Path) -> None:
-    """It has a worker of its own; films of unfinished episodes are marked."""
+    """Films of unfinished episodes are marked."""
     judged = {"name": "judged", "task": "cli.judged_env:make", "num_workers": 2}
     films = tmp_path / "films"
     config = write_config(tmp_path, judged)
@@ -196,6 +200,18 @@ def test_rollout_films_the_first_env_of_each_entry(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert {path.name.partition("-episode-")[0] for path in films.iterdir()} == {"judged-0"}
     assert (films / "judged-0-episode-2.mp4").exists()
+
+
+def test_a_filmed_env_has_its_own_worker(tmp_path: Path) -> None:
+    """So no other env waits for its frames, unless the entry says how many share one."""
+    config = load_config(write_config(tmp_path, {**CARTPOLE, "num_workers": 6}))
+    ready, films = films_of(config, tmp_path, ["pole-2"], None)
+    plan = films.plan(ready)
+    envs_of = [order.worker_indices for order in start_orders(plan, 2)]
+    assert envs_of == [(0, 1), (2,), (3, 4, 5)]
+    (three,) = [c.model_copy(update={"envs_per_process": 3}) for c in ready]
+    envs_of = [order.worker_indices for order in start_orders(films.plan([three]), 2)]
+    assert envs_of == [(0, 1, 2), (3, 4, 5)]
 
 
 def test_the_console_script_runs_cli_main() -> None:

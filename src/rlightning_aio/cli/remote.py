@@ -117,8 +117,6 @@ def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
                 f"{place}, {field}: a client's env runs in the command's own process; start "
                 "the command that way instead"
             )
-    if entry.video is not None:
-        raise ConfigError(f"{place}, video: a client's env isn't filmed")
     check_installed(configs)
     return entry
 

@@ -8,17 +8,17 @@ the machine are left to the group.
 
 from __future__ import annotations
 
-from rlightning_aio.config.checks import check_installed
+from rlightning_aio.config.checks import check_installed, runs_here
 from rlightning_aio.config.documents import load_config, parse_configs
-from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, VideoConfig, makers_of, moved
+from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, makers_of, moved
 
 __all__ = [
     "MADE_BY_GYMNASIUM",
     "EnvConfig",
-    "VideoConfig",
     "check_installed",
     "load_config",
     "makers_of",
     "moved",
     "parse_configs",
+    "runs_here",
 ]

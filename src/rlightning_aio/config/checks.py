@@ -17,7 +17,14 @@ from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-__all__ = ["Entry", "check_entry", "check_imports", "check_installed", "check_names"]
+__all__ = [
+    "Entry",
+    "check_entry",
+    "check_imports",
+    "check_installed",
+    "check_names",
+    "runs_here",
+]
 
 
 @dataclass(slots=True)
@@ -153,24 +160,9 @@ def _check_on_env_error(config: EnvConfig) -> str | None:
     return None
 
 
-def _check_video(config: EnvConfig) -> str | None:
-    video = config.video
-    if video is None:
-        return None
-    if above := [k for k in video.envs if k >= config.num_workers]:
-        return f"there is no env {above[0]}; num_workers: {config.num_workers} count from 0"
-    if 1 < config.num_envs <= video.sub_env:
-        return f"no sub-environment {video.sub_env}; num_envs: {config.num_envs} count from 0"
-    mode = config.env_kwargs.get("render_mode")
-    if config.backend in MADE_BY_GYMNASIUM and mode != "rgb_array":
-        return f"needs env_kwargs: {{render_mode: rgb_array}}, got {mode!r}"
-    return None
-
-
 _COMPARED_WITH = {
     "task": ("num_workers",),
     "snapshot_every": ("on_worker_death",),
-    "video": ("num_workers", "num_envs", "env_kwargs"),
 }
 """Other fields that a check reads; it is left out if one of them is wrong."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
@@ -180,7 +172,6 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "interpreter": _check_interpreter,
     "snapshot_every": _check_snapshot_every,
     "on_env_error": _check_on_env_error,
-    "video": _check_video,
 }
 
 

@@ -23,7 +23,6 @@ from rlightning_aio.sharing import num_batches, num_cores
 __all__ = [
     "MADE_BY_GYMNASIUM",
     "EnvConfig",
-    "VideoConfig",
     "completed",
     "makers_of",
     "moved",
@@ -50,37 +49,6 @@ class _Fields(BaseModel):
 
         # As that of pydantic's classes, so that validation doesn't call it.
         __init__.__pydantic_base_init__ = True
-
-
-class VideoConfig(_Fields):
-    """The episodes of an entry's envs to film, and the folder for the files."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
-
-    folder: str = Field(min_length=1)
-    """Folder for ``<env id>-episode-<n>.mp4``, created if missing; n counts the env's episodes
-    from 0, or on from the last film in the folder."""
-    envs: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0,), strict=False)
-    """Numbers of the envs to film, from 0. Each gets a worker of its own, so that no other env
-    waits for a frame, unless `EnvConfig.envs_per_process` is a number."""
-    sub_env: int = Field(default=0, ge=0)
-    """Number of the sub-environment to film."""
-    every: int = Field(default=1, ge=1)
-    """Film episodes 0, every, 2 * every, …"""
-    episodes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(default=None, strict=False)
-    """Film only these."""
-
-    @field_validator("folder")
-    @classmethod
-    def _find_from_anywhere(cls, folder: str) -> str:
-        # A "~" that names no user is part of the name.
-        return os.path.abspath(os.path.expanduser(folder))  # noqa: PTH100, PTH111
-
-    def wants(self, episode: int) -> bool:
-        """Return True if the episode with this number is to be filmed."""
-        if self.episodes is not None:
-            return episode in self.episodes
-        return episode % self.every == 0
 
 
 class EnvConfig(_Fields):
@@ -151,8 +119,6 @@ class EnvConfig(_Fields):
     ray_options: dict[str, Any] = Field(default_factory=dict)
     """Arguments for ``.options()`` of a Ray actor, except `num_cpus` and `num_gpus`, and
     ``address``, the cluster's (``placement: ray`` only)."""
-    video: VideoConfig | None = None
-    """Episodes to film from the start; `record_video` films envs of a running group."""
 
     @property
     def task_name(self) -> str:

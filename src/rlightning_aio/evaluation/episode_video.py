@@ -14,9 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.hosts.messages import RECORD_VIDEO
+from rlightning_aio._core.hosts.messages import RECORD_VIDEO, FilmOrder
 from rlightning_aio.attempts.spec import written
-from rlightning_aio.config import VideoConfig
 from rlightning_aio.files import check_folder, file_name, finish_file
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ class Filming:
         if self.video.wants is None or self.video.wants(spec):
             folder = self._folder(env_id)
             shutil.rmtree(folder, ignore_errors=True)
-            order = VideoConfig(folder=str(folder), episodes=(0,))
+            order = FilmOrder(str(folder), episodes=(0,))
             yield partial(self.group[env_id].call, RECORD_VIDEO, order)
             self._filmed.add(env_id)
 

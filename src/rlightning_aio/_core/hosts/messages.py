@@ -46,6 +46,7 @@ __all__ = [
     "EnvStarted",
     "ErrorText",
     "Failed",
+    "FilmOrder",
     "Joined",
     "NewSchema",
     "NotBuilt",
@@ -108,6 +109,29 @@ class StartOrder:
 
 
 @dataclass(frozen=True)
+class FilmOrder:
+    """The episodes of an env to film; the argument of `RECORD_VIDEO`, where None stops filming.
+
+    Attributes:
+        folder: absolute, for the files.
+        every: film episodes 0, every, 2 * every, …
+        episodes: film only these.
+        sub_env: number of the sub-environment to film.
+    """
+
+    folder: str
+    every: int = 1
+    episodes: tuple[int, ...] | None = None
+    sub_env: int = 0
+
+    def wants(self, episode: int) -> bool:
+        """True if the episode with this number is to be filmed."""
+        if self.episodes is not None:
+            return episode in self.episodes
+        return episode % self.every == 0
+
+
+@dataclass(frozen=True)
 class AttachOrder:
     """The rows of the envs of a host. Each env knows the layout of its row.
 
@@ -116,6 +140,7 @@ class AttachOrder:
         rows: index of the slab, and the row in it, for each env.
         checkpoints: of the envs of a replacement (see `Saved`); None for an env that begins a new
             episode. Empty if all do.
+        films: what each env of a replacement goes on filming, if anything. Empty if none does.
         restarts: how many workers had these envs before; seed: of the last reset of the first env
             that had one. They seed the global generators of a replacement.
     """
@@ -123,6 +148,7 @@ class AttachOrder:
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
     checkpoints: tuple[bytes | None, ...] = ()
+    films: tuple[FilmOrder | None, ...] = ()
     restarts: int = 0
     seed: int | None = None
 

@@ -13,13 +13,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlia
 import typer
 from rich.live import Live
 
-import rlightning_aio
+from rlightning_aio._core.group.api.aio import EnvGroup
 from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.bench.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.figures import estimates, with_interval
-from rlightning_aio.cli.option_files import check_option_file, naming_option
+from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
-from rlightning_aio.cli.playing.films import Video, VideoEnvs, VideoEvery, filmed, rendering
+from rlightning_aio.cli.playing.films import (
+    Films,
+    Video,
+    VideoEnvs,
+    VideoEvery,
+    check_films,
+    films_of,
+    rendering,
+)
 from rlightning_aio.cli.playing.queue_options import (
     EpisodesFile,
     QueueOptions,
@@ -48,7 +56,6 @@ from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import Evaluation, evaluate
 from rlightning_aio.evaluation.evaluation import parts_of
-from rlightning_aio.files import check_folder
 from rlightning_aio.json_text import finite
 from rlightning_aio.policies import ActionChunks
 
@@ -57,7 +64,6 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.attempts import Attempt
     from rlightning_aio.cli.policies.policies import Policy
     from rlightning_aio.config import EnvConfig
@@ -130,12 +136,14 @@ class _Order:
 
     Attributes:
         episodes: a number for each env, or a queue.
+        films: of envs; queue_films: of episodes of the queue, as `evaluate` takes them.
         by: what the table has a line for; title: of the table.
     """
 
     configs: Sequence[EnvConfig]
     episodes: int | Sequence[EpisodeSpec]
-    films: dict[str, Any]
+    films: Films
+    queue_films: dict[str, Any]
     whose: _Whose
     by: _By
     title: str
@@ -199,8 +207,8 @@ def evaluation(
     configs = load_config(config, overrides or ())
     _check_envs(config, configs)
     files = _Files(resume, plot, trace, as_json)
-    films = (video, video_every, video_failed, video_episode)
-    queue = QueueOptions(episodes_file, tasks, seeds, *films)
+    filming = (video, video_every, video_failed, video_episode)
+    queue = QueueOptions(episodes_file, tasks, seeds, *filming)
     if queue.wanted:
         _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
     facts = {"config": str(config), "policy": policy, "seed": seed}
@@ -210,8 +218,8 @@ def evaluation(
         if queue.wanted:
             order = _in_queue(configs, queue, whose)
         else:
-            configs = filmed(configs, video, video_env, video_every)
-            order = _of_each(configs, episodes or 10, whose)
+            configs, films = films_of(configs, video, video_env, video_every)
+            order = _of_each(configs, episodes or 10, films, whose)
         _play(order, files, _resumed(order, resume, stack))
 
 
@@ -219,17 +227,16 @@ def _in_queue(configs: Sequence[EnvConfig], queue: QueueOptions, whose: _Whose) 
     specs = queue.specs(configs)
     films = queue.films(specs)
     if films:
-        with naming_option("--video", films["video"]):
-            check_folder(films["video"])
+        check_films(configs, films["video"])
         configs = [rendering(config) for config in configs]
     title = f"{whose.facts['policy']}: {counted(len(specs), 'episode')}"
-    return _Order(configs, specs, films, whose, "task", title)
+    return _Order(configs, specs, Films(), films, whose, "task", title)
 
 
-def _of_each(configs: Sequence[EnvConfig], episodes: int, whose: _Whose) -> _Order:
+def _of_each(configs: Sequence[EnvConfig], episodes: int, films: Films, whose: _Whose) -> _Order:
     whose.facts["episodes_each"] = episodes
     title = f"{whose.facts['policy']}: {counted(episodes, 'episode')} of each env"
-    return _Order(configs, episodes, {}, whose, "entry", title)
+    return _Order(configs, episodes, films, {}, whose, "entry", title)
 
 
 def _refuse(given: dict[str, Any]) -> None:
@@ -263,7 +270,7 @@ def _subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:
 
 def _play(order: _Order, files: _Files, results: ResultsFile | None) -> None:
     """Play the episodes, and report them."""
-    group = rlightning_aio.build_env_group(order.configs, mixed_actions=True)
+    group = EnvGroup(order.films.plan(order.configs))
     interrupted, stopped = True, False
     with _Watch(group, order) as watch:
         try:
@@ -293,6 +300,7 @@ async def _evaluate(
     base: int | None = order.whose.facts["seed"]
     seed = None if base is None else base + before
     async with playing(group, order.whose.policy, seed, trace, watch.draw) as policy:
+        await order.films.begin(group)
         try:
             evaluated = evaluate(
                 group,
@@ -302,7 +310,7 @@ async def _evaluate(
                 retries=order.whose.retries,
                 results=results,
                 on_episode=watch.note,
-                **order.films,
+                **order.queue_films,
             )
         except ValueError as error:
             raise ConfigError(str(error)) from None

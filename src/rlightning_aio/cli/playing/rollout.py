@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
-import rlightning_aio
+from rlightning_aio._core.group.api.aio import EnvGroup
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.cli.bench.plots import check_plot, draw_rollout
 from rlightning_aio.cli.option_files import check_option_file
@@ -25,7 +25,7 @@ from rlightning_aio.cli.options import (
     TraceFile,
     check_seed,
 )
-from rlightning_aio.cli.playing.films import Video, VideoEnvs, VideoEvery, filmed
+from rlightning_aio.cli.playing.films import Films, Video, VideoEnvs, VideoEvery, films_of
 from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.cli.policies.collecting import (
     Roster,
@@ -53,7 +53,6 @@ from rlightning_aio.errors import EnvFault
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
-    from rlightning_aio._core.group.api.aio import EnvGroup
 
 __all__ = ["rollout"]
 
@@ -72,6 +71,7 @@ class _Order:
     seed: int | None
     policy: Policy | None
     trace: Path | None
+    films: Films
 
     def left(self, statistics: RolloutStatistics) -> tuple[int, float | None] | None:
         """Return the steps and seconds that are left, or None at the end."""
@@ -141,7 +141,7 @@ def rollout(
         rlightning-aio rollout configs/cartpole.yaml --video films --video-every 10
     """
     check_seed(seed)
-    configs = filmed(load_config(config, overrides or ()), video, video_env, video_every)
+    configs, films = films_of(load_config(config, overrides or ()), video, video_env, video_every)
     check_plot(plot)
     order = _Order(
         _STEPS if steps is None and seconds is None else steps,
@@ -150,10 +150,11 @@ def rollout(
         seed,
         load_policy(policy) if policy else None,
         trace,
+        films,
     )
     check_option_file("--trace", trace)
     statistics = RolloutStatistics(configs, keep_course=plot is not None)
-    group = rlightning_aio.build_env_group(configs, mixed_actions=True)
+    group = EnvGroup(films.plan(configs))
     interrupted = completed = False
     try:
         with Display(group, statistics, order.steps, seconds, workers=live) as display:
@@ -184,6 +185,7 @@ async def _collect(
         roster = Roster(group)
         for server in roster.servers:
             display.say(f"{server.env_id} listens at {server.address}")
+        await order.films.begin(group)
         display.resetting()
         batch, _ = await group.reset(seed=order.seed)
         respond = responder(group, roster, order.policy, order.seed)

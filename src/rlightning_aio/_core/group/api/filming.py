@@ -1,7 +1,7 @@
 """What `record_video` of a group does: starts and stops films of envs.
 
 The worker of an env renders and encodes, so no frame is sent to the trainer. Filming starts and
-stops by a call of the env, on any host.
+stops by a call of the env, on any host; the replacement of a worker gets the order again.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from rlightning_aio._core.hosts.messages import RECORD_VIDEO
-from rlightning_aio.config import VideoConfig
+from rlightning_aio._core.hosts.messages import RECORD_VIDEO, FilmOrder
 from rlightning_aio.errors import ConfigError, RLightningError
 
 if TYPE_CHECKING:
@@ -21,15 +20,15 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.core import Core
 
-__all__ = ["film", "video_of"]
+__all__ = ["film", "film_order"]
 
 
-def video_of(
+def film_order(
     folder: str | os.PathLike[str] | None,
     every: int,
     episodes: Sequence[int] | None,
     sub_env: int,
-) -> VideoConfig | None:
+) -> FilmOrder | None:
     """Return the order to film, or None to stop.
 
     Raises:
@@ -37,26 +36,35 @@ def video_of(
     """
     if folder is None:
         return None
-    numbers = None if episodes is None else tuple(episodes)
-    try:
-        return VideoConfig(folder=os.fspath(folder), sub_env=sub_env, every=every, episodes=numbers)
-    except ConfigError as error:
-        raise ConfigError(str(error).replace("VideoConfig", "record_video", 1)) from None
+    path = os.fspath(folder)
+    if not path:
+        raise ConfigError("record_video: folder: should not be empty")
+    for name, number, least in (("every", every, 1), ("sub_env", sub_env, 0)):
+        if number < least:
+            raise ConfigError(f"record_video: {name}: should be at least {least}, got {number}")
+    # A "~" that names no user is part of the name.
+    path = os.path.abspath(os.path.expanduser(path))  # noqa: PTH100, PTH111
+    return FilmOrder(path, every, None if episodes is None else tuple(episodes), sub_env)
 
 
-def film(core: Core, env_ids: Sequence[str] | None, video: VideoConfig | None) -> Procedure[None]:
+def film(core: Core, env_ids: Sequence[str] | None, order: FilmOrder | None) -> Procedure[None]:
     """Let envs begin to film, or end it; if one of them can't, none films."""
     ids = core.envs.local_ids if env_ids is None else dict.fromkeys(env_ids)
     slots = [core.envs.find_one(env_id) for env_id in ids]
     for place, slot in enumerate(slots):
         try:
-            yield from _order(core, slot, video)
+            yield from _film_one(core, slot, order)
         except BaseException:
             for other in slots[:place]:
                 with suppress(RLightningError):
-                    yield from _order(core, other, None)
+                    yield from _film_one(core, other, None)
             raise
 
 
-def _order(core: Core, slot: int, video: VideoConfig | None) -> Procedure[None]:
-    return core.calls.call_one(time.monotonic(), slot, (RECORD_VIDEO, (video,), {}))
+def _film_one(core: Core, slot: int, order: FilmOrder | None) -> Procedure[None]:
+    films = core.supervisor.records[core.requests.hosts.item(slot)].films
+    if order is None:
+        films.pop(slot, None)
+    yield from core.calls.call_one(time.monotonic(), slot, (RECORD_VIDEO, (order,), {}))
+    if order is not None:
+        films[slot] = order

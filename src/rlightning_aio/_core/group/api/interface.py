@@ -275,7 +275,8 @@ class GroupInterface(Facade):
                 ``….partial.mp4``. If the folder has films of the env, n continues after the last
                 one. None stops filming; a film in progress becomes a partial one.
             env_ids: the envs to film; None: all local ones. Envs that share a worker wait while it
-                renders; the field ``video`` of a config entry gives the env a separate worker.
+                renders, so give those of an entry that is filmed for long a worker each
+                (``envs_per_process: 1``). A replaced worker goes on filming.
             every: film episodes 0, every, 2 * every, … of each, counted from now.
             episodes: film only these.
             sub_env: index of the sub-environment to film.
@@ -289,7 +290,7 @@ class GroupInterface(Facade):
             EnvBusy: an env has a request outstanding.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: an env belongs to an env_server.
-            WorkerDied, EnvHung: a worker ended. Replacements are not filmed.
+            WorkerDied, EnvHung: a worker ended.
             ConfigError: `sub_env`, `every` or `episodes` is invalid.
             GroupClosed: the group was not initialised, or is closed.
         """

@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar, TypeVarTuple
 
 from rlightning_aio._core.group.api.facade import only_result, steps_of
-from rlightning_aio._core.group.api.filming import film, video_of
+from rlightning_aio._core.group.api.filming import film, film_order
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
@@ -125,8 +125,8 @@ class EnvGroup(GroupInterface):
         episodes: Sequence[int] | None = None,
         sub_env: int = 0,
     ) -> None:
-        video = video_of(folder, every, episodes, sub_env)
-        self._driver.run(film(self._core, env_ids, video))
+        order = film_order(folder, every, episodes, sub_env)
+        self._driver.run(film(self._core, env_ids, order))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         return self._handle(env_id, EnvHandle, ServerHandle)

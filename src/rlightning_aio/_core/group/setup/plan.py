@@ -5,16 +5,14 @@ Rule: every error that can be found without starting a process is raised here.
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio.config import EnvConfig, check_installed, makers_of, parse_configs
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.files import check_folder
 from rlightning_aio.protocol.pickling import dumped_with_code
 from rlightning_aio.registry import load, placement_of
 from rlightning_aio.types import PolicyResponse, default_env_preprocess_fn
@@ -23,19 +21,25 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import HostFactory
     from rlightning_aio.registry import Placement
 
-__all__ = ["Plan", "PreprocessFn", "filmed_alone", "host_class", "place_of", "plan_group"]
+__all__ = ["Plan", "PreprocessFn", "host_class", "place_of", "plan_group"]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The checked arguments of `build_env_group`."""
+    """The checked arguments of `build_env_group`.
+
+    Attributes:
+        filmed: ids of envs that will be filmed; each gets a worker of its own where possible, as
+            rendering would delay others.
+    """
 
     configs: list[EnvConfig]
     preprocess_fns: list[list[PreprocessFn | None]]
     mixed_actions: bool
     zero_copy: bool
+    filmed: frozenset[str] = frozenset()
 
 
 def plan_group(
@@ -45,15 +49,15 @@ def plan_group(
     *,
     mixed_actions: bool,
     zero_copy: bool,
+    filmed: Collection[str] = (),
 ) -> Plan:
-    """Check the arguments of `build_env_group`.
+    """Check the arguments of `build_env_group`, and of commands that film (see `Plan`).
 
     Raises:
         ConfigError: a config or a preprocess function can't be used.
     """
     configs = parse_configs(env_cfgs, fields)
     check_installed(configs)
-    _check_videos(configs)
     fns = _preprocess_fns(configs, preprocess_fn)
     for config, own in zip(configs, fns, strict=True):
         place = place_of(config)
@@ -68,19 +72,12 @@ def plan_group(
             )
         for make in _distinct(makers_of(config)):
             _check_sendable(config, "task", make)
-    return Plan(configs, fns, mixed_actions, zero_copy)
+    return Plan(configs, fns, mixed_actions, zero_copy, frozenset(filmed))
 
 
 def place_of(config: EnvConfig) -> Placement:
     """Return the place of the envs of an entry."""
     return placement_of(config.backend, config.placement)
-
-
-def filmed_alone(config: EnvConfig) -> set[int]:
-    """The filmed envs of an entry; each gets its own worker, as rendering would delay others."""
-    if config.video is None or config.envs_per_process != "auto":
-        return set()
-    return set(config.video.envs)
 
 
 def host_class(config: EnvConfig) -> HostFactory:
@@ -99,35 +96,6 @@ def host_class(config: EnvConfig) -> HostFactory:
             f"entry {config.name!r}: placement {config.placement!r} needs a package that is not "
             f"installed ({error}): pip install 'rlightning-aio[{place.extra}]'"
         ) from error
-
-
-def _check_videos(configs: Sequence[EnvConfig]) -> None:
-    """Check that the encoder is installed and the folder writable.
-
-    Entries on other machines are skipped, and so is the encoder of another interpreter.
-
-    Raises:
-        ConfigError: the encoder is missing, the folder isn't writable, or the env can't render.
-    """
-    for config in configs:
-        if config.video is None:
-            continue
-        where = f"entry {config.name!r}, video"
-        if config.backend == "ale" and config.num_envs > 1:
-            raise ConfigError(
-                f"{where}: ale-py's vector env, which num_envs: {config.num_envs} makes, renders "
-                "nothing; film an entry with num_envs: 1"
-            )
-        if not place_of(config).local:
-            continue
-        if config.interpreter is None and importlib.util.find_spec("imageio_ffmpeg") is None:
-            raise ConfigError(f"{where}: needs imageio-ffmpeg: pip install 'rlightning-aio[video]'")
-        try:
-            check_folder(config.video.folder)
-        except OSError as error:
-            raise ConfigError(
-                f"{where}.folder: nothing can be written to {error.filename}: {error.strerror}"
-            ) from None
 
 
 def _preprocess_fns(

@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
-from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, filmed_alone, place_of
+from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, place_of
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of
@@ -16,7 +16,7 @@ from rlightning_aio.registry import ENVS
 from rlightning_aio.sharing import envs_per_worker
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
 __all__ = ["nums_hosts", "start_orders"]
 
@@ -64,7 +64,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
     return [
         (config, share)
         for (config, fns), num_hosts in zip(local, counts, strict=True)
-        for share in _shares(config, fns, num_hosts)
+        for share in _shares(config, fns, num_hosts, plan.filmed)
     ]
 
 
@@ -152,14 +152,20 @@ def _is_own(config: EnvConfig) -> bool:
     )
 
 
-def _shares(config: EnvConfig, fns: Sequence[PreprocessFn | None], num_hosts: int) -> list[Share]:
+def _shares(
+    config: EnvConfig,
+    fns: Sequence[PreprocessFn | None],
+    num_hosts: int,
+    filmed: Collection[str],
+) -> list[Share]:
     """The envs of each host of an entry: consecutive ones, evenly divided.
 
-    Filmed envs have hosts of their own (`filmed_alone`).
+    Filmed envs have hosts of their own, unless the entry says how many envs share one.
     """
     count = len(fns)
     envs = list(enumerate(fns))
     bounds = {count * k // num_hosts for k in range(num_hosts + 1)}
-    if place_of(config).spreads:
-        bounds |= {k + side for k in filmed_alone(config) for side in (0, 1)}
+    if place_of(config).spreads and config.envs_per_process == "auto":
+        alone = [k for k in range(count) if f"{config.name}-{k}" in filmed]
+        bounds |= {k + side for k in alone for side in (0, 1)}
     return [envs[first:end] for first, end in itertools.pairwise(sorted(bounds))]

@@ -403,6 +403,7 @@ class Supervisor:
         order = replace(
             record.order,
             checkpoints=checkpoints,
+            films=tuple(record.films.get(slot) for slot in record.slots),
             restarts=record.restarts,
             seed=seed if seed >= 0 else None,
         )

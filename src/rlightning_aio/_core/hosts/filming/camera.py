@@ -22,7 +22,7 @@ from rlightning_aio.files import check_folder, file_name
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rlightning_aio.config import VideoConfig
+    from rlightning_aio._core.hosts.messages import FilmOrder
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.slab import Slab
 
@@ -40,17 +40,17 @@ class Camera:
         ValueError: the env renders nothing, or can't be filmed.
     """
 
-    def __init__(self, env: BaseEnv, config: VideoConfig) -> None:
+    def __init__(self, env: BaseEnv, order: FilmOrder) -> None:
         find_ffmpeg()
-        _check_renders(env, config.sub_env)
-        check_folder(config.folder)
-        self._env, self._config = env, config
+        _check_renders(env, order.sub_env)
+        check_folder(order.folder)
+        self._env, self._order = env, order
         self._name = file_name(env.env_id)
         if env.num_envs > 1:
-            self._name += f"-sub-{config.sub_env}"
+            self._name += f"-sub-{order.sub_env}"
         self._fps = _fps(env)
         self._file: VideoFile | None = None
-        self._number = _last_number(Path(config.folder), self._name)
+        self._number = _last_number(Path(order.folder), self._name)
         self._off = False
 
     def watch(self, slab: Slab, row: int, autoreset: str, limit: int | None) -> None:
@@ -58,7 +58,7 @@ class Camera:
         agents = len(slab.layout.agents) or 1
         columns = (slab.is_reset, slab.over, slab.episode_length)
         self._is_reset, self._over, self._length = (
-            column[row, ...].reshape(agents, -1)[:, self._config.sub_env] for column in columns
+            column[row, ...].reshape(agents, -1)[:, self._order.sub_env] for column in columns
         )
         self._resets_itself = autoreset == "same_step"
         self._limit = limit
@@ -76,7 +76,7 @@ class Camera:
         """Begin the next episode with the current frame."""
         self._finish()
         self._number += 1
-        if self._config.wants(self._number):
+        if self._order.wants(self._number):
             self._write()
 
     def _continue(self) -> None:
@@ -93,7 +93,7 @@ class Camera:
         frame = self._frame()
         try:
             if self._file is None:
-                path = Path(self._config.folder) / f"{self._name}-episode-{self._number}.mp4"
+                path = Path(self._order.folder) / f"{self._name}-episode-{self._number}.mp4"
                 self._file = VideoFile(path, frame, self._fps)
             else:
                 self._file.write(frame)
@@ -114,7 +114,7 @@ class Camera:
         sys.stderr.write(f"env {self._env.env_id!r} is no longer filmed: {error}\n")
 
     def _frame(self) -> NDArray[np.uint8]:
-        frame = as_numpy(self._env.render_one(self._config.sub_env))
+        frame = as_numpy(self._env.render_one(self._order.sub_env))
         array = np.asarray(frame)
         if array.ndim == 4 and len(array) == 1:  # ManiSkill's, of one sub-environment.
             array = array[0]

@@ -37,8 +37,9 @@ class AwaitedRunner(EnvRunner):
         """Prepare nothing: `answer` executes everything."""
 
     def use_rows_of(self, other: AwaitedRunner) -> None:
-        """Take over the row of `other`, which this env replaces, and its episode."""
+        """Take over the row of `other`, which this env replaces, its episode and its films."""
         self.attach(other._slab, other._row, other._announce)
+        self.keep_filming(other._film)
         self.reset_with = other.reset_with
 
     async def answer(self, op: int, arguments: Any) -> Any:

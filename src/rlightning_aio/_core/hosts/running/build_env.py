@@ -70,15 +70,9 @@ def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunn
 
     env = make()
     kind = _runner_class(env, config)
-    video = config.video
     # Others are replaced by their host, with a runner of their own.
     rebuilt = config.on_env_error == "restart" and not kind.is_awaitable
-    return kind(
-        env,
-        inline=inline,
-        video=video if video is not None and index in video.envs else None,
-        rebuild=make if rebuilt else None,
-    )
+    return kind(env, inline=inline, rebuild=make if rebuilt else None)
 
 
 def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:

@@ -10,6 +10,7 @@ import contextlib
 import logging
 import pickle
 import random
+import sys
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
@@ -53,11 +54,10 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
     from rlightning_aio._core.hosts.filming.camera import Camera
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completion
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, FilmOrder
     from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio._core.hosts.running.checkpoint import Send
     from rlightning_aio._core.hosts.running.env_steps import Execute
-    from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta
@@ -104,7 +104,6 @@ class EnvRunner:
         env: built, not yet initialised.
         inline: results stay in this process. Results that hold torch tensors are then returned
             without a copy; elsewhere tensors become NumPy arrays on the CPU.
-        video: what to film from the first episode on; None films nothing.
         rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
 
     Attributes:
@@ -116,7 +115,6 @@ class EnvRunner:
             that ends it. None if the env has no such step.
         is_awaitable: its requests are awaited, together with those of other envs.
 
-    Raises what `filming.Camera` raises.
     """
 
     is_awaitable: ClassVar[bool] = False
@@ -126,13 +124,13 @@ class EnvRunner:
         env: BaseEnv,
         *,
         inline: bool = False,
-        video: VideoConfig | None = None,
         rebuild: Callable[[], BaseEnv] | None = None,
     ) -> None:
         self.restarts = 0
         self._inline = inline
-        self._video = video
         self._rebuild = rebuild
+        self._film: FilmOrder | None = None
+        self._camera: Camera | None = None
         # The env has raised, and is to be rebuilt; it was closed for that.
         self._is_spent = self._has_closed = False
         self._on_stepped: Callable[[], None] | None = None
@@ -157,7 +155,6 @@ class EnvRunner:
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
         self._input = input_of(env)
-        self._camera = None if self._video is None else _camera(env, self._video)
         if self._on_stepped is not None:
             self.fast_path.on_stepped(self._on_stepped)
 
@@ -204,12 +201,7 @@ class EnvRunner:
         every = self.env.config.snapshot_every
         if every is not None and send_checkpoint is not None:
             self._saver = Saver(self.checkpoints, slab.over[row, ...], every, send_checkpoint)
-        if self._camera is not None:
-            self._watch(self._camera)
         self._bind()
-
-    def _watch(self, camera: Camera) -> None:
-        camera.watch(self._slab, self._row, self.meta.autoreset, self.meta.max_episode_steps)
 
     def _bind(self) -> None:
         """Choose the functions that step the env with the action in its row."""
@@ -310,7 +302,9 @@ class EnvRunner:
         if self.layout.key != key:
             raise ValueError("its spaces changed with the restart")
         self.restarts += 1
+        self._camera = None
         self._attach_again()
+        self.keep_filming(self._film)
         self._is_spent = False
 
     def close(self) -> Awaitable[None] | None:
@@ -330,12 +324,26 @@ class EnvRunner:
 
     # -- films --------------------------------------------------------------------
 
-    def _record_video(self, video: VideoConfig | None) -> None:
+    def keep_filming(self, film: FilmOrder | None) -> None:
+        """Film as the env did that this one replaces. If it can't, training goes on all the same.
+
+        Args:
+            film: what that one filmed, if anything.
+        """
+        if film is None:
+            return
+        try:
+            self._record_video(film)
+        except Exception as error:
+            sys.stderr.write(f"env {self.env.env_id!r} is no longer filmed: {error}\n")
+
+    def _record_video(self, film: FilmOrder | None) -> None:
         """Film episodes from the next one on, or stop filming; the current film ends here."""
-        camera = None if video is None else _camera(self.env, video)
-        former, self._camera, self._video = self._camera, camera, video
+        camera = None if film is None else _camera(self.env, film)
+        former, self._camera, self._film = self._camera, camera, film
         if camera is not None:
-            self._watch(camera)
+            limits = self.meta.autoreset, self.meta.max_episode_steps
+            camera.watch(self._slab, self._row, *limits)
         self._bind()
         if former is not None:
             former.close()
@@ -535,7 +543,7 @@ def attach_all(
 
 
 def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
-    """Seed a replacement, and restore its envs that have a checkpoint."""
+    """Seed a replacement, restore its envs that have a checkpoint, and go on filming others."""
     if order.seed is not None:
         # Not the numbers of an episode that begins with that seed.
         seed_generators(order.seed, order.restarts, 1)
@@ -544,6 +552,8 @@ def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
     for runner, checkpoint in zip(runners, order.checkpoints, strict=False):
         if checkpoint is not None:
             runner.checkpoints.resume(checkpoint)
+    for runner, film in zip(runners, order.films, strict=False):
+        runner.keep_filming(film)
 
 
 def close_all(
@@ -576,8 +586,8 @@ def disconnect_all(runners: Sequence[EnvRunner]) -> None:
             runner.env.on_disconnect()
 
 
-def _camera(env: BaseEnv, video: VideoConfig) -> Camera:
+def _camera(env: BaseEnv, film: FilmOrder) -> Camera:
     # Not at the top: few workers need it.
     from rlightning_aio._core.hosts.filming.camera import Camera  # noqa: PLC0415
 
-    return Camera(env, video)
+    return Camera(env, film)
