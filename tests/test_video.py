@@ -370,7 +370,7 @@ def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
     for name in names:
         while ffmpeg(tmp_path / name, "-f", "null", "-").returncode:
             """The ffmpeg of the worker that has died is about to end."""
-    assert films(tmp_path) == dict.fromkeys(names, [0, 1, 2])
+    assert films(tmp_path) == {name: [0, 1, 2] for name in names}
 
 
 async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
