@@ -143,15 +143,9 @@ def rollout(
     check_seed(seed)
     configs, films = films_of(load_config(config, overrides or ()), video, video_env, video_every)
     check_plot(plot)
-    order = _Order(
-        _STEPS if steps is None and seconds is None else steps,
-        seconds,
-        min_results,
-        seed,
-        load_policy(policy) if policy else None,
-        trace,
-        films,
-    )
+    limit = _STEPS if steps is None and seconds is None else steps
+    chosen = load_policy(policy) if policy else None
+    order = _Order(limit, seconds, min_results, seed, chosen, trace, films)
     check_option_file("--trace", trace)
     statistics = RolloutStatistics(configs, keep_course=plot is not None)
     group = EnvGroup(films.plan(configs))
