@@ -311,7 +311,7 @@ async def until_free_everywhere(*, ray: bool) -> dict[str, dict[str, float]]:
     for session in ("own", "keep"):
         async with (
             rl.build_env_group(name="tool", num_workers=1, **worker) as served,
-            OpenEnvServer(served, "tool", "127.0.0.1", 0) as server,
+            OpenEnvServer(served, "127.0.0.1", 0) as server,
         ):
             kwargs = {"action_field": "action", "session": session}
             far = {"backend": "openenv", "task": server.url, "env_kwargs": kwargs}

@@ -635,9 +635,7 @@ def test_any_value_gives_entries_or_a_config_error(cfgs: object) -> None:
 
 @pytest.fixture
 def absent(monkeypatch: pytest.MonkeyPatch) -> Backend:
-    backend = Backend(
-        "absent", "nowhere:Env", "no_such_simulator", "no-such-simulator", install="make absent"
-    )
+    backend = Backend("absent", "nowhere:Env", "no_such_simulator", install="make absent")
     monkeypatch.setitem(BACKENDS, "absent", backend)
     return backend
 

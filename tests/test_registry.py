@@ -26,7 +26,7 @@ class OwnEnv(GymnasiumEnv):
     """A user's class."""
 
 
-ROW = Backend("arm", f"{__name__}:OwnEnv", "no_such_sdk", "no-such-sdk", hardware=True)
+ROW = Backend("arm", f"{__name__}:OwnEnv", "no_such_sdk", hardware=True)
 
 
 @pytest.fixture
@@ -155,5 +155,5 @@ def test_the_version_of_a_missing_simulator_is_none() -> None:
     import mujoco
 
     assert BACKENDS["mujoco"].installed_version() == mujoco.__version__
-    absent = Backend("absent", "nowhere:Env", "no_such_simulator", "no-such-simulator")
+    absent = Backend("absent", "nowhere:Env", "no_such_simulator")
     assert absent.installed_version() is None

@@ -42,7 +42,7 @@ def client_of(server: OpenEnvServer, count: int) -> dict[str, Any]:
 async def test_episodes_over_the_network_equal_those_of_the_env() -> None:
     async with (
         rl.build_env_group({**POLE, "num_workers": 2, "max_episode_steps": 15}) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
         rl.build_env_group(client_of(server, 2)) as group,
         group.auto_reset(math.inf),
     ):
@@ -69,7 +69,7 @@ async def test_episodes_over_the_network_equal_those_of_the_env() -> None:
 async def test_its_envs_are_described() -> None:
     async with (
         rl.build_env_group(POLE) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         assert await asyncio.to_thread(get_json, server.url, "/health") == {"status": "healthy"}
         assert (await asyncio.to_thread(get_json, server.url, "/metadata"))["name"] == "pole"
@@ -95,7 +95,7 @@ async def test_invalid_messages_do_not_change_the_session() -> None:
 
     async with (
         rl.build_env_group(POLE) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         address = server.url.replace("http", "ws") + "/ws"
         async with connect(address, proxy=None) as socket:
@@ -164,7 +164,7 @@ async def test_its_frames_are_json() -> None:
     entry = {"name": "unstable", "task": Unstable, "placement": "inline"}
     async with (
         rl.build_env_group(entry) as served,
-        OpenEnvServer(served, "unstable", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
         connect(server.url.replace("http", "ws") + "/ws", proxy=None) as socket,
     ):
         for kind, data in (("reset", {"episode_id": math.nan}), ("step", {"action": 0})):
@@ -194,7 +194,7 @@ async def rpc(server: OpenEnvServer, method: str, **params: Any) -> Any:
 async def test_tools_are_answered_as_by_an_environment_without_any() -> None:
     async with (
         rl.build_env_group(POLE) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         assert await rpc(server, "tools/list") == -32603
         assert await rpc(server, "tools/call", name="add") == -32603
@@ -227,7 +227,7 @@ async def test_a_session_without_a_connection_ends_by_itself() -> None:
 
     async with (
         rl.build_env_group({**POLE, "num_workers": 2}) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         address = server.url.replace("http", "ws") + "/ws?session_id="
         kept = await until_free()
@@ -261,7 +261,7 @@ async def test_a_kept_session_whose_step_never_ends_ends_by_itself() -> None:
     """Its client is gone, and never closes it; the step is aborted, and its env is free again."""
     async with (
         rl.build_env_group(Stuck, name="stuck") as served,
-        OpenEnvServer(served, "stuck", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         created: Any = await rpc(server, "openenv/session/create")
         address = server.url.replace("http", "ws") + f"/ws?session_id={created['session_id']}"
@@ -283,7 +283,7 @@ async def test_a_kept_session_whose_step_never_ends_ends_by_itself() -> None:
 async def test_a_created_session_outlives_its_socket() -> None:
     async with (
         rl.build_env_group(POLE) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         key = (await rpc(server, "openenv/session/create"))["session_id"]
         assert await rpc(server, "openenv/session/create") == -32000
@@ -355,7 +355,7 @@ def test_a_private_server_gets_headers_that_no_log_has(
 async def _use_private(session: str, folder: Path) -> None:
     async with (
         rl.build_env_group({**POLE, "num_workers": 2}) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
         private(server.url) as (url, heads),
     ):
         config = client_of(server, 2)
@@ -392,7 +392,7 @@ def test_headers_that_can_not_be_sent_are_refused(headers: dict[str, str]) -> No
 async def test_kept_sessions_of_the_backend_are_those_of_the_server() -> None:
     async with (
         rl.build_env_group({**POLE, "num_workers": 2}) as served,
-        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         config = client_of(server, 2)
         config["env_kwargs"] = {**COLUMN, "session": "keep"}

@@ -54,7 +54,6 @@ class Backend:
         name: the value of ``backend`` in a config entry.
         target: ``module:Class`` of the env class.
         module: the simulator's top module; it is looked for, never imported.
-        distribution: the package whose version is shown.
         cpu_bound: a step is plain computation on one core, so several envs may share a worker
             (``envs_per_process: auto``).
         awaitable: its envs are awaitable and do nothing but wait, so one worker runs all of an
@@ -71,7 +70,6 @@ class Backend:
     name: str
     target: str
     module: str
-    distribution: str
     cpu_bound: bool = False
     awaitable: bool = False
     vectorized: bool = False
@@ -82,14 +80,19 @@ class Backend:
     def installed_version(self) -> str | None:
         """Return the simulator's version in this interpreter, or None if it isn't installed."""
         # Imported here, because it takes as long as a tenth of a worker's other imports.
-        from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415
+        from importlib.metadata import (  # noqa: PLC0415
+            PackageNotFoundError,
+            packages_distributions,
+            version,
+        )
 
         if importlib.util.find_spec(self.module) is None:
             return None
         try:
-            return version(self.distribution)
-        except PackageNotFoundError:
-            return "unknown"
+            return version(self.module)
+        except PackageNotFoundError:  # pyzmq has the module zmq.
+            names = packages_distributions().get(self.module)
+            return version(names[0]) if names else "unknown"
 
 
 def _of_extra(name: str) -> str:
@@ -108,41 +111,39 @@ _SIMULATORS: Final = "rlightning_aio.envs.simulators"
 BACKENDS: dict[str, Backend] = {
     backend.name: backend
     for backend in (
-        Backend("mujoco", f"{_SIMULATORS}.gymnasium:MujocoEnv", "mujoco", "mujoco",
+        Backend("mujoco", f"{_SIMULATORS}.gymnasium:MujocoEnv", "mujoco",
                 cpu_bound=True, vectorized=True,
                 preload=(f"{_SIMULATORS}.gymnasium", "gymnasium.envs.mujoco")),
         Backend("gymnasium", f"{_SIMULATORS}.gymnasium:GymnasiumEnv", "gymnasium",
-                "gymnasium", cpu_bound=True, vectorized=True,
-                preload=(f"{_SIMULATORS}.gymnasium",)),
+                cpu_bound=True, vectorized=True, preload=(f"{_SIMULATORS}.gymnasium",)),
         Backend("callable", f"{_SIMULATORS}.callable:env_of_callable", "gymnasium",
-                "gymnasium", cpu_bound=True, vectorized=True,
-                preload=(f"{_SIMULATORS}.callable",)),
+                cpu_bound=True, vectorized=True, preload=(f"{_SIMULATORS}.callable",)),
         Backend("env_server", "rlightning_aio._core.hosts.env_server.host:EnvServerHost", "zmq",
-                "pyzmq", vectorized=True),
-        Backend("ale", f"{_SIMULATORS}.ale:ALEEnv", "ale_py", "ale-py", install=_of_extra("ale"),
+                vectorized=True),
+        Backend("ale", f"{_SIMULATORS}.ale:ALEEnv", "ale_py", install=_of_extra("ale"),
                 cpu_bound=True, vectorized=True, preload=(f"{_SIMULATORS}.ale",)),
         Backend("pettingzoo", f"{_SIMULATORS}.pettingzoo:PettingZooEnv", "pettingzoo",
-                "pettingzoo", install=_of_extra("pettingzoo"), cpu_bound=True,
+                install=_of_extra("pettingzoo"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.pettingzoo",)),
-        Backend("envpool", f"{_SIMULATORS}.envpool:EnvPoolEnv", "envpool", "envpool",
+        Backend("envpool", f"{_SIMULATORS}.envpool:EnvPoolEnv", "envpool",
                 install=_of_extra("envpool"), vectorized=True, preload=(f"{_SIMULATORS}.envpool",)),
         Backend("maniskill", f"{_SIMULATORS}.maniskill:ManiskillEnv", "mani_skill",
-                "mani-skill", install=_of_extra("maniskill"), vectorized=True,
+                install=_of_extra("maniskill"), vectorized=True,
                 preload=(f"{_SIMULATORS}.maniskill",)),
         Backend("isaac_manager_based", f"{_SIMULATORS}.isaac:IsaacManagerBasedEnv",
-                "isaaclab", "isaaclab", vectorized=True, install=ISAAC_LAB),
+                "isaaclab", vectorized=True, install=ISAAC_LAB),
         Backend("isaac_marl", f"{_SIMULATORS}.isaac:IsaacMarlEnv",
-                "isaaclab", "isaaclab", vectorized=True, install=ISAAC_LAB),
-        Backend("metaworld", f"{_SIMULATORS}.metaworld:MetaworldEnv", "metaworld", "metaworld",
+                "isaaclab", vectorized=True, install=ISAAC_LAB),
+        Backend("metaworld", f"{_SIMULATORS}.metaworld:MetaworldEnv", "metaworld",
                 install=_of_extra("metaworld"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.metaworld",)),
-        Backend("pusht", f"{_SIMULATORS}.lerobot_tasks:PushTEnv", "gym_pusht", "gym-pusht",
+        Backend("pusht", f"{_SIMULATORS}.lerobot_tasks:PushTEnv", "gym_pusht",
                 install=_of_extra("pusht"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.lerobot_tasks",)),
-        Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
+        Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha",
                 install=_of_extra("aloha"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.lerobot_tasks",)),
-        Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets", "websockets",
+        Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets",
                 install=_of_extra("websockets"), awaitable=True,
                 preload=("rlightning_aio.envs.openenv.env",)),
     )

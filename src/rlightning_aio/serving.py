@@ -76,11 +76,11 @@ class _Session:
 class OpenEnvServer:
     """Serves the envs of a group whose entries have the same spaces; see the module.
 
+    Clients are told the name of the first entry.
     Use it as an asynchronous context manager, inside that of the group.
 
     Args:
         group: initialised.
-        name: of the environment, as clients are told it.
         host: address to listen on.
         port: to listen on; 0 picks a free one.
         session_timeout: seconds after which a session without a connection ends, and its env is
@@ -91,10 +91,9 @@ class OpenEnvServer:
     """
 
     def __init__(
-        self, group: EnvGroup, name: str, host: str, port: int, *, session_timeout: float = 300.0
+        self, group: EnvGroup, host: str, port: int, *, session_timeout: float = 300.0
     ) -> None:
         self._group = group
-        self._name = name
         self._host, self._port = host, port
         self._session_timeout = session_timeout
         self._free = deque(group.env_ids)
@@ -152,7 +151,8 @@ class OpenEnvServer:
     async def _metadata(self, request: web.Request) -> web.Response:
         del request
         text = f"{len(self._group)} sessions of an environment of rlightning-aio"
-        found = {"name": self._name, "description": text, "version": version("rlightning-aio")}
+        name = self._group.env_ids[0].rpartition("-")[0]
+        found = {"name": name, "description": text, "version": version("rlightning-aio")}
         return _json_response(found)
 
     async def _schema(self, request: web.Request) -> web.Response:

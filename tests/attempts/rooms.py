@@ -43,4 +43,4 @@ def serving(group: rl.EnvGroup) -> OpenEnvServer:
     """A server of its envs."""
     if isinstance(asyncio.get_running_loop(), uvloop.Loop):
         pytest.skip("it keeps a descriptor of a server")
-    return OpenEnvServer(group, "room", "127.0.0.1", 0)
+    return OpenEnvServer(group, "127.0.0.1", 0)

@@ -27,7 +27,7 @@ def test_each_backend_has_a_line() -> None:
         (line,) = [line for line in lines if line.split()[:1] == [backend.name]]
         assert line.rstrip().endswith(backend.install)
         version = backend.installed_version() or "not installed"
-        assert f" {backend.distribution} {version} " in line
+        assert f" {backend.module} {version} " in line
 
 
 def test_json_has_one_object_for_each_backend() -> None:

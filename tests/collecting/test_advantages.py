@@ -24,6 +24,7 @@ def rollout_of(
     ends = np.asarray(terminated, bool), np.asarray(truncated, bool)
     columns = {"reward": reward, "terminated": ends[0], "truncated": ends[1]}
     columns["done"] = ends[0] | ends[1]
+    columns["index"] = np.zeros(reward.shape, np.int64)
     if reward.ndim > 1:
         steps, envs = reward.shape
         lasts = np.arange(envs) + (steps - 1) * envs
@@ -32,7 +33,7 @@ def rollout_of(
     others = np.union1d(np.flatnonzero(columns["done"]), np.array(cuts, int))
     places = np.concatenate([lasts, np.setdiff1d(others, lasts)]).astype(np.intp)
     empty = np.zeros((len(places), 1))
-    return Rollout(columns, reward.shape, Ends(places, empty), len(lasts), {}, {})
+    return Rollout(columns, Ends(places, empty), {}, {})
 
 
 def cleanrl(
@@ -121,10 +122,10 @@ def test_v_trace_equals_the_papers_sum(case: tuple[list[int], Any]) -> None:
     values, next_values = rng.normal(size=count), rng.normal(size=len(rollout.ends))
     log_ratios = rng.normal(size=count)
     found_targets, found_advantages = rollout.vtrace(
-        values, next_values, log_ratios, 0.97, 0.9, clip_rho=1.3, clip_c=1.1
+        values, next_values, log_ratios, 0.97, 0.9, clip=1.3
     )
     rho = np.minimum(np.exp(log_ratios), 1.3)
-    c = 0.9 * np.minimum(np.exp(log_ratios), 1.1)
+    c = 0.9 * rho
 
     def check(rows: slice, k: int) -> None:
         last = next_values[k] * (not terminated[rows.stop - 1])
@@ -169,7 +170,8 @@ def test_each_agent_has_its_own_advantages() -> None:
         name: {"a": block[name], "b": 2 * block[name] if name == "reward" else ~block[name]}
         for name in ("reward", "terminated", "truncated", "done")
     }
-    both = Rollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, {}, {})
+    columns["index"] = block.index
+    both = Rollout(columns, Ends(block.ends, np.zeros((1, 1))), {}, {})
     values = {"a": np.zeros(2), "b": np.zeros(2)}
     found = both.advantages(values, {"a": [9.0], "b": [9.0]}, 0.5, 1.0)
     assert found["a"].tolist() == [1 + 0.5 * 2, 2.0]
@@ -250,7 +252,8 @@ def test_values_after_an_agents_end_are_ignored(number: float) -> None:
     block = rollout_of([1, 2, 3], [0, 1, 0], [0, 0, 0], lengths=[3])
     ends = np.array([2], np.intp)
     columns = {name: {"a": block[name]} for name in ("reward", "terminated", "truncated", "done")}
-    rollout = Rollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, {}, {})
+    columns["index"] = block.index
+    rollout = Rollout(columns, Ends(ends, np.zeros((1, 1))), {}, {})
     values = {"a": np.array([0.0, 0.0, number])}
     gains = rollout.advantages(values, {"a": [9.0]}, 0.5, 1.0)
     assert gains["a"][:2].tolist() == [1 + 0.5 * 2, 2.0]

@@ -94,14 +94,7 @@ def copied(rollout: Rollout) -> Rollout:
     """One whose arrays nobody else writes to."""
     columns = {name: rollout[name].copy() for name in rollout}
     ends = Ends(rollout.ends, rollout.end_observation.copy())
-    return Rollout(
-        columns,
-        rollout.shape,
-        ends,
-        rollout.num_chains,
-        rollout.episodes,
-        rollout.seconds,
-    )
+    return Rollout(columns, ends, rollout.episodes, rollout.seconds)
 
 
 def stored(use: Use, found: list[Rollout]) -> list[list[Transition]]:

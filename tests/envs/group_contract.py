@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
-from rlightning_aio.envs.contract import EnvContract, Expected, same, values_of
+from rlightning_aio.envs.contract import EnvContract, Expected, outcomes_of, same, values_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -30,7 +30,7 @@ class GroupContract(EnvContract):
             meta, actions = env.get_metadata(), self.actions(env)
             spaces = env.get_observation_space(), env.get_action_space()
             seeds = self.seed, self.seed + self.config.num_envs
-            alone = [list(self.outcomes(env, actions, seed=seed)) for seed in seeds]
+            alone = [list(outcomes_of(env, actions, seed)) for seed in seeds]
         config = self.config.model_copy(update={"placement": placement, "num_workers": 2})
         with sync.build_env_group(config) as group:
             assert group.get_observation_spaces() == [spaces[0]] * 2

@@ -193,7 +193,7 @@ def test_a_lost_server_of_environments_is_no_reward(tmp_path: Path) -> None:
             ChatServer(gate=65) as chat,
             rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
         ):
-            async with OpenEnvServer(group, "shop", "127.0.0.1", 0) as server:
+            async with OpenEnvServer(group, "127.0.0.1", 0) as server:
                 printing = asyncio.create_task(
                     run_agent(chat.url, "--openenv", server.url, "--out", out, "--retries", "0")
                 )
@@ -218,7 +218,7 @@ def test_environments_of_a_server_are_played_as_those_here(tmp_path: Path) -> No
         async with (
             ChatServer(gate=64) as chat,
             rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
-            OpenEnvServer(group, "shop", "127.0.0.1", 0) as server,
+            OpenEnvServer(group, "127.0.0.1", 0) as server,
         ):
             options = ["--openenv", server.url, "--patience", "1", "--retries", "0", "--out", out]
             return await run_agent(chat.url, *options)

@@ -262,7 +262,7 @@ def test_a_fork_server_that_hangs_in_an_import_fails_the_start(
 ) -> None:
     """It reads no messages while it imports, so it is killed; the error names the modules."""
     backend = registry.Backend(
-        "faulty", "faults.faulty:FaultyEnv", "faults", "faults", preload=("faults.hanging_import",)
+        "faulty", "faults.faulty:FaultyEnv", "faults", preload=("faults.hanging_import",)
     )
     monkeypatch.setitem(registry.BACKENDS, "faulty", backend)
     group = build(entry(start_timeout=LIMIT))

@@ -152,7 +152,7 @@ MOMENTS = {
     "importing": """
         from rlightning_aio import registry
         registry.BACKENDS["faulty"] = registry.Backend(
-            "faulty", "faults.faulty:FaultyEnv", "faults", "faults",
+            "faulty", "faults.faulty:FaultyEnv", "faults",
             preload=("faults.hanging_import",),
         )
         build().init()

@@ -235,7 +235,7 @@ class Counter(BaseEnv):
 ROW = """
 from rlightning_aio.registry import Backend
 
-BACKEND = Backend("announced", "counters:Counter", "gymnasium", "gymnasium")
+BACKEND = Backend("announced", "counters:Counter", "gymnasium")
 """
 
 SCRIPT = (

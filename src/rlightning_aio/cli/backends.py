@@ -75,7 +75,7 @@ def backends(
 
 def _row(backend: Backend) -> _Row:
     version = backend.installed_version()
-    package, command = backend.distribution, backend.install
+    package, command = backend.module, backend.install
     return _Row(backend.name, version is not None, package, version, command)
 
 

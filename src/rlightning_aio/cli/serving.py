@@ -58,7 +58,7 @@ async def _serve(config: EnvConfig, host: str, port: int, session_timeout: float
         raise ConfigError(f"{error}: pip install 'rlightning-aio[websockets]'") from error
     async with (
         rlightning_aio.build_env_group(config) as group,
-        OpenEnvServer(group, config.name, host, port, session_timeout=session_timeout) as server,
+        OpenEnvServer(group, host, port, session_timeout=session_timeout) as server,
     ):
         sessions = counted(len(group), "session")
         out().print(f"{config.name}: {sessions} at {server.url}", soft_wrap=True, markup=False)

@@ -112,21 +112,20 @@ def vtrace(
     log_ratios: NDArray[Any],
     gamma: float,
     lam: float,
-    clip_rho: float,
-    clip_c: float,
+    clip: float,
     stops: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """V-trace (Espeholt et al., 2018, arXiv:1802.01561, eq. 1 and section 4.2).
 
     Takes the arguments of `gae`, and ``[n]`` `log_ratios`: log-probability of the action under the
-    learned policy minus that under the acting policy. Ratios that weight errors and advantages are
-    clipped at `clip_rho`; those that carry corrections back (the paper's traces c, scaled by
-    `lam`, remark 2) at `clip_c`.
+    learned policy minus that under the acting policy. Ratios that weight errors and advantages
+    are clipped at `clip`, and so are those that carry corrections back (the paper's traces c,
+    scaled by `lam`, remark 2).
     """
     dtype = values.dtype
     ratios = np.exp(log_ratios).astype(dtype, copy=False)
-    rhos = np.minimum(ratios, dtype.type(clip_rho))
-    traces = lam * np.minimum(ratios, dtype.type(clip_c))
+    rhos = np.minimum(ratios, dtype.type(clip))
+    traces = lam * rhos
     after = segments.successors(values, next_values)
     errors = rhos * (rewards + gamma * _until(terminated, after) - values)
     corrections = segments.backwards(errors.astype(dtype, copy=False), gamma * traces, stops)

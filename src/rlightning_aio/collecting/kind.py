@@ -213,7 +213,7 @@ class EnvKind:
         episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
         found = Ends(ends, end_observation)
-        return Rollout(columns, shape, found, full.num_chains, episodes, seconds)
+        return Rollout(columns, found, episodes, seconds)
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)

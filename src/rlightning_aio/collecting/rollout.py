@@ -60,7 +60,6 @@ class Rollout:
             earlier. ``index`` is that of the env in the group, ``total_reward`` the undiscounted
             return since the reset, summed over agents, ``length`` the steps since the reset, and
             ``info`` a list: the info of the last step, without that of the next episode.
-        num_chains: number of envs with transitions in this rollout.
         seconds: times by name. ``elapsed``: since the previous rollout was complete, or since the
             first call of `collect`. ``collecting``: inside `Collector.collect`; a learner that runs
             in between waits that long. ``policy``: in calls of the policy. ``env_busy``: in steps
@@ -84,19 +83,22 @@ class Rollout:
     def __init__(
         self,
         columns: dict[str, Tree],
-        shape: tuple[int, ...],
         ends: Ends,
-        num_chains: int,
         episodes: dict[str, Any],
         seconds: dict[str, float],
     ) -> None:
         self._columns = columns
-        self.shape = shape
+        index: Any = columns["index"]
+        self.shape: tuple[int, ...] = index.shape
         self.ends, self._end_observation = ends
-        self.num_chains = num_chains
         self.episodes = episodes
         self.seconds = seconds
         self._segments: Segments | None = None
+
+    @property
+    def num_chains(self) -> int:
+        """Number of envs with transitions in this rollout."""
+        return len(np.unique(self.index))
 
     # -- columns ------------------------------------------------------------------
 
@@ -213,9 +215,7 @@ class Rollout:
         log_ratios: Any,
         gamma: float,
         lam: float = 1.0,
-        *,
-        clip_rho: float = 1.0,
-        clip_c: float = 1.0,
+        clip: float = 1.0,
     ) -> _Pair | dict[str, _Pair]:
         """Compute V-trace over chains, for transitions of an older policy.
 
@@ -227,8 +227,8 @@ class Rollout:
                 name), in the shape of the rollout; a dict of such by agent.
             gamma: discount.
             lam: scales the traces.
-            clip_rho: upper limit of the ratios that weight errors and advantages.
-            clip_c: upper limit of the ratios that carry corrections back.
+            clip: upper limit of the ratios of probabilities, both of those that weight errors and
+                advantages and of those that carry corrections back.
 
         Returns:
             Two new arrays in the shape of the rollout, or a dict of such by agent: targets of the
@@ -241,11 +241,11 @@ class Rollout:
         if isinstance(values, dict):
             return {
                 agent: self._vtrace(
-                    agent, own, next_values[agent], log_ratios[agent], gamma, lam, clip_rho, clip_c
+                    agent, own, next_values[agent], log_ratios[agent], gamma, lam, clip
                 )
                 for agent, own in cast("dict[str, Any]", values).items()
             }
-        return self._vtrace(None, values, next_values, log_ratios, gamma, lam, clip_rho, clip_c)
+        return self._vtrace(None, values, next_values, log_ratios, gamma, lam, clip)
 
     def _vtrace(
         self,
@@ -255,8 +255,7 @@ class Rollout:
         log_ratios: Any,
         gamma: float,
         lam: float,
-        clip_rho: float,
-        clip_c: float,
+        clip: float,
     ) -> _Pair:
         now, after = self._checked(values, next_values)
         ratios = self._rows("log_ratios", log_ratios)
@@ -270,8 +269,7 @@ class Rollout:
             ratios,
             gamma,
             lam,
-            clip_rho,
-            clip_c,
+            clip,
             None if agent is None else self._of(agent, "done"),
         )
         return targets.reshape(self.shape), advantages.reshape(self.shape)

@@ -37,13 +37,11 @@ class Full(NamedTuple):
         order: ``[n]``, their places, those of each env contiguous and in order.
         ends: ``[k]``, positions in `order` of transitions without successor, ends of chains first.
         end_rows: ``[k]``, rows of `Staging.end_observation`.
-        num_chains: number of envs with transitions.
     """
 
     order: NDArray[np.intp]
     ends: NDArray[np.intp]
     end_rows: NDArray[np.intp]
-    num_chains: int
 
 
 class Staging:
@@ -308,7 +306,7 @@ class Staging:
         inner = np.zeros(len(order), np.bool_)
         inner[:-1] = envs[1:] == envs[:-1]
         end_rows = np.lexsort((ends, inner[ends]))
-        return Full(order, ends[end_rows], end_rows, len(order) - len(inner.nonzero()[0]))
+        return Full(order, ends[end_rows], end_rows)
 
     def _end_chains(self, held: ResultRows | None) -> None:
         """Record the observation after each chain that continues in the next rollout."""

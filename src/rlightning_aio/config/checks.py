@@ -57,7 +57,7 @@ def check_installed(configs: Iterable[EnvConfig]) -> None:
         if backend.installed_version() is None:
             problems.add(
                 f"envs.{index} ({config.name!r}), backend",
-                f"{backend.name!r} needs {backend.distribution}: {backend.install}",
+                f"{backend.name!r} needs {backend.module}: {backend.install}",
             )
     problems.raise_any()
 

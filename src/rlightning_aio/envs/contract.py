@@ -86,25 +86,6 @@ class EnvContract:
         finally:
             env.close()
 
-    def outcomes(
-        self, env: BaseEnv, actions: Sequence[Any], *, seed: int | None = None
-    ) -> Iterator[Expected]:
-        """Yield the env's outcomes of a reset with `seed` (or the given one) and of each action.
-
-        As in `simulate`, a reset takes the place of the step after the end of an episode, unless
-        the env resets itself.
-        """
-
-        def step(action: Any) -> Expected:
-            return values_of(_step(env, action))
-
-        yield values_of(env.reset(seed=self.seed if seed is None else seed))
-        ended = False
-        for action in actions:
-            outcome = values_of(env.reset()) if ended else step(action)
-            ended = _awaits_reset(env, outcome)
-            yield outcome
-
     def test_metadata_is_what_the_env_was_configured_to_be(self) -> None:
         """Id, counts and spaces are known as soon as the env is built."""
         with self.opened() as env:
@@ -145,16 +126,16 @@ class EnvContract:
         """The same seed and actions give the same bits, in this env and in another one."""
         with self.opened() as env, self.opened() as other:
             actions = self.actions(env)
-            first = list(self.outcomes(env, actions))
-            assert same(first, list(self.outcomes(env, actions))), "not when reset again"
-            assert same(first, list(self.outcomes(other, actions))), "not in another env"
+            first = list(outcomes_of(env, actions, self.seed))
+            assert same(first, list(outcomes_of(env, actions, self.seed))), "not when reset again"
+            assert same(first, list(outcomes_of(other, actions, self.seed))), "not in another env"
 
     def test_other_seeds_give_other_trajectories(self) -> None:
         """The seed matters."""
         with self.opened() as env:
             actions = self.actions(env)
-            one = list(self.outcomes(env, actions))
-            assert not same(one, list(self.outcomes(env, actions, seed=self.seed + 1000)))
+            one = list(outcomes_of(env, actions, self.seed))
+            assert not same(one, list(outcomes_of(env, actions, self.seed + 1000)))
 
     def test_results_are_not_overwritten(self) -> None:
         """A returned result stays unchanged during later steps."""
@@ -215,9 +196,23 @@ class EnvContract:
             expected = list(self.simulate(actions))
             assert len(expected) == len(actions) + 1
             for index, (one, other) in enumerate(
-                zip(self.outcomes(env, actions), expected, strict=True)
+                zip(outcomes_of(env, actions, self.seed), expected, strict=True)
             ):
                 assert same(one, other), f"outcome {index}: {one} is not {other}"
+
+
+def outcomes_of(env: BaseEnv, actions: Sequence[Any], seed: int) -> Iterator[Expected]:
+    """Yield the env's outcomes of a reset with `seed` and of each action.
+
+    As in `EnvContract.simulate`, a reset takes the place of the step after the end of an episode,
+    unless the env resets itself.
+    """
+    yield values_of(env.reset(seed=seed))
+    ended = False
+    for action in actions:
+        outcome = values_of(env.reset() if ended else _step(env, action))
+        ended = _awaits_reset(env, outcome)
+        yield outcome
 
 
 def values_of(result: Any) -> Expected:

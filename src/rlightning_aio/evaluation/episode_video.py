@@ -12,7 +12,7 @@ import zlib
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from rlightning_aio._core.hosts.messages import RECORD_VIDEO, FilmOrder
 from rlightning_aio.attempts.spec import written
@@ -26,7 +26,10 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.collecting.procedure import Procedure
 
-__all__ = ["EpisodeVideo", "Filming"]
+__all__ = ["EpisodeVideo", "Filming", "Wanted"]
+
+Wanted: TypeAlias = bool | Literal["failed"]
+"""Whether the film of an episode is wanted, or only if the episode fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,12 +37,11 @@ class EpisodeVideo:
     """The episodes to film.
 
     Attributes:
-        folder, wants, failed_only: `video`, `video_if` and `video_failed` of `evaluate`.
+        folder, wants: `video` and `video_if` of `evaluate`.
     """
 
     folder: str | os.PathLike[str]
-    wants: Callable[[EpisodeSpec], bool] | None = None
-    failed_only: bool = False
+    wants: Callable[[EpisodeSpec], Wanted] | None = None
 
 
 @dataclass(slots=True)
@@ -56,28 +58,29 @@ class Filming:
 
     group: Any
     video: EpisodeVideo
-    _filmed: set[str] = field(default_factory=set[str])
-    """Envs that are filming an episode."""
+    _filmed: dict[str, Wanted] = field(default_factory=dict[str, "Wanted"])
+    """Envs that are filming an episode, and whether its film is wanted."""
 
     def __post_init__(self) -> None:
         check_folder(self.video.folder)
 
     def begin(self, env_id: str, spec: EpisodeSpec) -> Procedure[None]:
         """Film the next episode of an idle env, if it is wanted."""
-        if self.video.wants is None or self.video.wants(spec):
+        wanted = self.video.wants is None or self.video.wants(spec)
+        if wanted:
             folder = self._folder(env_id)
             shutil.rmtree(folder, ignore_errors=True)
             order = FilmOrder(str(folder), episodes=(0,))
             yield partial(self.group[env_id].call, RECORD_VIDEO, order)
-            self._filmed.add(env_id)
+            self._filmed[env_id] = wanted
 
     def end(self, env_id: str, attempt: Attempt) -> Procedure[None]:
         """Stop filming an idle env, and keep or delete the film of the episode."""
         if env_id in self._filmed:
             yield partial(self.group[env_id].call, RECORD_VIDEO, None)
-            self._filmed.remove(env_id)
+            wanted = self._filmed.pop(env_id)
             folder = self._folder(env_id)
-            if not self.video.failed_only or attempt.success is False:
+            if wanted != "failed" or attempt.success is False:
                 # A step limit of the group ends an episode, but not its film.
                 for film in folder.glob("*-episode-0*.mp4"):
                     finish_file(film, Path(self.video.folder, _name(attempt)))
@@ -86,7 +89,7 @@ class Filming:
     def drop(self, env_id: str) -> None:
         """Delete what was filmed of an episode that was lost."""
         if env_id in self._filmed:
-            self._filmed.remove(env_id)
+            del self._filmed[env_id]
             shutil.rmtree(self._folder(env_id), ignore_errors=True)
 
     def _folder(self, env_id: str) -> Path:

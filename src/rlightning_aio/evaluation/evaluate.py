@@ -11,7 +11,7 @@ from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation.episode_video import EpisodeVideo
+from rlightning_aio.evaluation.episode_video import EpisodeVideo, Wanted
 from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.evaluation.playing import Options, PolicyPlay
 from rlightning_aio.policies.predicting import Model, PredictPolicy
@@ -44,8 +44,7 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], bool] | None = None,
-    video_failed: bool = False,
+    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Evaluation: ...
 
@@ -61,8 +60,7 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], bool] | None = None,
-    video_failed: bool = False,
+    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Coroutine[Any, Any, Evaluation]: ...
 
@@ -77,8 +75,7 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], bool] | None = None,
-    video_failed: bool = False,
+    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
@@ -104,8 +101,8 @@ def evaluate(
             each `seed`, since episodes without a seed are only known by their number.
         video: folder for films, ``<entry>-<task>-seed-<seed>.mp4``, created if missing; options of
             an episode add a number to the name, an episode for one env its env and number.
-        video_if: returns True for an episode to film; None films all.
-        video_failed: keep the films of episodes whose success is False, and delete the others.
+        video_if: returns True for an episode to film, or ``"failed"`` to keep its film only if its
+            success is False; None films all.
         on_episode: called with each episode: first with those in the file, then as others end.
 
     Raises:
@@ -121,7 +118,7 @@ def evaluate(
     is_number = isinstance(episodes, SupportsIndex)
     _check_numbers({"min_results": min_results, "episodes": episodes if is_number else None})
     _check(group, one_each=video is not None or not is_number)
-    films = None if video is None else EpisodeVideo(video, video_if, video_failed)
+    films = None if video is None else EpisodeVideo(video, video_if)
     queue = AttemptQueue(group, Rules(retries=retries), results)
     options = Options(min_results or default_min_results(group), films, on_episode)
     play = PolicyPlay(group, _called(policy, group, seed), queue, Evaluation(), options)

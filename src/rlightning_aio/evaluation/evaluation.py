@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 from rlightning_aio.outcomes import is_bystanders
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 __all__ = ["Evaluation", "parts_of"]
 
@@ -71,11 +68,6 @@ class Evaluation:
     def by_task(self) -> dict[str, Evaluation]:
         """Split by task, in alphabetical order."""
         return parts_of(self, "task")
-
-    def of_envs(self, env_ids: Iterable[str]) -> Evaluation:
-        """Select the episodes of some envs."""
-        wanted = set(env_ids)
-        return Evaluation([attempt for attempt in self.attempts if attempt.env_id in wanted])
 
     def __str__(self) -> str:
         """A table with a line for each task."""

@@ -10,7 +10,6 @@ BACKEND = Backend(
     "piper",
     "rlightning_aio.piper.env:PiperEnv",
     "piper_sdk",
-    "piper-sdk",
     hardware=True,
     install="pip install 'rlightning-aio[piper]'",
 )

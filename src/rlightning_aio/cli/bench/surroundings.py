@@ -28,5 +28,5 @@ def surroundings(configs: Iterable[EnvConfig]) -> dict[str, Any]:
         backend = ENVS.described(config.backend)
         version = None if backend is None else backend.installed_version()
         if backend is not None and version is not None:
-            versions[backend.distribution] = version
+            versions[backend.module] = version
     return {"cores": num_cores(), "cpu": cpu_model(), "versions": versions}

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.evaluation.episode_video import Wanted
 
 __all__ = [
     "EpisodesFile",
@@ -136,10 +137,11 @@ class QueueOptions:
             raise ConfigError(f"--video-episode {name}: is not in the queue; give TASK:SEED")
         every = {_place(spec) for spec in specs[:: self.video_every or 1]}
 
-        def wanted(spec: EpisodeSpec) -> bool:
-            return _place(spec) in every and (not chosen or _name(spec) in chosen)
+        def wanted(spec: EpisodeSpec) -> Wanted:
+            is_chosen = _place(spec) in every and (not chosen or _name(spec) in chosen)
+            return "failed" if is_chosen and self.video_failed else is_chosen
 
-        return {"video": self.video, "video_if": wanted, "video_failed": self.video_failed}
+        return {"video": self.video, "video_if": wanted}
 
 
 def _name(spec: EpisodeSpec) -> str:
