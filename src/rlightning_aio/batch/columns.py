@@ -13,6 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from rlightning_aio.batch.infos import info_list_of_rows
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
@@ -26,6 +27,18 @@ __all__ = ["BY_ROW", "ResultColumns"]
 
 # Offset of the monotonic clock, which stamps results, from the epoch.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
+
+
+_FIELDS: Final = (
+    "env_id",
+    "observation",
+    "last_reward",
+    "last_terminated",
+    "last_truncated",
+    "info",
+    "ts_env_sent_ns",
+)
+"""Of a result; see `EnvRet`."""
 
 
 class ResultColumns(msgspec.Struct):
@@ -224,30 +237,40 @@ class ResultColumns(msgspec.Struct):
             return {"r": sums["r"].sum(axis=0), "l": sums["l"].max(axis=0)}
         return sums
 
-    def ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
-        """Result of one env as a separate value."""
-        kept = self.out_of_band_of(row) if self.out_of_band else {}
+    def rets(self) -> list[EnvRet | MultiAgentEnvRet]:
+        """Results of all envs as separate values."""
+        rows = range(len(self.slots))
+        if self.out_of_band or self.reward.ndim > 1:
+            return [self._ret(row) for row in rows]
+        # As `_ret`, column by column, which takes half of the time.
+        terminated, truncated = self.terminated.tolist(), self.truncated.tolist()
+        infos = info_list_of_rows(self)
+        for row in np.flatnonzero(self.done).tolist():
+            infos[row] = self.info_of(row)
+        env_ids, reward = self.names.ids(self.slots), self.reward.tolist()
+        observation = [index(self.observation, row) for row in rows]
+        times = [self.sent_ns_of(row) for row in rows]
+        columns = env_ids, observation, reward, terminated, truncated, infos, times
+        return [
+            unchecked(EnvRet, dict(zip(_FIELDS, fields, strict=True)))
+            for fields in zip(*columns, strict=True)
+        ]
+
+    def _ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
+        kept = self.out_of_band_of(row)
         if "ret" in kept:
             return self._ret_handed_over(row, kept["ret"])
-        if self.reward.ndim == 1:  # As `head_of`, in an eighth of the time.
-            reward = self.reward.item(row)
-            terminated = self.flags.item(row, TERMINATED)
-            truncated = self.flags.item(row, TRUNCATED)
-            info = self.info_of(row) if terminated or truncated else self.reported_info_of(row)
-        else:
-            heads = self.reward, self.terminated, self.truncated
-            reward, terminated, truncated = (self.head_of(head, row) for head in heads)
-            info = self.info_of(row)
-        fields = {
-            "env_id": self.names.env_ids[self.slots.item(row)],
-            "observation": self.observation_of(row),
-            "last_reward": reward,
-            "last_terminated": terminated,
-            "last_truncated": truncated,
-            "info": info,
-            "ts_env_sent_ns": self.sent_ns_of(row),
-        }
-        return unchecked(MultiAgentEnvRet if self.agents else EnvRet, fields, kept.get("extra"))
+        fields = (
+            self.names.env_ids[self.slots.item(row)],
+            self.observation_of(row),
+            self.head_of(self.reward, row),
+            self.head_of(self.terminated, row),
+            self.head_of(self.truncated, row),
+            self.info_of(row),
+            self.sent_ns_of(row),
+        )
+        kind = MultiAgentEnvRet if self.agents else EnvRet
+        return unchecked(kind, dict(zip(_FIELDS, fields, strict=True)), kept.get("extra"))
 
     def _ret_handed_over(self, row: int, ret: Any) -> Any:
         changed: dict[str, Any] = {}

@@ -163,8 +163,8 @@ def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
     if not part.whole_results:
         done = part.done
         return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
-    rets = [part.ret(row) for row in range(len(part))]
-    return np.array([_all_flags(r.last_terminated, r.last_truncated) for r in rets], np.bool_)
+    flags = [_all_flags(ret.last_terminated, ret.last_truncated) for ret in part.rets()]
+    return np.array(flags, np.bool_)
 
 
 def _all_flags(terminated: Any, truncated: Any) -> bool:

@@ -17,6 +17,7 @@ from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.batch.parts import (
     column_of_parts,
+    in_order,
     infos_of_parts,
     observations_of_parts,
     rows_in_order,
@@ -135,8 +136,7 @@ class BatchedData:
             if self._columns is not None:
                 self._values = _policy_responses(self._columns, self.env_ids())
             else:
-                places = rows_in_order(self._parts)
-                self._values = [part.ret(row) for part, row in places]
+                self._values = in_order(self._parts, [part.rets() for part in self._parts])
         return self._values
 
     def items(self) -> list[tuple[str, Any]]:

@@ -7,7 +7,7 @@ knows the positions of its rows in the batch; a single part has the rows in orde
 from __future__ import annotations
 
 from itertools import repeat
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "column_of_parts",
+    "in_order",
     "infos_of_parts",
     "observations_of_parts",
     "reported_infos_of_parts",
@@ -33,16 +34,24 @@ __all__ = [
     "taken_parts",
 ]
 
+T = TypeVar("T")
+
 
 def rows_in_order(parts: Sequence[ResultColumns]) -> list[tuple[ResultColumns, int]]:
     """Part and row for each position in the batch."""
+    return in_order(parts, [[*zip(repeat(part), range(len(part)))] for part in parts])
+
+
+def in_order(parts: Sequence[ResultColumns], values: Sequence[list[T]]) -> list[T]:
+    """Join the values of the rows of each part, in the order of the batch."""
     if len(parts) == 1:
-        return list(zip(repeat(parts[0]), range(len(parts[0].slots)), strict=False))
-    places: list[Any] = [None] * _size(parts)
-    for part in parts:
-        for row, position in enumerate(cast("NDArray[np.intp]", part.positions).tolist()):
-            places[position] = (part, row)
-    return places
+        return values[0]
+    whole: list[Any] = [None] * _size(parts)
+    for part, own in zip(parts, values, strict=True):
+        positions = cast("NDArray[np.intp]", part.positions).tolist()
+        for position, value in zip(positions, own, strict=True):
+            whole[position] = value
+    return whole
 
 
 def _size(parts: Sequence[ResultColumns]) -> int:
@@ -127,9 +136,7 @@ def infos_of_parts(parts: Sequence[ResultColumns], *, episodes: bool) -> dict[st
 
 def reported_infos_of_parts(parts: Sequence[ResultColumns]) -> list[dict[str, Any]]:
     """One info for each row, as the env reported it."""
-    if len(parts) == 1 and parts[0].positions is None:
-        return info_list_of_rows(parts[0])
-    return [part.reported_info_of(row) for part, row in rows_in_order(parts)]
+    return in_order(parts, [info_list_of_rows(part) for part in parts])
 
 
 def taken_parts(parts: Sequence[ResultColumns], chosen: Sequence[int]) -> list[ResultColumns]:
