@@ -45,7 +45,9 @@ class PolicyResponse:
     @property
     def extras(self) -> dict[str, Any]:
         """Fields other than `env_id` and `action`."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("env_id", "action")}
+        extras = self.__dict__.copy()
+        del extras["env_id"], extras["action"]
+        return extras
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{k}={v!r}" for k, v in self.__dict__.items())

@@ -248,7 +248,7 @@ class ResultColumns(msgspec.Struct):
         for row in np.flatnonzero(self.done).tolist():
             infos[row] = self.info_of(row)
         env_ids, reward = self.names.ids(self.slots), self.reward.tolist()
-        observation = [index(self.observation, row) for row in rows]
+        observation = [self.observation_of(row) for row in rows]
         times = [self.sent_ns_of(row) for row in rows]
         columns = env_ids, observation, reward, terminated, truncated, infos, times
         return [

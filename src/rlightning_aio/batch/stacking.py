@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -12,7 +12,22 @@ from rlightning_aio.protocol.columns import as_array
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["columns_where_possible", "concatenated", "differing", "form_of", "stacked_values"]
+__all__ = [
+    "columns_where_possible",
+    "concatenated",
+    "differing",
+    "form_of",
+    "plain_numbers",
+    "stacked_values",
+]
+
+_PLAIN: Final = (int, float, bool)
+
+
+def plain_numbers(values: list[Any]) -> NDArray[Any] | None:
+    """Convert Python's numbers of one type to an array; return None for all else."""
+    kinds = set(map(type, values))
+    return np.array(values) if len(kinds) == 1 and not kinds.isdisjoint(_PLAIN) else None
 
 
 def stacked_values(values: list[Any]) -> Any:
@@ -25,6 +40,8 @@ def stacked_values(values: list[Any]) -> Any:
         ValueError: they differ in structure or shape.
     """
     first = values[0] if values else None
+    if (numbers := plain_numbers(values)) is not None:
+        return numbers
     if isinstance(first, dict | tuple):
         return _stacked_trees(cast("dict[Any, Any] | tuple[Any, ...]", first), values)
     if hasattr(first, "detach") and all(hasattr(value, "detach") for value in values):

@@ -11,10 +11,9 @@ import time
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio._core.group.api.facade import only_result, response_to
-from rlightning_aio._core.group.engine.agent_steps import AgentStep
+from rlightning_aio._core.group.api.facade import response_to
+from rlightning_aio._core.group.engine.agent_steps import AgentStep, EpisodeStart
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
-from rlightning_aio.batch.contents import are_over
 from rlightning_aio.errors import EpisodeLost
 
 if TYPE_CHECKING:
@@ -37,13 +36,13 @@ class Agents:
         self._serving: asyncio.Task[None] | None = None
 
     def ask(
-        self, env_id: str, response: PolicyResponse
+        self, env_id: str, what: PolicyResponse | EpisodeStart
     ) -> tuple[AgentStep, asyncio.Future[StepEnd]]:
-        """Have a step sent in the next turn of the loop; return it, and what gets its outcome."""
+        """Have a step or a reset sent in the next turn of the loop; return it, and its outcome."""
         self._driver.check_caller()
         loop = asyncio.get_running_loop()
         reply: asyncio.Future[StepEnd] = loop.create_future()
-        step = AgentStep(env_id, response, reply)
+        step = AgentStep(env_id, what, reply)
         if self._steps.ask(step):
             serving = self._driver.run(self._steps.serve(time.monotonic()))
             self._serving = new_task(serving, loop, Context())  # In no agent's context.
@@ -83,41 +82,38 @@ class EnvEpisode:
         options: dict[str, Any] | None,
     ) -> None:
         self._group, self._agents, self.env = group, agents, env
-        self._seed, self._options = seed, options
+        self._start = EpisodeStart(seed, options)
         self.lost: Outcome | None = None
-        self._reset: asyncio.Future[tuple[BatchedData, Any]] | None = None
-        # Steps that were cancelled after they had been sent.
+        # Steps, and the reset, that were cancelled after they had been sent.
         self._given_up: list[AgentStep] = []
         self._has_given_up_call = False
 
     async def __aenter__(self) -> Self:
         try:
-            seeds = None if self._seed is None else [self._seed]
-            reset: Any = self._group.reset(seeds, self._options, [self.env.env_id])
-            self._reset = task = asyncio.ensure_future(reset)
-            found = await asyncio.shield(task)
-            self._reset = None  # A task keeps its result.
-            self.last, (self.is_over,) = only_result(found), are_over(found[0])
+            self.last, self.is_over, _ = await self._asked(self._start)
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        tasks: list[asyncio.Future[Any]] = []
-        if self._reset is not None:
-            tasks.append(self._reset)
-            self._reset = None
-        in_flight = any(not task.done() for task in tasks) or self._has_given_up_call
-        if in_flight or any(step.is_outstanding for step in self._given_up):
+        if self._has_given_up_call or any(step.is_outstanding for step in self._given_up):
             self._has_given_up_call = False
             abort: Any = self._group.abort([self.env.env_id])
-            tasks.append(asyncio.ensure_future(abort))
-            # However often this is cancelled, they go on, and the env is idle in the end.
-            await asyncio.wait(tasks)
-        for task in tasks:
+            aborting = asyncio.ensure_future(abort)
+            # However often this is cancelled, it goes on, and the env is idle in the end.
+            await asyncio.wait([aborting])
             # Read, so that asyncio doesn't log an error that nobody asks for.
-            _ = task.cancelled() or task.exception()
+            _ = aborting.cancelled() or aborting.exception()
+
+    async def _asked(self, what: PolicyResponse | EpisodeStart) -> StepEnd:
+        step, reply = self._agents.ask(self.env.env_id, what)
+        try:
+            return await reply
+        except BaseException:
+            if step.is_outstanding:
+                self._given_up.append(step)
+            raise
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
@@ -131,14 +127,7 @@ class EnvEpisode:
         """
         loss: BatchedData | None = None
         if self.lost is None:
-            env_id = self.env.env_id
-            step, reply = self._agents.ask(env_id, response_to(env_id, response))
-            try:
-                ret, is_over, loss = await reply
-            except BaseException:
-                if step.is_outstanding:
-                    self._given_up.append(step)
-                raise
+            ret, is_over, loss = await self._asked(response_to(self.env.env_id, response))
             if loss is None:
                 self.last, self.is_over = ret, is_over
                 return ret

@@ -16,6 +16,7 @@ from rlightning_aio._core.group.state.slab_layout import rows_in
 from rlightning_aio._core.hosts.messages import NO_ACTION
 from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.batch.sent import columns_of_values
+from rlightning_aio.batch.stacking import plain_numbers
 from rlightning_aio.errors import BadAction
 from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
 from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
@@ -109,12 +110,15 @@ def _write_one_by_one(
         slab = layout.slabs[slab_index]
         rows = layout.row[slots[positions]]
         for leaf, target in slab.action_columns:
-            sources = [_as_array(_at(actions[k], leaf)) for k in positions]
-            for k, source in zip(positions, sources, strict=True):
-                if source.shape != leaf.shape or not _castable(source, leaf):
-                    who = envs.describe(int(slots[k]))
-                    raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
-            stacked = np.array(sources)
+            values = [_at(actions[k], leaf) for k in positions]
+            stacked = plain_numbers(values)
+            if stacked is None or leaf.shape or not _castable(stacked, leaf):
+                sources = [_as_array(value) for value in values]
+                for k, source in zip(positions, sources, strict=True):
+                    if source.shape != leaf.shape or not _castable(source, leaf):
+                        who = envs.describe(int(slots[k]))
+                        raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
+                stacked = np.array(sources)
             if (unfit := _unfit(stacked, leaf, slab)) is not None:
                 raise _unfit_error(unfit, stacked, leaf, slots[positions], envs)
             target[rows] = stacked

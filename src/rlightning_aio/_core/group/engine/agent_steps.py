@@ -1,4 +1,4 @@
-"""`AgentSteps`: the steps of agents. An agent is a coroutine that plays one env.
+"""`AgentSteps`: the resets and steps of agents. An agent is a coroutine that plays one env.
 
 What agents ask for in one turn of the event loop is sent as one batch, and results that are ready
 together are handed out as one. One call waits for all of them, while any agent waits: a step costs
@@ -9,7 +9,8 @@ one after another, results wait for a hundredth of a step's time, so that there 
 from __future__ import annotations
 
 from asyncio import CancelledError
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
 from rlightning_aio._core.group.drivers.wait import TURN, Wait
 from rlightning_aio._core.group.engine.waiting import REPLIES
@@ -18,12 +19,13 @@ from rlightning_aio.batch.data import BatchedData
 from rlightning_aio.errors import EnvAway
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.resets import Resets
     from rlightning_aio._core.group.engine.steps import Steps
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["AgentStep", "AgentSteps", "StepEnd"]
+__all__ = ["AgentStep", "AgentSteps", "EpisodeStart", "StepEnd"]
 
 _MANY: Final = 400
 """With this number of steps outstanding, several end in a hundredth of the time of one."""
@@ -67,34 +69,51 @@ class _Reply(Protocol):
     def set_exception(self, exception: BaseException, /) -> None: ...
 
 
+class EpisodeStart(NamedTuple):
+    """What an agent's env is reset with; see `Env.reset`."""
+
+    seed: int | None
+    options: dict[str, Any] | None
+
+
 class AgentStep:
-    """A step that an agent has asked for.
+    """A step or a reset that an agent has asked for.
 
     Args:
-        env_id, response: of it.
+        env_id: of its env.
+        what: the response that the env is stepped with, or what it is reset with.
         reply: gets its `StepEnd`, or the error.
 
     Attributes:
-        env_id, response, reply: as given.
+        env_id, what, reply: as given.
         is_outstanding: it was sent, and has not ended.
     """
 
-    __slots__ = ("env_id", "is_outstanding", "reply", "response")
+    __slots__ = ("env_id", "is_outstanding", "reply", "what")
 
-    def __init__(self, env_id: str, response: PolicyResponse, reply: _Reply) -> None:
+    def __init__(self, env_id: str, what: PolicyResponse | EpisodeStart, reply: _Reply) -> None:
         self.env_id = env_id
-        self.response = response
+        self.what = what
         self.reply = reply
         self.is_outstanding = False
+
+    @property
+    def kind(self) -> object:
+        """Steps of the same kind can be sent as one batch."""
+        if not isinstance(self.what, EpisodeStart):
+            return "step"
+        seed, options = self.what
+        return ("seeded" if seed is not None else "reset") if options is None else self
 
 
 class AgentSteps:
     """See the module; the arguments are the group's parts."""
 
-    def __init__(self, tables: Tables, steps: Steps, waiting: Waiting) -> None:
+    def __init__(self, tables: Tables, steps: Steps, resets: Resets, waiting: Waiting) -> None:
         self._tables = tables
         self._requests = tables.requests
         self._steps = steps
+        self._resets = resets
         self._waiting = waiting
         self._asked: list[AgentStep] = []
         # Those that are outstanding, by slot.
@@ -140,7 +159,11 @@ class AgentSteps:
         asked = [step for step in self._asked if not step.reply.done()]
         self._asked.clear()
         if asked:
-            self._send(asked, ticket, now)
+            by_kind: dict[object, list[AgentStep]] = {}
+            for step in asked:
+                by_kind.setdefault(step.kind, []).append(step)
+            for alike in by_kind.values():
+                self._send(alike, ticket, now)
             self._waiting.poll()  # Some may have ended at once.
             has_handed_out = self._hand_out(ticket) or has_handed_out
         if has_handed_out:
@@ -156,16 +179,12 @@ class AgentSteps:
         return now + pause if pause >= _SHORTEST_PAUSE else 0.0
 
     def _send(self, asked: Sequence[AgentStep], ticket: Ticket, now: float) -> None:
-        """Send steps as one batch; if that can't be, one by one, so that each has its own error."""
-        batch = BatchedData([step.env_id for step in asked], [step.response for step in asked])
+        """Send steps as one batch; if that can't be, one by one, so that each has its own error.
+
+        Those of a batch are of one kind.
+        """
         try:
-            slots, packed = self._steps.write(batch, now)
-            if len(slots) < len(asked):
-                raise EnvAway(
-                    f"the client of env {asked[0].env_id!r} has left since its last result; the "
-                    "first result of one that is back comes through collect_async",
-                    env_id=asked[0].env_id,
-                )
+            slots, send = self._prepared(asked, now)
         except Exception as error:  # noqa: BLE001  # Nothing was sent.
             if len(asked) == 1:
                 asked[0].reply.set_exception(error)
@@ -177,7 +196,26 @@ class AgentSteps:
             self._sent[slot] = step
             step.is_outstanding = True
         ticket.remaining += len(slots)
-        self._steps.send(slots, packed, now, ticket)
+        send(ticket)
+
+    def _prepared(
+        self, asked: Sequence[AgentStep], now: float
+    ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
+        """Check steps of one kind; return their slots, and what sends them."""
+        env_ids, first = [step.env_id for step in asked], asked[0].what
+        if isinstance(first, EpisodeStart):
+            seeds = None
+            if first.seed is not None:
+                seeds = [cast("EpisodeStart", step.what).seed or 0 for step in asked]
+            return self._resets.prepared(now, seeds, first.options, env_ids)
+        slots, packed = self._steps.write(BatchedData(env_ids, [step.what for step in asked]), now)
+        if len(slots) < len(asked):
+            raise EnvAway(
+                f"the client of env {env_ids[0]!r} has left since its last result; the first "
+                "result of one that is back comes through collect_async",
+                env_id=env_ids[0],
+            )
+        return slots, partial(self._steps.send, slots, packed, now)
 
     def _hand_out(self, ticket: Ticket) -> bool:
         """Give each agent whose request has ended its result or error; False if there is none."""

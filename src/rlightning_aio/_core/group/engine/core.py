@@ -80,12 +80,12 @@ class Core:
         dispatch = Dispatch(tables, supervisor, poller, waiting, parts.watcher)
         self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)
         self.newest = self.steps.newest
-        self.agent_steps = AgentSteps(tables, self.steps, waiting)
         self.calls = Calls(tables, dispatch, intake, waiting)
         self._snapshots = Snapshots(
             envs, supervisor, dispatch, self.calls, tables.continuity, waiting
         )
         self._resets = Resets(tables, supervisor, dispatch, results, intake, waiting)
+        self.agent_steps = AgentSteps(tables, self.steps, self._resets, waiting)
         self._aborts = Aborts(tables, supervisor, results, arrivals, intake, waiting, stats)
 
     # -- life -------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_RESTORED
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -67,8 +67,20 @@ class Resets:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
         if env_ids is None and self._members.possible:
             now = yield from self._await_members(now)
+        slots, send = self.prepared(now, seed, options, env_ids)
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        return ticket, slots
+
+    def prepared(
+        self,
+        now: float,
+        seed: Seeds,
+        options: dict[str, Any] | None,
+        env_ids: Sequence[str] | None,
+    ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
+        """Check resets; return the slots, and what sends the resets for a ticket."""
         slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
-        return (yield from self._reset(now, seed, options, slots))
+        return slots, self._prepared(now, seed, options, slots)
 
     def reset_members(
         self,
@@ -85,7 +97,9 @@ class Resets:
             self._members.rank()
             offsets = self._envs.seed_offset[slots]
             seeds = (checked_seed(seed) + offsets - offsets[:1]).tolist()
-        return (yield from self._reset(now, seeds, options, slots))
+        send = self._prepared(now, seeds, options, slots)
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        return ticket, slots
 
     def reset_async(
         self,
@@ -121,9 +135,9 @@ class Resets:
             self._waiting.check(now)
         return now
 
-    def _reset(
+    def _prepared(
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
-    ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
+    ) -> Callable[[Ticket], None]:
         seeds = self._seeds_for(slots, seed, now)
         joined = self._requests.joined(slots)
         self._dispatch.check_sendable(now, slots[~joined], "reset")
@@ -138,8 +152,7 @@ class Resets:
                     asked, own_seeds = slots[~joined], seeds[~joined]
             self._send(asked, own_seeds, options, packed, ticket.owner, now)
 
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return ticket, slots
+        return send
 
     def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
         """Apply completions, and return the seeds of resets that are about to be sent."""

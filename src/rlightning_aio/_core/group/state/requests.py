@@ -534,6 +534,8 @@ class Requests:
         else:
             self.owner[slots] = ticket.owner
             ticket.remaining -= len(slots)
+            if ticket.apart:
+                ticket.ended.append(slots)
 
     # -- calls that wait for their own replies ------------------------------------
 
