@@ -117,6 +117,54 @@ async def test_two_steps_of_one_env_are_one_too_many() -> None:
         assert [ret.info["count"] for ret in found] == [2, 2]
 
 
+class Picky(Counter):
+    """Its observation is the seed; refuses an odd one, and says which options it was given."""
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        if seed is not None and seed % 2:
+            raise ArithmeticError
+        super().reset()
+        return np.array([seed or 0]), {"options": options} if options else {}
+
+
+async def begun(starts: list[Any]) -> list[Any]:
+    """The first results, or the errors, of episodes that begin in one turn of the loop."""
+
+    async def first(episode: Any) -> Any:
+        return (await episode.__aenter__()).last
+
+    return await asyncio.gather(*map(first, starts), return_exceptions=True)
+
+
+@pytest.mark.parametrize("place", PLACES, ids=["inline", "workers"])
+async def test_episodes_that_begin_together_have_their_own_seeds_options_and_errors(
+    place: dict[str, Any],
+) -> None:
+    async with rl.build_env_group(Picky, num_workers=6, **place) as group:
+        given: list[Any] = [(2, None), (3, None), (None, None), (4, {"a": 1}), (-1, None), (6, 7)]
+        found = await begun(
+            [group.episode(e, *one) for e, one in zip(group.env_ids, given, strict=True)]
+        )
+        assert isinstance(found[1], EnvRaised)
+        assert [found[k].observation.tolist() for k in (0, 2, 3)] == [[2], [0], [4]]
+        assert found[1].env_id == group.env_ids[1]
+        assert found[3].info == {"options": {"a": 1}}
+        assert isinstance(found[4], ValueError)
+        assert isinstance(found[5], TypeError)
+        assert group.pending == []
+        assert len(await begun([group.episode(env_id, 8) for env_id in group.env_ids])) == 6
+        found = await stepped(await episodes(group), [STEP] * 6)
+        assert [ret.info["count"] for ret in found] == [1] * 6
+
+
+async def test_two_episodes_of_one_env_that_begin_together_are_one_too_many() -> None:
+    async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
+        one, other = group.env_ids
+        found = await begun([group.episode(one), group.episode(one), group.episode(other)])
+        assert [type(ret) is EnvBusy for ret in found] == [False, True, False]
+        assert group.pending == []
+
+
 async def test_agents_of_a_worker_that_dies_lose_their_own_episodes() -> None:
     async with rl.build_env_group(Counter, num_workers=4, envs_per_process=2) as group:
         playing = await episodes(group)

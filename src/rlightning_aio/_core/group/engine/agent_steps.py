@@ -39,7 +39,7 @@ _MANY: Final = 400
 """With this number of steps outstanding, several end in a hundredth of the time of one."""
 _SHARE: Final = 0.01
 """How much later, as a share of its time, a step may end for a batch with others."""
-_SHORTEST_PAUSE, _LONGEST_PAUSE = 0.001, 0.005
+_SHORTEST_PAUSE, _LONGEST_PAUSE = 0.001, 0.01
 """Seconds; an event loop's timers know no less than the first."""
 
 
