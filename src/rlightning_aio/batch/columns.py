@@ -13,12 +13,10 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from rlightning_aio.batch.infos import info_list_of_rows
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
-from rlightning_aio.types import EnvRet, MultiAgentEnvRet, unchecked
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,18 +25,6 @@ __all__ = ["BY_ROW", "ResultColumns"]
 
 # Offset of the monotonic clock, which stamps results, from the epoch.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
-
-
-_FIELDS: Final = (
-    "env_id",
-    "observation",
-    "last_reward",
-    "last_terminated",
-    "last_truncated",
-    "info",
-    "ts_env_sent_ns",
-)
-"""Of a result; see `EnvRet`."""
 
 
 class ResultColumns(msgspec.Struct):
@@ -237,53 +223,6 @@ class ResultColumns(msgspec.Struct):
             return {"r": sums["r"].sum(axis=0), "l": sums["l"].max(axis=0)}
         return sums
 
-    def rets(self) -> list[EnvRet | MultiAgentEnvRet]:
-        """Results of all envs as separate values."""
-        rows = range(len(self.slots))
-        if self.out_of_band or self.reward.ndim > 1:
-            return [self._ret(row) for row in rows]
-        # As `_ret`, column by column, which takes half of the time.
-        terminated, truncated = self.terminated.tolist(), self.truncated.tolist()
-        infos = info_list_of_rows(self)
-        for row in np.flatnonzero(self.done).tolist():
-            infos[row] = self.info_of(row)
-        env_ids, reward = self.names.ids(self.slots), self.reward.tolist()
-        observation = [self.observation_of(row) for row in rows]
-        times = [self.sent_ns_of(row) for row in rows]
-        columns = env_ids, observation, reward, terminated, truncated, infos, times
-        return [
-            unchecked(EnvRet, dict(zip(_FIELDS, fields, strict=True)))
-            for fields in zip(*columns, strict=True)
-        ]
-
-    def _ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
-        kept = self.out_of_band_of(row)
-        if "ret" in kept:
-            return self._ret_handed_over(row, kept["ret"])
-        fields = (
-            self.names.env_ids[self.slots.item(row)],
-            self.observation_of(row),
-            self.head_of(self.reward, row),
-            self.head_of(self.terminated, row),
-            self.head_of(self.truncated, row),
-            self.info_of(row),
-            self.sent_ns_of(row),
-        )
-        kind = MultiAgentEnvRet if self.agents else EnvRet
-        return unchecked(kind, dict(zip(_FIELDS, fields, strict=True)), kept.get("extra"))
-
-    def _ret_handed_over(self, row: int, ret: Any) -> Any:
-        changed: dict[str, Any] = {}
-        for name in ("reward", "terminated", "truncated"):
-            field = f"last_{name}"
-            if _is_default(getattr(ret, field)) and self.reward.ndim > 1:
-                changed[field] = self.head_of(getattr(self, name), row)
-        if self.episode(row):
-            changed["info"] = self.info_of(row)
-        if self.limit_reached is not None and self.limit_reached[row]:
-            changed["last_truncated"] = _like(ret.last_truncated, self.head_of(self.truncated, row))
-        return ret.model_copy(update=changed) if changed else ret
-
     def sent_ns_of(self, row: int) -> int:
         """Time when one env sent its result, in ns since the epoch."""
         if self.sent_ns is None:
@@ -325,18 +264,6 @@ class ResultColumns(msgspec.Struct):
         if self.agents:
             return {agent: array[:, k] for k, agent in enumerate(self.agents)}
         return array
-
-
-def _is_default(field: Any) -> bool:
-    """Return True if a reward or flag of all sub-environments or agents was left out."""
-    return type(field) in (float, bool) or (isinstance(field, dict) and not field)
-
-
-def _like(old: Any, value: Any) -> Any:
-    """Convert `value` to the type of `old`: a tensor on the same device, or an array."""
-    if isinstance(old, dict):
-        return {key: _like(part, value[key]) for key, part in cast("dict[str, Any]", old).items()}
-    return old.new_tensor(value) if hasattr(old, "new_tensor") else value
 
 
 BY_ROW: Final = (

@@ -21,6 +21,7 @@ from rlightning_aio.batch.parts import (
     reported_infos_of_parts,
     rows_in_order,
 )
+from rlightning_aio.batch.rets import rets_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -163,7 +164,7 @@ def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
     if not part.whole_results:
         done = part.done
         return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
-    flags = [_all_flags(ret.last_terminated, ret.last_truncated) for ret in part.rets()]
+    flags = [_all_flags(ret.last_terminated, ret.last_truncated) for ret in rets_of(part)]
     return np.array(flags, np.bool_)
 
 

@@ -24,6 +24,7 @@ from rlightning_aio.batch.parts import (
     shapes,
     taken_parts,
 )
+from rlightning_aio.batch.rets import rets_of
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction
@@ -136,7 +137,7 @@ class BatchedData:
             if self._columns is not None:
                 self._values = _policy_responses(self._columns, self.env_ids())
             else:
-                self._values = in_order(self._parts, [part.rets() for part in self._parts])
+                self._values = in_order(self._parts, [rets_of(part) for part in self._parts])
         return self._values
 
     def items(self) -> list[tuple[str, Any]]:
