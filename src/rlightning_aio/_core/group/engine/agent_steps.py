@@ -99,7 +99,7 @@ class AgentStep:
 
     @property
     def kind(self) -> object:
-        """Steps of the same kind can be sent as one batch."""
+        """What it shares with steps that can be sent as one batch with it."""
         if not isinstance(self.what, EpisodeStart):
             return "step"
         seed, options = self.what
