@@ -99,7 +99,7 @@ class AgentStep:
 
     @property
     def kind(self) -> object:
-        """What it shares with steps that can be sent as one batch with it."""
+        """A key that steps share which can be sent as one batch."""
         if not isinstance(self.what, EpisodeStart):
             return "step"
         seed, options = self.what
