@@ -304,6 +304,18 @@ def test_entries_may_differ() -> None:
     assert Counter(one.env_id for one in found.attempts) == {"pair-0": 4, "single-0": 2}
 
 
+def test_the_policy_waits_for_half_of_the_envs_by_default() -> None:
+    """So it is not called for one env after the other."""
+    sizes: list[int] = []
+
+    def noting(batch: rl.BatchedData) -> Any:
+        sizes.append(len(batch))
+        return nothing(batch)
+
+    evaluated(group_of(*[scripted(lambda _: True)] * 6), 1, policy=noting)
+    assert set(sizes) == {3}
+
+
 async def test_it_is_awaited_over_an_asynchronous_group() -> None:
     """The policy may be awaitable, too."""
 

@@ -48,6 +48,7 @@ from rlightning_aio.errors import (
     WorkerDied,
 )
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
+from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -791,6 +792,28 @@ async def test_an_object_with_gymnasiums_methods_will_do(place: dict[str, Any]) 
             for _ in range(30):
                 batch, _ = await group.step(batch.respond(action=np.array([1, 5, 8])))
         assert batch.observation.tolist() == [40, 45, 0]
+
+
+class Chat:
+    """Texts in and out, and no spaces."""
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return {"said": "hello"}, {}
+
+    async def step(self, action: Any) -> Any:
+        return {"said": f"{action}?"}, 1.0, action == "bye", False, {}
+
+
+async def test_an_awaitable_env_without_spaces_takes_plain_values(place: dict[str, Any]) -> None:
+    """Its spaces are `Anything`, so nobody has to say it."""
+    async with rl.build_env_group(Chat, num_workers=2, **place) as group:
+        for space in (*group.get_observation_spaces(), *group.get_action_spaces()):
+            assert isinstance(space, Anything)
+        batch, _ = await group.reset()
+        assert batch.observation == [{"said": "hello"}] * 2
+        batch, _ = await group.step(batch.respond(action=["tea", "bye"]))
+        assert batch.observation == [{"said": "tea?"}, {"said": "bye?"}]
+        assert batch.terminated.tolist() == [False, True]
 
 
 class Slotted:
