@@ -1,6 +1,7 @@
 """rlightning_aio: many reinforcement-learning environments in worker processes, used as one.
 
-The public names. Each is imported when it is first used: a worker needs few of them.
+The names that most programs need; each is imported when it is first used, as a worker needs few of
+them. What ``docs/reference`` lists is promised. Everything else, `_core` above all, may change.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup, EnvHandle, build_env_group, run
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.collecting import Collector
     from rlightning_aio.config import EnvConfig, load_config
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.errors import (
@@ -31,14 +33,17 @@ if TYPE_CHECKING:
         UnknownEnv,
         WorkerDied,
     )
+    from rlightning_aio.evaluation import evaluate
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.registry import ENVS
+    from rlightning_aio.spaces import Anything
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __version__ = "0.2.0"
 
 _HOMES = {
     "batch": ("BatchedData",),
+    "collecting": ("Collector",),
     "config": ("EnvConfig", "load_config"),
     "envs.base": ("BaseEnv",),
     "errors": (
@@ -60,18 +65,22 @@ _HOMES = {
         "WorkerDied",
     ),
     "_core.group.api.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
+    "evaluation": ("evaluate",),
     "outcomes": ("Outcome",),
     "registry": ("ENVS",),
+    "spaces": ("Anything",),
     "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "ENVS",
+    "Anything",
     "BadAction",
     "BaseEnv",
     "BatchedData",
     "ClientRefused",
+    "Collector",
     "ConfigError",
     "EnvAway",
     "EnvBusy",
@@ -95,6 +104,7 @@ __all__ = [
     "UnknownEnv",
     "WorkerDied",
     "build_env_group",
+    "evaluate",
     "load_config",
     "run",
 ]
