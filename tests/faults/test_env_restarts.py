@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
 import gymnasium as gym
@@ -225,6 +226,31 @@ def test_the_env_is_closed_and_rebuilt_wherever_it_lives(
         assert batch.observation[-1].tolist() == [first[-1] + fault, 1]
     made, closed = group.call("e-0", "lives")
     assert (made, closed) == (len(batch) + 2, [first[-1], first[-1] + 1])
+
+
+class Unsendable(Lives):
+    """Action 1 returns what can't leave its process."""
+
+    def step(self, action: Any) -> Any:
+        return *super().step(0)[:-1], {"lock": threading.Lock()} if action else {}
+
+
+class AwaitedUnsendable(AwaitedLives):
+    def __init__(self) -> None:
+        self.env = Unsendable()
+
+
+@pytest.mark.parametrize("task", [Unsendable, AwaitedUnsendable])
+@on_one_driver
+def test_an_env_whose_result_cannot_be_sent_is_rebuilt(build: Start, task: type) -> None:
+    """Its worker raises that in its place."""
+    group = build({"name": "e", "task": task, "placement": "process", "on_env_error": "restart"})
+    group.init()
+    batch, _ = group.reset()
+    batch, _ = group.step(batch.respond(action=[1]))
+    assert batch.restarted.tolist() == [True]
+    assert "can't be pickled" in batch.outcome[0].cause
+    assert batch.observation.tolist() == [[2, 0]]
 
 
 @pytest.mark.parametrize("task", [Lives, AwaitedLives])

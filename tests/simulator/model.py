@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from simulator.scripted import (
     DYING,
+    NOT_SHOWN,
     RAISING,
     TIMEOUT,
     Act,
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
 
 MARKS = {"worker_restarted", "client_lost"}
+UNSHOWN = "unshown"
+"""What an env does that can't show the state to which it was put back after a death."""
 COLLECTOR = "collector"
 """Owner of the requests whose results a collect returns."""
 
@@ -598,7 +601,11 @@ class Model:
         acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
             acts += state.faults(Request("reset"))
-        return [act for act in acts if act[0] in (*RAISING, "rubbish")]
+        found = [act for act in acts if act[0] in (*RAISING, "rubbish")]
+        shows = request.kind == "step" and not request.due and env.may_be_lost
+        if shows and any("bound" in info for state in env.saves for info in state.infos):
+            found.append((UNSHOWN, 0))
+        return found
 
     def _begun_again(self, env: Env, request: Request) -> Request:
         """The reset that follows an exception; an awaitable env begins the same episode again."""
@@ -766,15 +773,19 @@ class Model:
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
         acts = self._raising(env, request)
-        raising = [act for act in acts if act[0] in RAISING]
+        raising = [act for act in acts if act[0] in (*RAISING, UNSHOWN)]
         is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
         if env.entry.on_error == "restart" and fault.exception_type != "KeyboardInterrupt":
             require(raising or is_rubbish, "an error of nobody", repr(fault), request)
             self._put_away(env, request)
         elif raising:
             likely = [act for act in raising if str(act[1]) in fault.exception_text]
-            effect, token = (likely or raising)[0]
+            effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
             check_raised(fault, effect, token)
+            if effect == UNSHOWN:
+                env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
+                env.torn = env.after_loss()
+                self.counts["resumed, and not shown"] += 1
             if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
                 check_outcome(fault, request, effect, token)
             self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
@@ -815,6 +826,7 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
         "raise": (f"as asked for: {token}", *_raised_class(token)),
         "raise oddly": (f"odd {token}", "Odd", EnvRaised),
         "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
+        UNSHOWN: (f"the result can't be pickled: {NOT_SHOWN}", "TypeError", TypeError),
     }[effect]
     require(fault.exception_text == text, "another error", fault.exception_text, text)
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)

@@ -271,6 +271,7 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
+    features = _with_bound(seed, kind, features, plans)
     has_clients = kind == "group" and apart.random() < _CLIENTS and CLIENTS not in without
     if has_clients:
         features, plans = _with_clients(apart, features, plans)
@@ -307,6 +308,16 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
     if plan.form == "stacked" and kind == "sb3":
         plan = replace(plan, mode="same_step")
     return features, [plan]
+
+
+def _with_bound(
+    seed: int, kind: str, features: frozenset[str], plans: list[Plan]
+) -> frozenset[str]:
+    """The same, perhaps so that envs resume from what they can't show."""
+    resumes = kind == "group" and any(plan.every for plan in plans)
+    if not resumes or Random(seed ^ 0xB0).random() < 0.6:
+        return features
+    return features - {"snapshots"} | {"raise", "die"}
 
 
 def _with_clients(

@@ -242,6 +242,8 @@ class Session:
         effects += ["end", "cut", "both"] * ("ends" in features)
         effects += ["info", "info", "info", "nested"] * ("infos" in features)
         effects += ["slow"] * ("slow" in features)
+        if env.entry.every is not None and "raise" in features and "snapshots" not in features:
+            effects += ["bound"] * 4
         effect = rng.choice(effects)
         if plain or rng.random() > 0.15:
             return effect, token

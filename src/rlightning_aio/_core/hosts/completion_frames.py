@@ -64,7 +64,9 @@ def completion_in(host_id: int, frame: Frame) -> Completion:
 
 
 def _encoded_result(result: Result) -> tuple[FrameKind, int, bytes]:
-    payload = dumped(result.out_of_band, "the result")
+    payload = result.out_of_band
+    if type(payload) is not bytes:
+        payload = dumped(payload, "the result")
     if result.restarted is not None:
         return FrameKind.RESTARTED, result.entry, pickle.dumps((result.restarted, payload))
     return FrameKind.RESULT, result.entry, payload

@@ -292,12 +292,13 @@ class AwaitedEnvs:
         record = self._records[env.index]
         if error is None and op_of(entry) == Operation.STEP:
             record.losses = 0
-        if self._renews and error is not None:
-            text = ErrorText.of(error)
-            if text.ends_env(op_of(entry)):
-                why = Loss(f"raised {text.summary}", "env_raised", "either", record.name)
+        completion = completion_of(self._host_id, env.runner, entry, outcome, error)
+        if self._renews and isinstance(completion, Raised):
+            raised = completion.error
+            if raised.ends_env(op_of(entry)):
+                why = Loss(f"raised {raised.summary}", "env_raised", "either", record.name)
                 self._put_away(record, env, why)
-        self._finish(record, completion_of(self._host_id, env.runner, entry, outcome, error))
+        self._finish(record, completion)
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self._inline and isinstance(error, KeyboardInterrupt):
             self._loop.call_soon(_reraise, error)

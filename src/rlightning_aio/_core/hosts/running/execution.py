@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import ErrorText, Raised, Result, Value
 from rlightning_aio.protocol.entries import answers_with_value, op_of
+from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,6 +58,8 @@ def completion_of(
 ) -> Result | Value | Raised | None:
     """Return the completion of a request, or None if the row holds the whole result.
 
+    What can't leave this process is an error of the env.
+
     Args:
         host_id: of the env's host.
         runner: of the env.
@@ -64,10 +67,17 @@ def completion_of(
         outcome: the part of the result that is out of band; for a call, its value.
         error: what the env has raised instead.
     """
+    returns_value = answers_with_value(op_of(entry))
+    travels = outcome is not None and not (returns_value or runner.inline)
+    if error is None and travels:
+        try:
+            outcome = dumped(outcome, "the result")
+        except TypeError as misfit:
+            error = misfit
     if error is not None:
         text = ErrorText.of(error)
         runner.note_error(op_of(entry), text)
         return Raised(host_id, entry, text)
-    if answers_with_value(op_of(entry)):
+    if returns_value:
         return Value(host_id, entry, outcome)
     return None if outcome is None else Result(host_id, entry, outcome)

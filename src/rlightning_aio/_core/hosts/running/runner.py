@@ -107,6 +107,7 @@ class EnvRunner:
         rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
 
     Attributes:
+        inline: it lives in the trainer's process.
         restarts: how many workers had this env before, and how often it was rebuilt.
         fast_path: what the env offers to save time.
         checkpoints: of the env.
@@ -127,7 +128,7 @@ class EnvRunner:
         rebuild: Callable[[], BaseEnv] | None = None,
     ) -> None:
         self.restarts = 0
-        self._inline = inline
+        self.inline = inline
         self._rebuild = rebuild
         self._film: FilmOrder | None = None
         self._camera: Camera | None = None
@@ -169,7 +170,7 @@ class EnvRunner:
     def layout(self) -> RowLayout:
         """The row that this env needs."""
         # The results of bare steps are handed over if the env doesn't use their arrays again.
-        hands_over = self._inline and self._is_bare and self.fast_path.fresh_results
+        hands_over = self.inline and self._is_bare and self.fast_path.fresh_results
         return RowLayout.of(self.meta, observations_out_of_band=hands_over)
 
     def attach(
@@ -191,7 +192,7 @@ class EnvRunner:
             autoreset=self.meta.autoreset,
             announce=announce,
             partial_of=num_envs if num_envs > self.meta.num_envs else 0,
-            stays_here=self._inline,
+            stays_here=self.inline,
         )
         if self._casts is not None:
             self._writer.convert_by(self._casts.fitted)
@@ -429,7 +430,7 @@ class EnvRunner:
         An episode that is repeated after a death gets other numbers: an env that crashes by chance
         would crash at the same step again.
         """
-        if seed is not None and not self._inline:
+        if seed is not None and not self.inline:
             seed_generators(seed, self.restarts)
 
     def _finish_reset(self, returned: Any, busy_ns: int, *, is_bare: bool) -> OutOfBand | None:
