@@ -136,6 +136,8 @@ def test_auto_reset_resets_by_its_counter_alone(group: EnvGroup) -> None:
         for _ in range(5):
             batch, flags = group.step(responses(ids[:2]))
             told.append((batch.values()[0].observation[1], flags[0], group.step_counter[ids[0]]))
+            # As in RLightning, only an env's own end is in its result.
+            assert not batch.values()[0].last_truncated
         assert told == [(1, False, 1), (2, False, 2), (3, True, 3), (0, False, 0), (1, False, 1)]
         assert env.given == ((), {})
         assert group.step_counter[ids[2]] == 0
