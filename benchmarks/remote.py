@@ -51,13 +51,13 @@ gym.register(TASK, CheetahSized, disable_env_checker=True, order_enforce=False)
 
 def request() -> list[bytes]:
     """Return a message with the size of a step."""
-    return Writer().write(Step(session=2**62, number=2**20), [bytes(6 * 4)])
+    return Writer().write(Step(number=2**20), [bytes(6 * 4)])
 
 
 def reply() -> list[bytes]:
     """Return a message with the size of a result."""
     result = ClientResult(
-        session=2**62, number=2**20, busy_ns=2**15, reward=0.0, terminated=False, truncated=False
+        number=2**20, busy_ns=2**15, reward=0.0, terminated=False, truncated=False
     )
     return Writer().write(result, [bytes(17 * 8)])
 

@@ -1,20 +1,16 @@
-"""A TCP proxy that knows ZMTP's frames and disturbs the messages that it forwards.
+"""A TCP proxy that knows ZMTP's frames and disturbs the connections that it forwards.
 
-Whole messages are dropped, repeated, delayed and reordered; connections are cut, or
-fall silent without being closed (half-open), as if a cable had been pulled. ZMTP's own
-commands pass, except through a silent connection.
+At a message, a connection is cut, or falls silent without being closed (half-open), as if a cable
+had been pulled. ZMTP's own commands pass, except through a silent connection.
 """
 
 from __future__ import annotations
 
 import contextlib
-import heapq
-import itertools
 import os
 import selectors
 import socket
 import threading
-import time
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -28,12 +24,8 @@ _MORE, _LONG, _COMMAND = 1, 2, 4
 class Faults:
     """Probabilities for each message."""
 
-    drop: float = 0.0
-    repeat: float = 0.0
-    delay: float = 0.0
     cut: float = 0.0
     silence: float = 0.0
-    delay_seconds: float = 0.05
 
 
 @dataclass
@@ -93,14 +85,12 @@ class FaultyProxy:
         host, _, port = target.removeprefix("tcp://").rpartition(":")
         self._target = (host, int(port))
         self.faults = faults
-        self.tally = dict.fromkeys(("passed", "drop", "repeat", "delay", "cut", "silence"), 0)
+        self.tally = dict.fromkeys(("passed", "cut", "silence"), 0)
         self._rng = np.random.default_rng(seed)
         self._selector = selectors.DefaultSelector()
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._late: list[tuple[float, int, _Flow, bytes]] = []
-        self._order = itertools.count()
         self._pairs: list[_Pair] = []
         self._end, self._told = os.pipe()
         self._selector.register(self._end, selectors.EVENT_READ)
@@ -122,17 +112,13 @@ class FaultyProxy:
 
     def _run(self) -> None:
         while True:
-            wait = max(0.0, self._late[0][0] - time.monotonic()) if self._late else None
-            for key, _ in self._selector.select(wait):
+            for key, _ in self._selector.select():
                 if key.fileobj == self._end:
                     return
                 if key.fileobj is self._listener:
                     self._accept()
                 else:
                     self._read(key.data)
-            while self._late and self._late[0][0] <= time.monotonic():
-                _, _, flow, message = heapq.heappop(self._late)
-                self._send(flow, message)
 
     def _accept(self) -> None:
         client, _ = self._listener.accept()
@@ -168,32 +154,15 @@ class FaultyProxy:
 
     def _pass(self, flow: _Flow, message: bytes) -> None:
         self.tally["passed"] += 1
-        fate, faults = self._rng.random(), self.faults
-        for name in ("drop", "repeat", "delay", "cut", "silence"):
-            fate -= getattr(faults, name)
-            if fate < 0:
-                self.tally[name] += 1
-                getattr(self, f"_{name}")(flow, message)
-                return
-        self._send(flow, message)
-
-    def _drop(self, flow: _Flow, message: bytes) -> None:
-        pass
-
-    def _repeat(self, flow: _Flow, message: bytes) -> None:
-        self._send(flow, message)
-        self._delay(flow, message)
-
-    def _delay(self, flow: _Flow, message: bytes) -> None:
-        # Messages that arrive meanwhile overtake it.
-        due = time.monotonic() + self._rng.random() * self.faults.delay_seconds
-        heapq.heappush(self._late, (due, next(self._order), flow, message))
-
-    def _cut(self, flow: _Flow, message: bytes) -> None:
-        self._close(flow.pair)
-
-    def _silence(self, flow: _Flow, message: bytes) -> None:
-        flow.pair.silent = True
+        fate = self._rng.random()
+        if fate < self.faults.cut:
+            self.tally["cut"] += 1
+            self._close(flow.pair)
+        elif fate < self.faults.cut + self.faults.silence:
+            self.tally["silence"] += 1
+            flow.pair.silent = True
+        else:
+            self._send(flow, message)
 
     def _send(self, flow: _Flow, message: bytes) -> None:
         if not flow.pair.closed and not flow.pair.silent:

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 import pytest
 import zmq
@@ -24,7 +25,7 @@ from rlightning_aio._core.hosts.env_server import (
 )
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.space_description import describe
-from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, ClientHello, Ping, Writer
+from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, Bye, ClientHello, Writer
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote.keys import make_keys
 
@@ -139,12 +140,9 @@ def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: byt
         assert listener.connections.num_wasted == listener.connections.num_dropped == 0
 
 
-def ping() -> bytes:
-    return Writer().write(Ping(session=1))[0]
-
-
 @pytest.mark.parametrize(
-    ("said", "most"), [(b"nonsense", 1), (ping(), connection_limiter._MAX_WASTED + 1)]
+    ("said", "most"),
+    [(b"nonsense", 1), (Writer().write(Bye())[0], connection_limiter._MAX_WASTED + 1)],
 )
 def test_a_peer_that_sends_nothing_useful_is_cut_off(said: bytes, most: int) -> None:
     """At once after nonsense, and its further messages are not read; a client may be silent."""
@@ -169,43 +167,57 @@ def hello() -> list[bytes]:
         ClientHello(
             version=VERSION,
             name="greedy",
-            nonce=1,
             observation_space=observation_space,
             action_space=action_space,
         )
     )
 
 
-def test_a_client_that_keeps_opening_connections_keeps_only_the_last_one(
+def test_a_client_that_keeps_opening_connections_keeps_only_the_first_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its other connections make room, and no other client is cut off."""
     monkeypatch.setattr(connection_limiter, "_MAX_CONNECTIONS", 20)
     with with_a_client() as (group, listener, friend, first):
-        batch, message = first, hello()
+        batch = first
         with zmq.Context() as context, contextlib.ExitStack() as held:
             for _ in range(40):
                 greedy = held.enter_context(context.socket(zmq.DEALER))
                 greedy.linger = 0
                 greedy.set(zmq.RECONNECT_IVL, -1)
                 greedy.connect(group["robots-0"].address)
-                greedy.send_multipart(message)
+                greedy.send_multipart(hello())
                 while not greedy.poll(0):
                     batch = step(group, batch)
-                (token,) = [
-                    token
-                    for token, session in listener._sessions._registry.sessions.items()
-                    if session.record.name == "greedy"
-                ]
-                message = Writer().write(Ping(session=token))
                 assert len(listener.connections._open) <= 20
+            assert len(listener._sessions.routes()) == 2
         assert friend.env.disconnects == 0
+
+
+@pytest.mark.parametrize("goodbye", [True, False])
+def test_a_connection_that_ends_ends_its_session_at_once(goodbye: bool) -> None:
+    """What it sent before counts, and its client may come back under its name."""
+    with with_a_client() as (group, listener, _, first), zmq.Context() as context:
+        batch = first
+        for _ in range(3):
+            with context.socket(zmq.DEALER) as peer:
+                peer.linger = 0
+                peer.connect(group["robots-0"].address)
+                peer.send_multipart(hello())
+                while not peer.poll(0):
+                    batch = step(group, batch)
+                assert msgspec.msgpack.decode(peer.recv_multipart()[0])["type"] == "welcome"
+                if goodbye:
+                    peer.linger = int(1000 * HANG)
+                    peer.send_multipart(Writer().write(Bye(reason="enough")))
+            while len(listener._sessions.routes()) == 2:
+                batch = step(group, batch)
 
 
 # The budget of unauthenticated peers
 
 SHORT = {**ENTRY, "env_kwargs": {"heartbeat": 5.0, "connect_timeout": HANG}}
-"""A client that doesn't hear the server's goodbye ends a quarter of that later."""
+"""A client that doesn't hear the server's goodbye ends within that time."""
 
 
 def spend_everything(address: str, group: Any, listener: Any) -> None:

@@ -1,4 +1,4 @@
-"""Through a proxy that disturbs messages and connections: executed once, answered once."""
+"""Through a proxy that disturbs connections: executed once, answered once."""
 
 from __future__ import annotations
 
@@ -49,11 +49,9 @@ class RecordingEnv(CountingEnv):
 
 
 NETWORKS = {
-    "lossy": Faults(drop=0.04),
-    "repeating and reordering": Faults(repeat=0.1, delay=0.1),
-    "breaking": Faults(cut=0.01),
-    "falling silent": Faults(silence=0.004),
-    "everything": Faults(drop=0.02, repeat=0.05, delay=0.05, cut=0.004, silence=0.002),
+    "breaking": Faults(cut=0.02),
+    "falling silent": Faults(silence=0.006),
+    "both": Faults(cut=0.01, silence=0.008),
 }
 
 
@@ -89,11 +87,8 @@ def test_no_request_is_executed_twice_and_each_ends_once(
     assert len(executed) == len(set(executed)), "a request was executed twice"
     assert sum(ends.values()) == REQUESTS
     assert ends["answered"] <= len(executed) <= REQUESTS
-    fates = [name for name in ("drop", "repeat", "delay", "cut", "silence")
-             if getattr(NETWORKS[network], name)]  # fmt: skip
+    fates = [name for name in ("cut", "silence") if getattr(NETWORKS[network], name)]
     assert all(proxy.tally[name] for name in fates), "the network had too few faults"
-    if not {"cut", "silence"} & set(fates):
-        assert ends["answered"] == REQUESTS
 
 
 def exchange(group: Any, requests: int) -> dict[str, int]:

@@ -23,8 +23,9 @@ from rlightning_aio import ConfigError, sync
 from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.protocol.net.wire import ClientHello, Writer
-from rlightning_aio.remote import RemoteEnvClient, client
+from rlightning_aio.protocol.net.wire import VERSION, ClientHello, Writer
+from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote import client as client_module
 from rlightning_aio.remote.keys import make_keys, read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
@@ -200,8 +201,8 @@ def test_a_client_with_other_keys_is_logged_once_on_both_sides(
         events.append(event["event"])
         return event
 
-    monkeypatch.setattr(client, "_REDIAL_SECONDS", (0.05, 0.8))
-    monkeypatch.setattr(client, "recv_monitor_message", note)
+    monkeypatch.setattr(client_module, "_SECONDS_BETWEEN_ATTEMPTS", (0.05, 0.8))
+    monkeypatch.setattr(client_module, "recv_monitor_message", note)
     make_keys(tmp_path / "ours", ["arm"])
     make_keys(tmp_path / "theirs", ["arm"])
     server = {} if kind == "keys where none are" else {"keys": str(tmp_path / "ours" / "server")}
@@ -333,7 +334,7 @@ def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path
     rng = np.random.default_rng(0)
     bomb = pickle.dumps(Bomb(str(tmp_path / "exploded")))
     hello = Writer().write(
-        ClientHello(version=1, name="x", nonce=1, observation_space={}, action_space={})
+        ClientHello(version=VERSION, name="x", observation_space={}, action_space={})
     )
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
@@ -384,15 +385,19 @@ def test_a_frame_beyond_the_limit_is_not_read() -> None:
         friend.join()
 
 
-def test_a_client_survives_a_server_that_sends_nonsense() -> None:
-    """It counts malformed messages and keeps asking to be let in."""
+def test_a_client_survives_a_server_that_sends_nonsense(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It hangs up at the first malformed message, and dials again."""
+    monkeypatch.setattr(client_module, "_SECONDS_BETWEEN_ATTEMPTS", (0.01, 0.01))
     rng = np.random.default_rng(1)
     done = threading.Event()
+    hellos = 0
 
     def talk_nonsense() -> None:
+        nonlocal hellos
         while not done.is_set():
             if router.poll(50):
                 route, *parts = router.recv_multipart()
+                hellos += 1
                 for _ in range(50):
                     router.send_multipart([route, *mutation(rng)(parts)])
 
@@ -403,10 +408,10 @@ def test_a_client_survives_a_server_that_sends_nonsense() -> None:
         thread.start()
         env = CountingEnv()
         with RemoteEnvClient(env, "127.0.0.1", port, name="arm") as client:
-            while client._session.num_malformed <= 20:
+            while hellos <= 20:
                 with pytest.raises(TimeoutError):
-                    client.connect(timeout=0.5)
-            assert "asking to be let in" in client.state
+                    client.connect(timeout=0.05)
+            assert "a message of the server is malformed" in client.state
         done.set()
         thread.join()
     assert env.closed

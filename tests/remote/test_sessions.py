@@ -9,15 +9,15 @@ import gymnasium as gym
 import msgspec
 import numpy as np
 import pytest
-from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
+from remote.unreliable import OBSERVATION, Client, World
 
 from rlightning_aio.errors import BadAction, EnvBusy, UnknownEnv
 from rlightning_aio.protocol.error_text import ErrorText
-from rlightning_aio.protocol.net import client_registry
-from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
+from rlightning_aio.protocol.net import server_session
+from rlightning_aio.protocol.net.client_session import ClientSession, Phase, Refused
 from rlightning_aio.protocol.net.payload import ResultFields
-from rlightning_aio.protocol.net.server_session import ServerSessions
-from rlightning_aio.protocol.net.wire import MAX_NESTING, ClientHello, Welcome, Writer
+from rlightning_aio.protocol.net.server_session import MessageEffect, ServerSessions
+from rlightning_aio.protocol.net.wire import MAX_NESTING, ClientHello, Refusal, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
 
 
@@ -62,15 +62,17 @@ def test_a_client_with_a_pending_request_is_busy(world: World) -> None:
 
 
 def test_a_client_that_never_joined_is_unknown(world: World) -> None:
-    """The message says who is here."""
-    with pytest.raises(UnknownEnv, match="no client named 'c' has joined srv; joined are 'a', 'b'"):
-        world.submit("c", 1)
+    """No request to it is sent or answered."""
+    with pytest.raises(UnknownEnv, match="no client named 'c' is connected to srv"):
+        world.server.traits("c")
+    assert not world.submit("c", 1)
+    assert not world.submit_reset("c", 2)
 
 
 def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
     """The client stays free for a better one."""
     with pytest.raises(BadAction, match=r"srv/a.*expected shape \(2,\)"):
-        world.server.requests.step("a", 1, np.zeros(3, np.float32), {}, 0.0)
+        world.server.step("a", 1, np.zeros(3, np.float32), {}, 0.0)
     assert world.submit("a", 2)
 
 
@@ -98,41 +100,24 @@ def test_an_exception_arrives_with_its_traceback_and_the_env_goes_on(world: Worl
     assert only(world.take()).error is None
 
 
-def test_a_lost_request_and_a_lost_result_are_made_good_by_the_next_ping(world: World) -> None:
-    """Whichever way the message was lost, the request is executed once."""
+def test_an_answer_that_nobody_waits_for_ends_the_session(world: World) -> None:
+    """A second answer, and one to another request."""
     world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    client.inbox.clear()
-    world.pass_time(HEARTBEAT / 8)
-    world.settle()
-    assert only(world.take()).observation[2] == 1
-    world.submit("a", 2)
-    world.to_client(client)
-    client.execute()
-    client.outbox.clear()
-    world.pass_time(HEARTBEAT / 8)
-    world.settle()
-    assert only(world.take()).observation[2] == 2
-
-
-def test_a_repeated_request_gets_the_same_reply_and_an_older_one_is_refused(world: World) -> None:
-    """The env steps once for each request."""
-    world.take()
-    client = world.clients["a"]
-    for number in (1, 2):
-        world.submit("a", number)
+    for name, count in (("a", 2), ("b", 1)):
+        client = world.clients[name]
+        world.submit(name, 1)
         world.to_client(client)
-        client.execute()
-        world.to_server(client)
-    world.replay(client, 0, to_server=False)
-    world.replay(client, 1, to_server=False)
-    again, refused = client.outbox
-    assert again == world.delivered["a", True][-1]
-    assert b"StaleRequest" in refused[0]
-    assert client.steps == 2
-    world.settle()
-    assert len(world.take()) == 2
+        number = client.todo.number if client.todo else 0
+        for _ in range(count):
+            client.session.finish(number + (name == "b"), client.ret())
+        client.todo = None
+        client.flush()
+        world.settle()
+        assert "which is not in flight" in client.ended[0]
+        assert name not in world.server.clients
+    answered, lost = world.take()
+    assert (answered.client, answered.is_loss) == ("a", False)
+    assert (lost.client, lost.is_loss) == ("b", True)
 
 
 def test_a_client_that_dies_in_a_step_leaves_one_marked_result(world: World) -> None:
@@ -140,9 +125,8 @@ def test_a_client_that_dies_in_a_step_leaves_one_marked_result(world: World) -> 
     world.take()
     world.submit("a", 1)
     world.clients["a"].kill()
-    while "a" in world.server.clients:
-        world.pass_time(HEARTBEAT / 8)
-        assert world.clock.now <= HEARTBEAT
+    world.settle()
+    assert "a" not in world.server.clients
     result = only(world.take())
     assert (result.number, result.truncated, result.terminated) == (1, True, False)
     assert result.observation.tolist() == [1, 1, 0]
@@ -153,8 +137,7 @@ def test_a_request_to_a_client_that_is_known_to_be_absent_is_not_answered(world:
     """There is no series of marked results: the next result is the client's first one."""
     world.submit("a", 1)
     world.clients["a"].kill()
-    world.pass_time(HEARTBEAT)
-    world.pass_time(HEARTBEAT)
+    world.settle()
     world.take()
     assert not world.submit("a", 2)
     assert not world.take()
@@ -171,72 +154,79 @@ def test_a_loss_without_a_pending_request_is_reported_by_the_next_step(world: Wo
     world.clients["a"].kill()
     world.clients["a"].connect()
     world.settle()
-    world.pass_time(HEARTBEAT)
-    world.pass_time(HEARTBEAT)
-    world.settle()
     assert not world.take(), "the first result waits until the loss is reported"
     assert world.submit("a", 1)
-    assert "client_lost" in only(world.take()).info
-    assert world.submit("a", 2)
-    result = only(world.take())
-    assert (result.number, result.observation.tolist()) == (2, [1, 2, 0])
+    lost, first = world.take()
+    assert "client_lost" in lost.info
+    assert (first.number, first.observation.tolist()) == (None, [1, 2, 0])
 
 
 def test_a_reset_replaces_a_loss_and_a_first_result(world: World) -> None:
     """After a reset, the end of the last episode does not matter."""
-    assert world.submit_reset("a", 1)
-    world.settle()
-    results = world.take()
-    assert [r.number for r in results if r.client == "a"] == [None, 1]
+    world.take()
     world.clients["a"].kill()
     world.clients["a"].connect()
-    world.settle()
-    world.pass_time(2 * HEARTBEAT)
-    world.pass_time(HEARTBEAT)
     world.settle()
     assert world.submit_reset("a", 2)
     world.settle()
     assert only(world.take()).number == 2
 
 
-def test_a_broken_connection_is_resumed_within_a_quarter_of_the_heartbeat(world: World) -> None:
-    """The session continues, and the pending request is executed once."""
+def test_a_client_is_lost_again_after_a_reset_that_replaced_its_first_result(world: World) -> None:
+    """The marked result shows the observation that the reset began with."""
+    world.take()
+    world.clients["a"].kill()
+    world.clients["a"].connect()
+    world.settle()
+    assert world.submit_reset("a", 1)
+    world.clients["a"].kill()
+    world.settle()
+    lost = only(world.take())
+    assert (lost.number, lost.is_loss, lost.observation.tolist()) == (1, True, [1, 2, 0])
+
+
+def test_a_client_that_is_lost_again_unseen_reports_the_first_loss(world: World) -> None:
+    """Nobody has seen the session in between."""
+    world.take()
+    world.clients["a"].cut()
+    world.clients["a"].connect()
+    world.settle()
+    world.clients["a"].leave()
+    world.settle()
+    assert world.submit("a", 1)
+    assert "its connection broke" in only(world.take()).info["client_lost"]
+    assert not world.submit("a", 2)
+
+
+def test_a_broken_connection_ends_the_session_on_both_sides(world: World) -> None:
+    """The env must be made safe, and another session begins; nothing is sent twice."""
     world.take()
     client = world.clients["a"]
     world.submit("a", 1)
     world.to_client(client)
+    client.cut()
+    assert client.ended == ["the connection broke"]
     client.execute()
-    client.cut()
-    world.pass_time(HEARTBEAT / 8)
     client.connect()
     world.settle()
-    assert only(world.take()).observation.tolist() == [1, 1, 1]
-    assert not client.ended
-
-
-def test_a_client_gives_its_server_up_after_a_quarter_of_the_heartbeat(world: World) -> None:
-    """Then the env must be made safe, and another session begins."""
-    client = world.clients["a"]
-    client.cut()
-    world.clock.now += HEARTBEAT / 4
-    client.tick()
-    assert client.ended == ["the connection to the server broke and did not come back"]
-    client.connect()
-    world.settle()
+    lost, first = world.take()
+    assert (lost.number, lost.is_loss, first.number) == (1, True, None)
     assert client.session.phase is Phase.SERVING
-    assert world.clients["a"].steps == 0
+    assert (client.steps, len(client.executed)) == (0, 2)
 
 
-def test_an_idle_client_that_falls_silent_is_given_up_within_the_heartbeat(world: World) -> None:
-    """Even if its connection seems intact."""
+def test_an_answer_over_a_connection_that_is_gone_is_not_sent_over_the_next(world: World) -> None:
+    """A step may end after its session has."""
     world.take()
-    while "a" in world.server.clients:
-        world.pass_time(HEARTBEAT / 8)
-        world.clients["a"].inbox.clear()
-        world.clients["a"].outbox.clear()
-        world.settle()
-        assert world.clock.now <= 1.3 * HEARTBEAT
-    assert "b" in world.server.clients
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    assert client.todo is not None
+    number = client.todo.number
+    client.cut()
+    client.session.finish(number, client.ret())
+    client.flush()
+    assert not client.outbox[1:]
 
 
 def test_a_busy_client_may_be_silent_without_limit(world: World) -> None:
@@ -245,11 +235,11 @@ def test_a_busy_client_may_be_silent_without_limit(world: World) -> None:
     client = world.clients["a"]
     world.submit("a", 1)
     world.to_client(client)
-    for _ in range(100):
-        world.pass_time(HEARTBEAT)
+    world.pass_time(10_000.0)
+    assert world.server.deadline() is None
     client.execute()
     world.settle()
-    assert only([r for r in world.take() if r.client == "a"]).number == 1
+    assert only(world.take()).number == 1
 
 
 def test_a_step_past_its_timeout_loses_the_client() -> None:
@@ -262,7 +252,7 @@ def test_a_step_past_its_timeout_loses_the_client() -> None:
     world.to_client(client)
     while "a" in world.server.clients:
         world.pass_time(0.5)
-    assert world.clock.now <= 4.0
+    assert world.now <= 4.0
     assert "no result of a step within 3.0 s" in only(world.take()).info["client_lost"]
     client.execute()
     world.settle()
@@ -273,19 +263,9 @@ def test_a_client_that_leaves_sends_a_reason(world: World) -> None:
     """Its reason is in the marked result."""
     world.take()
     world.submit("a", 1)
-    client = world.clients["a"]
-    client.session.leave("battery empty")
-    client.flush()
-    world.to_server(client)
-    assert "it left: battery empty" in only(world.take()).info["client_lost"]
-
-
-def leave(world: World, client: Client) -> None:
-    """Let the client send a goodbye and disconnect."""
-    client.session.leave("enough")
-    client.flush()
-    world.to_server(client)
-    client.kill()
+    world.clients["a"].leave()
+    world.settle()
+    assert "it left: enough" in only(world.take()).info["client_lost"]
 
 
 def test_a_client_that_leaves_before_the_trainer_saw_it_may_come_back() -> None:
@@ -296,14 +276,15 @@ def test_a_client_that_leaves_before_the_trainer_saw_it_may_come_back() -> None:
     world.to_server(client)
     world.to_client(client)
     client.execute()
-    client.session.leave("enough")
-    client.flush()
-    for parts in client.outbox:  # Both have arrived when the trainer reads.
-        world.server.receive(client.route or b"", None, parts, 0.0)
+    client.leave()
+    for route, parts in client.outbox:  # All have arrived when the trainer reads.
+        if parts is None:
+            world.server.disconnected(route)
+        else:
+            world.server.receive(route, parts, 0.0)
     client.outbox.clear()
     world.flush()
     assert not world.take()
-    client.kill()
     client.connect()
     world.settle()
     assert only(world.take()).observation.tolist() == [1, 2, 0]
@@ -315,92 +296,64 @@ def test_a_client_that_was_dismissed_for_lack_of_room_may_come_back(world: World
     world.server.dismiss("a", "no place")
     world.flush()
     world.settle()
-    world.pass_time(1.0)
-    world.settle()
     assert world.clients["a"].ended == ["the server ended the session: no place"]
+    world.join_all()
     assert only(world.take()).number is None
 
 
-def test_the_client_that_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """If others need records, the order in which clients left decides, not that of joining."""
-    monkeypatch.setattr(client_registry, "_MAX_RECORDS", 2)
-    world = World("abc")
-    early, late, other = world.clients.values()
-    for client in (early, late):
-        client.connect()
-        world.settle()
-    for client in (late, early):
-        leave(world, client)
-    other.connect()
-    world.settle()
-    assert world.serving("c")
-    with pytest.raises(UnknownEnv, match="'b' has joined"):
-        world.submit("b", 1)
-    assert world.submit("a", 2)
-
-
-def test_an_unreported_loss_is_forgotten_last(
+def test_the_oldest_losses_are_forgotten_if_there_are_too_many(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A reported one makes room before it, however recent it is."""
-    monkeypatch.setattr(client_registry, "_MAX_RECORDS", 2)
-    world = World("abc")
-    unreported, reported, other = world.clients.values()
-    for client in (unreported, reported):
+    """Clients under ever new names take a bounded amount of memory."""
+    monkeypatch.setattr(server_session, "_MAX_SESSIONS", 2)
+    world = World("abcde")
+    for client in world.clients.values():
         client.connect()
         world.settle()
-    leave(world, unreported)
-    world.submit("b", 1)
-    leave(world, reported)
-    world.take()
-    other.connect()
-    world.settle()
-    assert world.serving("c")
-    world.take()
-    assert world.submit("a", 2)
-    assert "it left: enough" in only(world.take()).info["client_lost"]
+        client.leave()
+        world.settle()
+    assert {one.client for one in world.take()} == set("abcde")
+    assert not world.submit("a", 1)
+    for number, name in enumerate("cd", start=2):
+        assert world.submit(name, number)
+        assert "it left: enough" in only(world.take()).info["client_lost"]
 
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:
     """The present client keeps its session."""
-    second = Client("a", 9, world.clock)
+    second = Client("a", 9)
     second.routes = iter(range(50, 60))
     first, world.clients["a"] = world.clients["a"], second
     second.connect()
-    world.to_server(second)
-    world.to_client(second)
-    assert second.session.phase is Phase.GREETING
-    assert "a client named 'a' is here already" in (second.session.refusal or "")
+    world.settle()
+    assert second.refused == ["a client named 'a' is here already"]
     assert first.session.phase is Phase.SERVING
-    for _ in range(40):
-        # Messages to the first one find no connection.
-        world.pass_time(HEARTBEAT / 8)
-        world.settle()
+    # A message to the first one finds no connection.
+    world.submit("a", 1)
+    second.connect()
+    world.settle()
     assert second.session.phase is Phase.SERVING
 
 
 def test_a_restarted_server_gets_its_clients_back() -> None:
-    """A new server doesn't know the old session; the client says hello again."""
+    """A new server knows no session; the client says hello again."""
     world = World("a")
     world.join_all()
     client = world.clients["a"]
-    world.server = ServerSessions("srv", heartbeat=HEARTBEAT)
+    world.server = ServerSessions("srv")
     client.cut()
-    client.connect()
-    world.settle()
-    world.pass_time(1.0)
-    world.settle()
-    assert client.ended == ["the server ended the session: no such session"]
+    world.join_all()
     assert client.session.phase is Phase.SERVING
+    assert set(world.server.clients) == {"a"}
 
 
 def test_a_server_that_closes_says_goodbye(world: World) -> None:
-    """Clients end their sessions at once and say hello later."""
+    """Clients end their sessions at once and hang up."""
     world.server.close("done")
     world.flush()
     world.settle()
-    assert world.clients["a"].ended == ["the server closed: done"]
-    assert world.clients["a"].session.phase is Phase.GREETING
+    assert world.clients["a"].ended == ["the server ended the session: done"]
+    assert world.clients["a"].session.phase is Phase.AWAY
 
 
 def meta(**changes: Any) -> EnvMeta:
@@ -413,49 +366,50 @@ def meta(**changes: Any) -> EnvMeta:
 
 
 @pytest.mark.parametrize(
-    ("name", "changes", "code"),
+    ("name", "changes", "says"),
     [
-        ("c/d", {}, "name"),
-        ("c\n", {}, "name"),
-        ("c", {}, "spaces"),  # Differs from the other clients' action space.
-        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "spaces"),
-        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "agents": ("x",)}, "spaces"),
+        ("c/d", {}, "must be printable and without '/'"),
+        ("c\n", {}, "must be printable and without '/'"),
+        ("c", {}, "its spaces, num_envs or agents differ"),
+        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "differ"),
+        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "agents": ("x",)}, "differ"),
     ],
 )
 def test_a_client_that_does_not_fit_is_refused_for_good(
-    world: World, name: str, changes: dict[str, Any], code: str
+    world: World, name: str, changes: dict[str, Any], says: str
 ) -> None:
     """The client receives the reason and gives up."""
-    other_client = ClientSession(meta(**changes), name, heartbeat=HEARTBEAT)
-    other_client.connected(0.0)
-    world.server.receive(b"r", None, other_client.outbox.popleft(), 0.0)
-    event = other_client.receive(world.server.outbox.popleft().parts, 0.0)
+    other_client = ClientSession(meta(**changes), name)
+    other_client.connected()
+    world.server.receive(b"r", other_client.outbox.popleft(), 0.0)
+    event = other_client.receive(world.server.outbox.popleft().parts)
     assert isinstance(event, Refused)
-    assert event.code == code
+    assert not event.retry
+    assert says in event.text
     assert "c" not in world.server.clients
 
 
 def test_another_version_is_refused_with_both_versions(world: World) -> None:
     """Neither side guesses."""
-    hello = ClientHello(version=9, name="z", nonce=1, observation_space={}, action_space={})
-    world.server.receive(b"r", None, Writer().write(hello), 0.0)
-    assert b"speaks version 1, not 9" in world.server.outbox.popleft().parts[0]
+    hello = ClientHello(version=9, name="z", observation_space={}, action_space={})
+    world.server.receive(b"r", Writer().write(hello), 0.0)
+    assert b"speaks version 2, not 9" in world.server.outbox.popleft().parts[0]
 
 
-def test_a_session_accepts_only_the_key_that_opened_it() -> None:
-    """A session's number alone is not enough to use it."""
-    server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=lambda: 7)
-    session = ClientSession(meta(), "a", heartbeat=HEARTBEAT)
-    session.connected(0.0)
-    server.receive(b"r", "alice", session.outbox.popleft(), 0.0)
-    session.receive(server.outbox.popleft().parts, 0.0)
-    session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
-    result = session.outbox.popleft()
-    server.receive(b"s", "mallory", result, 0.0)
-    assert not server.take()
-    assert server.num_malformed == 1
-    server.receive(b"s", "alice", result, 0.0)
-    assert server.take()
+def test_a_session_is_that_of_its_connection(world: World) -> None:
+    """Nothing that another connection says belongs to it."""
+    world.take()
+    world.submit("a", 1)
+    client = world.clients["a"]
+    world.to_client(client)
+    client.execute()
+    (_, result), client.outbox[:] = client.outbox[0], []
+    assert result is not None
+    assert world.server.receive(b"s", result, 0.0) is MessageEffect.TURNED_AWAY
+    assert not world.server.take()
+    assert client.route
+    assert world.server.receive(client.route, result, 0.0) is MessageEffect.IN_SESSION
+    assert only(world.server.take()).number == 1
 
 
 def answered_once() -> tuple[World, Any, bytes, bytes]:
@@ -467,64 +421,44 @@ def answered_once() -> tuple[World, Any, bytes, bytes]:
     world.submit("a", 1)
     world.to_client(client)
     client.execute()
-    (header, frame), client.outbox[:] = client.outbox[0], []
+    (_, parts), client.outbox[:] = client.outbox[0], []
+    header, frame = parts or []
     return world, client, header, frame
 
 
-def test_results_that_never_fit_end_the_session() -> None:
-    """After three wrong answers to one request, the client is dismissed."""
-    world, client, header, _ = answered_once()
-    for _ in range(3):
-        assert not world.results
-        world.server.receive(client.route or b"", None, [header, b"short"], 0.0)
-        world.flush()
-    assert "don't fit what it announced" in only(world.take()).info["client_lost"]
-    world.settle()
-    assert client.ended
-
-
-def test_answers_that_are_malformed_as_a_whole_end_the_session() -> None:
-    """The request is not repeated forever; without a request nothing is counted."""
-    world = World("a")
-    world.join_all()
-    client = world.clients["a"]
-    assert client.route
-    for _ in range(5):
-        world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
-    assert world.serving("a")
-    world.take()
-    world.submit("a", 7)
-    for _ in range(2):
-        world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
-    assert not world.take()
-    world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
-    world.flush()
-    (lost,) = world.take()
-    assert lost.is_loss
-    assert "its messages don't fit what it announced" in lost.info["client_lost"]
-
-
-def test_results_that_are_nested_too_deep_end_the_session() -> None:
-    """They are malformed, because reading such an info could exhaust the stack."""
+@pytest.mark.parametrize("spoil", ["whole", "frame", "info", "extra"])
+def test_a_message_that_is_malformed_ends_the_session(spoil: str) -> None:
+    """It says why. Reading an info that is nested too deep could exhaust the stack."""
     world, client, header, frame = answered_once()
     deep: dict[str, Any] = {}
     for _ in range(MAX_NESTING):
         deep = {"deep": deep}
-    for name in ("info", "extra", "info"):
-        assert not world.results
-        result = {**msgspec.msgpack.decode(header), name: deep}
-        parts = [msgspec.msgpack.encode(result), frame]
-        world.server.receive(client.route or b"", None, parts, 0.0)
-        world.flush()
-    assert "nested more than 32 deep" in only(world.take()).info["client_lost"]
+    if spoil in ("info", "extra"):
+        header = msgspec.msgpack.encode({**msgspec.msgpack.decode(header), spoil: deep})
+    parts = {"whole": [b"nonsense"], "frame": [header, b"short"]}.get(spoil, [header, frame])
+    assert world.server.receive(client.route or b"", parts, 0.0) is MessageEffect.MALFORMED
+    world.flush()
+    lost = only(world.take())
+    assert lost.is_loss
+    says = "nested more than 32 deep" if spoil in ("info", "extra") else "a message of it"
+    assert says in lost.info["client_lost"]
+    world.settle()
+    assert client.ended
+    world.join_all()
+    assert world.submit("a", 2)
 
 
-def test_a_client_counts_and_drops_malformed_messages(world: World) -> None:
-    """A server's mistakes do not end a client."""
+def test_a_client_hangs_up_at_a_malformed_message(world: World) -> None:
+    """It ends its session with the reason, and comes back."""
+    world.take()
     client = world.clients["a"]
     client.receive([b"\xc1"])
-    assert client.session.num_malformed == 1
+    assert "a message of the server is malformed" in client.ended[0]
+    world.settle()
     assert world.submit("a", 1)
+    assert "it left: a message of the server is malformed" in only(world.take()).info["client_lost"]
+    world.join_all()
+    assert world.serving("a")
 
 
 def test_a_flood_of_nonsense_is_logged_rarely(
@@ -533,7 +467,7 @@ def test_a_flood_of_nonsense_is_logged_rarely(
     """All messages are counted, and the log does not fill."""
     with caplog.at_level(logging.WARNING):
         for k in range(1000):
-            world.server.receive(b"r", None, [b"\xc1"], 30 * k / 1000)
+            world.server.receive(b"r", [b"\xc1"], 30 * k / 1000)
     assert world.server.num_malformed == 1000
     assert len(caplog.records) == 3
 
@@ -585,39 +519,29 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
 
 def test_extras_are_sent_to_a_client_that_reads_them() -> None:
     """Columns of the policy reach the env; those that can't be sent are dropped."""
-    server = ServerSessions("srv", heartbeat=HEARTBEAT)
-    session = ClientSession(meta(), "a", heartbeat=HEARTBEAT, reads_extras=True, free_actions=True)
-    session.connected(0.0)
-    server.receive(b"r", None, session.outbox.popleft(), 0.0)
-    session.receive(server.outbox.popleft().parts, 0.0)
+    server = ServerSessions("srv")
+    session = ClientSession(meta(), "a", reads_extras=True, free_actions=True)
+    session.connected()
+    server.receive(b"r", session.outbox.popleft(), 0.0)
+    session.receive(server.outbox.popleft().parts)
     session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
-    server.receive(b"r", None, session.outbox.popleft(), 0.0)
+    server.receive(b"r", session.outbox.popleft(), 0.0)
     chunk = {"chunk": np.ones((4, 2)), "mode": "fast"}
-    server.requests.step("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
-    event = session.receive(server.outbox.popleft().parts, 0.0)
+    server.step("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
+    event = session.receive(server.outbox.popleft().parts)
     assert np.array_equal(event.action["chunk"], chunk["chunk"])
     assert event.action["mode"] == "fast"
     assert event.extras == {"log_prob": -0.5}
 
 
-def test_a_client_ignores_a_welcome_that_answers_no_hello(world: World) -> None:
-    """Answers to earlier hellos change nothing."""
+@pytest.mark.parametrize("stray", [Welcome(env_id="x"), Refusal(text="no", retry=False)])
+def test_a_second_answer_to_a_hello_ends_the_session(world: World, stray: Any) -> None:
+    """So does a second hello."""
     client = world.clients["a"]
-    stray = Welcome(nonce=1, session=99, env_id="x", heartbeat=1.0)
-    assert client.session.receive(Writer().write(stray), 0.0) is None
-    assert world.submit("a", 1)
-
-
-def test_a_client_that_its_server_forgot_gets_ended(world: World) -> None:
-    """`Ended` carries the server's reason."""
-    client = world.clients["a"]
-    world.server._registry.lose(client_session_of(world, "a"), "test")
-    client.cut()
-    client.connect()
-    world.to_server(client)
-    event = client.session.receive(client.inbox.pop(0), 0.0)
-    assert isinstance(event, Ended)
-
-
-def client_session_of(world: World, name: str) -> Any:
-    return world.server._registry.records[name].session
+    client.receive(Writer().write(stray))
+    assert client.ended
+    other = world.clients["b"]
+    other.session.connected()
+    other.flush()
+    world.settle()
+    assert other.refused or other.ended

@@ -53,13 +53,13 @@ def test_values_survive_in_structure_dtype_shape_and_content(space: Any, seed: i
 @given(any_info)
 def test_infos_survive_with_their_arrays(info: dict[str, Any]) -> None:
     """Values of msgpack arrive, and arrays travel as frames."""
-    message, _ = through_wire(ClientResult(session=1, number=2, info=info))
+    message, _ = through_wire(ClientResult(number=2, info=info))
     assert same(message.info, info)
 
 
 def test_a_frame_named_in_an_info_is_no_view_of_the_message() -> None:
     """An info's arrays are the reader's own, and writable."""
-    message, _ = through_wire(ClientResult(session=1, number=2, info={"a": np.arange(3)}))
+    message, _ = through_wire(ClientResult(number=2, info={"a": np.arange(3)}))
     message.info["a"][0] = 7
 
 
@@ -98,12 +98,12 @@ def test_keys_that_are_not_strings_are_left_out_and_named() -> None:
     """At the top, where a reader would refuse the whole message for them; numbers survive below."""
     info: dict[Any, Any] = {"good": {1: "one", None: "none"}, 0: {"a": 1}, True: 2}
     with pytest.raises(Untransferable, match="info has the key 0; keys must be strings"):
-        Writer().write(ClientResult(session=1, number=2, info=info))
+        Writer().write(ClientResult(number=2, info=info))
     lost: list[str] = []
     kept = portable(info, lost)
     assert kept == {"good": {1: "one"}}
     assert lost == ["good.None", "0", "True"]
-    message, _ = through_wire(ClientResult(session=1, number=2, info=kept))
+    message, _ = through_wire(ClientResult(number=2, info=kept))
     assert message.info == kept
 
 
@@ -119,12 +119,12 @@ def test_a_value_that_is_nested_too_deep_is_left_out_and_named() -> None:
     """Processing it could exhaust the stack; up to the limit, it survives."""
     info = {"deepest": nested(wire.MAX_NESTING - 1), "deeper": nested(wire.MAX_NESTING)}
     with pytest.raises(Untransferable, match="info is nested more than 32 deep"):
-        Writer().write(ClientResult(session=1, number=2, info=info))
+        Writer().write(ClientResult(number=2, info=info))
     lost: list[str] = []
     kept = portable(info, lost)
     assert kept == {"deepest": info["deepest"], "deeper": {}}
     assert lost == ["deeper.a"]
-    message, _ = through_wire(ClientResult(session=1, number=2, info=kept))
+    message, _ = through_wire(ClientResult(number=2, info=kept))
     assert message.info == kept
 
 
@@ -140,7 +140,7 @@ def test_an_info_that_contains_itself_is_left_out() -> None:
 def test_numpy_scalars_and_tuples_travel_as_plain_values() -> None:
     """Infos of simulators contain them."""
     info = {"x": np.float64(0.5), "n": np.int32(3), "t": (1, 2), "words": np.array(["a", "b"])}
-    message, _ = through_wire(ClientResult(session=1, number=2, info=info))
+    message, _ = through_wire(ClientResult(number=2, info=info))
     assert message.info == {"x": 0.5, "n": 3, "t": [1, 2], "words": ["a", "b"]}
 
 
@@ -258,7 +258,7 @@ def test_an_info_that_names_frames_wrongly_is_refused(info: dict[str, Any]) -> N
         Reader[Any](FromClient).read([msgspec.msgpack.encode(header), b"\0" * 8])
 
 
-RESULT_WITH_KEY = b"\x84\xa4type\xa6result\xa7session\x01\xa6number\x01\xa4info\x81\xa1a\x81%b\x01"
+RESULT_WITH_KEY = b"\x83\xa4type\xa6result\xa6number\x01\xa4info\x81\xa1a\x81%b\x01"
 
 
 @pytest.mark.parametrize(
@@ -268,11 +268,11 @@ RESULT_WITH_KEY = b"\x84\xa4type\xa6result\xa7session\x01\xa6number\x01\xa4info\
         [b""],
         [b"\xc1"],
         [b"\x91" * 100_000],
-        [msgspec.msgpack.encode({"type": "step", "session": 1, "number": 1})],
-        [msgspec.msgpack.encode({"type": "result", "session": -1, "number": 1})],
-        [msgspec.msgpack.encode({"type": "result", "session": 1, "number": 2**63})],
-        [msgspec.msgpack.encode({"type": "bye", "session": "1"})],
-        [b"\x82\xa4type\xa3bye\xa7session\xa1\xff"],
+        [msgspec.msgpack.encode({"type": "step", "number": 1})],
+        [msgspec.msgpack.encode({"type": "result", "number": -1})],
+        [msgspec.msgpack.encode({"type": "result", "number": 2**63})],
+        [msgspec.msgpack.encode({"type": "bye", "reason": 1})],
+        [b"\x82\xa4type\xa3bye\xa6reason\xa1\xff"],
         [RESULT_WITH_KEY % b"\x80"],  # A map as key.
         [RESULT_WITH_KEY % b"\xc7\x0a\x01\x93\xa5uint8\x91\x08\0", b"\0" * 8],  # An array as key.
         [b"\0" * (wire.MAX_HEADER_BYTES + 1)],
@@ -306,7 +306,7 @@ class Bomb:
 def test_a_pickle_does_nothing(where: str) -> None:
     """Bytes that would run code if unpickled are only bytes here."""
     bomb = pickle.dumps(Bomb())
-    good = Writer().write(ClientResult(session=1, number=1, info={"a": bomb}), [])
+    good = Writer().write(ClientResult(number=1, info={"a": bomb}), [])
     parts = {"header": [bomb], "frame": [good[0], bomb], "info": good}[where]
     try:
         message, _ = Reader[Any](FromClient).read(parts)

@@ -34,7 +34,6 @@ def hello(rng: np.random.Generator) -> list[bytes]:
         ClientHello(
             version=int(rng.integers(0, 3)),
             name=f"peer-{rng.integers(100)}",
-            nonce=int(rng.integers(1 << 60)),
             observation_space=_SPACES,
             action_space={"type": "discrete", "n": 2**62, "start": 2**62},
         )

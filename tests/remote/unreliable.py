@@ -1,4 +1,8 @@
-"""A server and clients without sockets, on a simulated network."""
+"""A server and clients without sockets, on a simulated network.
+
+Messages of a connection arrive in order. When it breaks, what is on the way is lost, and each end
+finds out at its own time.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
     Phase,
+    Refused,
     ResetRequest,
     StepRequest,
 )
@@ -20,40 +25,32 @@ from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.types import EnvMeta, EnvRet
 
 if TYPE_CHECKING:
-    from rlightning_aio.protocol.net.server_records import RemoteResult
+    from rlightning_aio.protocol.net.server_session import RemoteResult
 
-HEARTBEAT = 8.0
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 ACTION = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
 EXTRAS: dict[str, Any] = {}
-
-
-def counter() -> Any:
-    return itertools.count(1).__next__
-
-
-class Clock:
-    now = 0.0
 
 
 class Client:
     """A client process: its session, its env (which only counts), and its connection.
 
     The observation is (which client, which life, steps since the last reset).
+
+    Attributes:
+        outbox: routes and messages on the way to the server; None for the end of a connection.
+        inbox: messages on the way to the client.
     """
 
-    def __init__(
-        self, name: str, identity: int, clock: Clock, heartbeat: float = HEARTBEAT
-    ) -> None:
+    def __init__(self, name: str, identity: int) -> None:
         self.name = name
         self.identity = identity
-        self.clock = clock
-        self.heartbeat = heartbeat
         self.lives = 0
         self.executed: set[tuple[Any, int]] = set()
         self.ended: list[str] = []
+        self.refused: list[str] = []
         self.inbox: list[list[bytes]] = []
-        self.outbox: list[list[bytes]] = []
+        self.outbox: list[tuple[bytes, list[bytes] | None]] = []
         self.route: bytes | None = None
         self.routes = itertools.count()
         self.raises = False
@@ -65,29 +62,27 @@ class Client:
         self.steps = 0
         self.todo: StepRequest | ResetRequest | None = None
         meta = EnvMeta(env_id="env", observation_space=OBSERVATION, action_space=ACTION)
-        # Nonces must differ between lives, as real ones do.
-        start = 1000 * self.lives + 100_000 * self.identity
-        self.session = ClientSession(
-            meta,
-            self.name,
-            heartbeat=self.heartbeat,
-            new_token=itertools.count(start).__next__,
-        )
+        self.session = ClientSession(meta, self.name)
 
     def connect(self) -> None:
         if self.route is None:
             self.route = f"{self.name}:{next(self.routes)}".encode()
-            self.session.connected(self.clock.now)
+            self.session.connected()
             self.flush()
 
-    def cut(self) -> None:
-        """Break the connection; messages on the way are lost."""
+    def hang_up(self) -> None:
+        """Close the connection; what was sent arrives."""
         if self.route is not None:
+            self.outbox.append((self.route, None))
             self.route = None
             self.inbox.clear()
-            self.outbox.clear()
-            self.session.disconnected(self.clock.now)
-            self.flush()
+
+    def cut(self) -> None:
+        """Break the connection; messages on the way are lost, but for its end."""
+        if self.route is not None:
+            self.outbox = [one for one in self.outbox if one[0] != self.route]
+            self.hang_up()
+            self.obey(self.session.disconnected("the connection broke"))
 
     def kill(self) -> None:
         self.cut()
@@ -97,23 +92,30 @@ class Client:
         while self.session.outbox:
             parts = self.session.outbox.popleft()
             if self.route is not None:
-                self.outbox.append(parts)
+                self.outbox.append((self.route, parts))
 
     def receive(self, parts: list[bytes]) -> None:
-        event = self.session.receive(parts, self.clock.now)
-        self.obey(event)
+        event = self.session.receive(parts)
         self.flush()
+        self.obey(event)
 
     def obey(self, event: Any) -> None:
-        if isinstance(event, Ended):
+        if isinstance(event, Ended | Refused):
             self.todo = None
-            self.ended.append(event.cause)
+            if isinstance(event, Ended):
+                self.ended.append(event.cause)
+            else:
+                self.refused.append(event.text)
+            self.hang_up()
         elif event is not None:
             self.todo = event
 
-    def tick(self) -> None:
-        self.obey(self.session.tick(self.clock.now))
+    def leave(self) -> None:
+        """Send a goodbye and end."""
+        self.session.leave("enough")
         self.flush()
+        self.hang_up()
+        self.begin()
 
     def execute(self) -> None:
         """Execute the pending request once."""
@@ -121,7 +123,7 @@ class Client:
         if not isinstance(request, StepRequest | ResetRequest):
             return
         self.todo = None
-        key = (self.lives, self.session._session, request.number)
+        key = (self.route, request.number)
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
         if self.raises and request.number:
@@ -142,23 +144,11 @@ class World:
     """One server and its clients; messages wait until they are delivered or lost."""
 
     def __init__(self, names: str = "ab", **server: Any) -> None:
-        self.clock = Clock()
-        self.server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=counter(), **server)
-        self.clients = {name: Client(name, k + 1, self.clock) for k, name in enumerate(names)}
+        self.now = 0.0
+        self.server = ServerSessions("srv", **server)
+        self.clients = {name: Client(name, k + 1) for k, name in enumerate(names)}
         self.results: list[RemoteResult] = []
         self.delivered: dict[tuple[str, bool], list[list[bytes]]] = {}
-
-    def replay(self, client: Client, k: int, *, to_server: bool) -> None:
-        """Deliver an earlier message again, the latest first."""
-        delivered = self.delivered.get((client.name, to_server), [])
-        if client.route is None or not delivered or (client.todo is not None and not to_server):
-            return
-        parts = delivered[-1 - k % len(delivered)]
-        if to_server:
-            self.server.receive(client.route, None, parts, self.clock.now)
-            self.flush()
-        else:
-            client.receive(parts)
 
     def flush(self) -> None:
         """Put the messages of the server onto the network."""
@@ -168,27 +158,27 @@ class World:
             if client.route == route:
                 client.inbox.append(parts)
             else:
-                self.server.on_unreachable(route, self.clock.now)
+                self.server.disconnected(route)
         self.results += self.server.take()
 
-    def to_server(self, client: Client, k: int = 0, *, keep: bool = False) -> None:
-        parts = client.outbox[k] if keep else client.outbox.pop(k)
-        assert client.route is not None
-        self.delivered.setdefault((client.name, True), []).append(parts)
-        self.server.receive(client.route, None, parts, self.clock.now)
+    def to_server(self, client: Client) -> None:
+        route, parts = client.outbox.pop(0)
+        if parts is None:
+            self.server.disconnected(route)
+        else:
+            self.delivered.setdefault((client.name, True), []).append(parts)
+            self.server.receive(route, parts, self.now)
         self.flush()
 
-    def to_client(self, client: Client, k: int = 0, *, keep: bool = False) -> None:
-        parts = client.inbox[k] if keep else client.inbox.pop(k)
+    def to_client(self, client: Client) -> None:
+        parts = client.inbox.pop(0)
         self.delivered.setdefault((client.name, False), []).append(parts)
         client.receive(parts)
 
     def pass_time(self, seconds: float) -> None:
-        self.clock.now += seconds
-        self.server.tick(self.clock.now)
+        self.now += seconds
+        self.server.tick(self.now)
         self.flush()
-        for client in self.clients.values():
-            client.tick()
 
     def settle(self) -> None:
         """Deliver everything in order, and let clients work, until nothing moves."""
@@ -212,13 +202,13 @@ class World:
         self.settle()
 
     def submit(self, name: str, number: int) -> bool:
-        answered = self.server.requests.step(name, number, ACTION.sample(), EXTRAS, self.clock.now)
+        answered = self.server.step(name, number, ACTION.sample(), EXTRAS, self.now)
         self.flush()
         return answered
 
     def submit_reset(self, name: str, number: int, **options: Any) -> bool:
-        answered = self.server.requests.reset(
-            name, number, options.get("seed"), options.get("options"), self.clock.now
+        answered = self.server.reset(
+            name, number, options.get("seed"), options.get("options"), self.now
         )
         self.flush()
         return answered

@@ -9,6 +9,7 @@ the first result of a later session.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -97,6 +98,7 @@ class Client:
             are true.
         is_known: the trainer has its id; last: the observation that it has got last.
         withdrawn: what was sent to it since it was out.
+        dropped: requests that were aborted since its last result, which it may have executed.
         troubles: what has happened to it that may end a session.
         hangs: its env does not return any more.
         asked, done: steps and resets that were sent, and that were executed, in order.
@@ -113,6 +115,7 @@ class Client:
         self.is_out = True
         self.last = state.scripts.words
         self.withdrawn: dict[str, Any] | None = None
+        self.dropped: list[Request] = []
         self.troubles = 0
         self.asked: deque[tuple[str, int]] = deque()
         self.done: list[tuple[str, int]] = []
@@ -195,6 +198,8 @@ class Client:
                 done.play(request)
                 done.count = state.count if request.kind == "step" else 0
                 self.env.loose.append(done)
+        if request is not None and request.kind != "join":
+            self.dropped.append(request)
         self.troubles += 1
         self.is_in = self.is_in or (request is not None and request.kind == "join")
         self.is_out, self.withdrawn = True, None
@@ -220,7 +225,7 @@ class Client:
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         model.counts["first results"] += number != self.session
         self.session, self.is_in, self.is_out, self.withdrawn = number, True, False, None
-        self.is_known, self.last = True, row.words
+        self.is_known, self.last, self.dropped = True, row.words, []
         env.adopt(state)
 
     def _played(self, model: Model, request: Request) -> Iterator[tuple[int, State, Expected]]:
@@ -236,15 +241,21 @@ class Client:
             first = state.play(Request("reset"))
             if self.is_out or (is_plain and request.resets):
                 yield number, state, first
-            for one in request.alternatives():
-                if request.resets or (self.is_out and model.context is not None):
-                    again = state.copy()
-                    yield number, again, again.play(replace(one, due=True))
-                if (
-                    self.is_in and self.is_out and request.kind != "join"
-                ):  # Its first result was dropped.
-                    again = state.copy()
-                    yield number, again, again.play(one, limit)
+            is_due = request.resets or (self.is_out and model.context is not None)
+            # Its first result was dropped.
+            was_dropped = self.is_in and self.is_out and request.kind != "join"
+            ways = [{"due": True}] * is_due + [{}] * was_dropped
+            for one, way in itertools.product(request.alternatives(), ways):
+                for again in self._after_dropped(state):
+                    yield number, again, again.play(replace(one, **way), limit)
+
+    def _after_dropped(self, state: State) -> Iterator[State]:
+        """The states after each end of what was dropped, which may have come to this session."""
+        for begin in range(len(self.dropped) + 1):
+            again = state.copy()
+            for request in self.dropped[begin:]:
+                again.play(request)
+            yield again
 
     def _judge_lost(self, model: Model, request: Request, row: Row) -> None:
         # A reset may be sent to one that is about to come back.

@@ -3,7 +3,8 @@
 It takes the place of ZMQ on both sides. A client is the real `RemoteEnvClient` in a process of the
 world, and the server is the real host, whose listener is simulated. What is sent over a connection
 arrives in order and late; when the connection breaks, the rest is lost. Each end finds out at its
-own time: the server when it sends something, the client by an event. Then the client dials again.
+own time. A socket of a client has one connection at most, and a client that has lost one dials
+again with another.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import zmq
 from simulator.processes import Killed, Process
 
-from rlightning_aio.protocol.net.wire import PINGS_PER_HEARTBEAT
+from rlightning_aio.protocol.net.wire import ping_ms
 from rlightning_aio.remote import client as client_module
 from rlightning_aio.remote.client import RemoteEnvClient
 
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.server_session import ServerSessions
 
 __all__ = ["ClientProcess", "Network"]
-
-_DIAL_SECONDS: Final = (0.1, 5.0)
 
 
 class Network:
@@ -155,8 +154,8 @@ class _Connection:
         world = self._world
         world.counts["cuts"] += 1
         world.note("the connection of {} breaks", self.dealer.process.name)
-        world.after(world.delay(), partial(self.listener.connections.pop, self.route, None))
-        world.after(world.delay(), partial(self.dealer.lose, self))
+        world.after(world.delay(), partial(self.listener.lose, self.route))
+        world.after(world.delay(), self.dealer.lose)
 
 
 class _Listener:
@@ -166,11 +165,11 @@ class _Listener:
         self, network: Network, server_id: str, settings: ServerSettings, sessions: ServerSessions
     ) -> None:
         del server_id
-        self.incoming: deque[tuple[bytes, list[bytes]]] = deque()
+        self.incoming: deque[tuple[bytes, list[bytes] | None]] = deque()
         self.connections: dict[bytes, _Connection] = {}
         self._network = network
         self._sessions = sessions
-        self.silence = 3 * settings.heartbeat / PINGS_PER_HEARTBEAT
+        self.silence = sum(ping_ms(settings.heartbeat)) / 1000
         self._port = settings.port
         self._descriptor = -1
         self._has_more = False
@@ -188,7 +187,7 @@ class _Listener:
         if self._descriptor < 0:
             return
         self._sessions.close("the trainer closed its group")
-        self._send(0.0)
+        self._send()
         del self._network.listeners[self.address]
         del self._network.world.sockets.by_number[self._descriptor]
         self._descriptor = -1
@@ -211,26 +210,34 @@ class _Listener:
     def deadline(self) -> float | None:
         return self._sessions.deadline()
 
+    def lose(self, route: bytes) -> None:
+        """Find out that a connection is gone."""
+        if self.connections.pop(route, None) is not None:
+            self.incoming.append((route, None))
+
     def pump(self, now: float) -> None:
         self._has_more = False
         while self.incoming:
             route, parts = self.incoming.popleft()
-            self._sessions.receive(route, None, parts, now)
+            if parts is None:
+                self._sessions.disconnected(route)
+            else:
+                self._sessions.receive(route, parts, now)
         self._sessions.tick(now)
-        self._send(now)
+        self._send()
 
-    def flush(self, now: float) -> None:
-        self._send(now)
+    def flush(self) -> None:
+        self._send()
         self._has_more = self._sessions.has_results
 
-    def _send(self, now: float) -> None:
+    def _send(self) -> None:
         outbox = self._sessions.outbox
         while outbox:
             route, parts = outbox.popleft()
             if route in self.connections:
                 self.connections[route].send([bytes(part) for part in parts], to_server=False)
             else:
-                self._sessions.on_unreachable(route, now)
+                self._sessions.disconnected(route)
 
 
 class _Frame:
@@ -278,8 +285,7 @@ class _Dealer:
         self._connection: _Connection | None = None
         self._frames: deque[_Frame] = deque()
         self._parts: list[bytes] = []
-        self._address = ""
-        self._attempt = 0
+        self._is_open = True
 
     def set(self, option: int, value: Any) -> None:
         """Do nothing: all options are about what is not simulated."""
@@ -297,48 +303,35 @@ class _Dealer:
 
     def close(self, linger: int) -> None:
         del linger
-        self._attempt = -1
+        self._is_open = False
         if self._connection is not None:
             self._network.world.after(0.1, self._connection.cut)
 
     # -- the connection -----------------------------------------------------------
 
     def connect(self, address: str) -> None:
-        self._address = address
-        self._attempt = number = self._attempt + 1
-        self._later(self._network.world.start_delay(), partial(self._dial, number, 0))
-
-    def disconnect(self, address: str) -> None:
-        del address
-        self._attempt += 1
-        self.cut()
+        self.process.later(self._network.world.start_delay(), partial(self._dial, address))
 
     def cut(self) -> None:
         """Break the connection, if there is one."""
         if self._connection is not None:
             self._connection.cut()
 
-    def _later(self, seconds: float, callback: Callable[[], object]) -> None:
-        self.process.later(seconds, callback)
-
-    def _dial(self, number: int, count: int) -> None:
-        if number != self._attempt or self._connection is not None:
+    def _dial(self, address: str) -> None:
+        if not self._is_open:
             return
-        listener = self._network.listeners.get(self._address)
+        listener = self._network.listeners.get(address)
         if listener is None:
-            self._add_event(zmq.EVENT_CONNECT_RETRIED)
-            pause = min(_DIAL_SECONDS[1], _DIAL_SECONDS[0] * 2**count)
-            self._later(pause, partial(self._dial, number, count + 1))
+            self._add_event(zmq.EVENT_CLOSED)
             return
         self._connection = _Connection(self._network, self, listener)
         self._add_event(zmq.EVENT_HANDSHAKE_SUCCEEDED)
 
-    def lose(self, connection: _Connection) -> None:
-        """Find out that a connection is gone, and dial again."""
-        if self._connection is connection:
-            self._connection = None
+    def lose(self) -> None:
+        """Find out that the connection is gone."""
+        self._connection = None
+        if self._is_open:
             self._add_event(zmq.EVENT_DISCONNECTED)
-            self._later(_DIAL_SECONDS[0], partial(self._dial, self._attempt, 0))
 
     def _add_event(self, event: int) -> None:
         self._monitor.events.append(event)

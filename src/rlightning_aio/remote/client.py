@@ -1,8 +1,10 @@
 """`RemoteEnvClient`: an env of this machine that a trainer on another machine steps.
 
-Rule: a plain blocking loop on the caller's thread, which alone resets, steps and stops the env.
-`client_session` decides which messages to send and when. ZMQ's own thread keeps the connection
-alive while the env steps. Deliberately left out: threads, and anything that unpickles.
+Rule: a plain blocking loop on the caller's thread, which alone resets, steps and stops the env. A
+socket of ZMQ has one connection at most, which is one session; after its end, another socket dials
+again. ZMQ's own thread keeps the connection alive while the env steps, and notices if the server is
+silent. Deliberately left out: the meaning of messages (`client_session`), threads, and anything
+that unpickles.
 """
 
 from __future__ import annotations
@@ -14,7 +16,6 @@ import re
 import socket
 import time
 from math import ceil
-from threading import Thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
@@ -33,7 +34,6 @@ from rlightning_aio.errors import ClientRefused, ConfigError
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
-    Ended,
     Phase,
     Refused,
     ResetRequest,
@@ -43,9 +43,10 @@ from rlightning_aio.protocol.net.limited_log import LOG
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
 from rlightning_aio.protocol.net.wire import (
+    HANDSHAKE_SECONDS,
     MAX_FRAME_BYTES,
     MAX_NAME_LENGTH,
-    PINGS_PER_HEARTBEAT,
+    ping_ms,
 )
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
@@ -56,19 +57,16 @@ if TYPE_CHECKING:
 
 __all__ = ["RemoteEnvClient", "is_address"]
 
-_RECONNECT_MS: Final = (100, 5000)
-"""Time between two attempts to connect: at first, and at most. Each attempt doubles it."""
-_HANDSHAKE_MS: Final = 5000
-_REDIAL_SECONDS: Final = (1.0, 8.0)
-"""Pauses before another attempt after a failed handshake, after which ZMQ itself gives up."""
+_SECONDS_BETWEEN_ATTEMPTS: Final = (0.1, 5.0)
+"""The first pause, and the longest. Each attempt doubles it, until a server requests something."""
+_ATTEMPT_SECONDS: Final = 3 * HANDSHAKE_SECONDS
+"""Time after which an attempt that ZMQ says nothing about is over."""
 _LINGER_MS: Final = 500
 
 _ADDRESS: Final = re.compile(r"tcp://(?:\[[0-9A-Fa-f:.]+\]|[\w.-]+):([0-9]{1,5})")
 _MAX_PORT: Final = 65535
 
 _Socket = zmq.Socket[bytes]
-ENDING: Final = "end of an interrupted client's sockets"
-"""Name of a thread."""
 
 
 class RemoteEnvClient:
@@ -85,8 +83,7 @@ class RemoteEnvClient:
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
         name: unique at the server; by default this machine's name and the process id.
-        heartbeat: seconds within which a dead server is found, until the server has answered;
-            then the server's own setting applies.
+        heartbeat: seconds within which a dead server is found.
 
     Attributes:
         name: of the client.
@@ -123,7 +120,6 @@ class RemoteEnvClient:
             self._session = ClientSession(
                 initialised(env),
                 self.name,
-                heartbeat=heartbeat,
                 free_actions=env.transforms_actions or has_preprocess_fn(env),
                 reads_extras=reads_extras(env),
             )
@@ -135,22 +131,20 @@ class RemoteEnvClient:
         self._request: StepRequest | ResetRequest | None = None
         self._trouble = ""
         self._logged_state = Phase.AWAY.value
-        self._redial_at: float | None = None
-        self._redial_pause = _REDIAL_SECONDS[0]
-        self._context: zmq.Context[_Socket] | None = None
-        self._dealer: _Socket
+        self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
+        self._due = 0.0
+        self._context = zmq.Context[_Socket]()
+        self._dealer: _Socket | None = None
         self._monitor: _Socket
-        self._poller: zmq.Poller
+        self._poller = zmq.Poller()
         self._closed = False
 
     @property
     def state(self) -> str:
         """The state of the connection, in a few words."""
-        trouble = self._session.refusal or self._trouble
-        phase = self._session.phase.value
-        if not trouble or self._session.phase is Phase.SERVING:
-            return phase
-        return f"{phase} ({trouble})"
+        phase = self._session.phase
+        is_well = phase is Phase.SERVING or not self._trouble
+        return phase.value if is_well else f"{phase.value} ({self._trouble})"
 
     def connect(self, timeout: float | None = None) -> None:
         """Dial in and wait until the server lets this client in.
@@ -164,8 +158,6 @@ class RemoteEnvClient:
         """
         if self._closed:
             raise RuntimeError("this client is closed")
-        if self._context is None:
-            self._dial()
         end = None if timeout is None else time.monotonic() + timeout
         while self._session.phase is not Phase.SERVING:
             if end is not None and time.monotonic() >= end:
@@ -202,12 +194,9 @@ class RemoteEnvClient:
         if self._closed:
             return
         self._closed = True
-        if self._context is not None:
-            self._leave("the client was closed")
-            self._dealer.disable_monitor()
-            self._monitor.close(linger=0)
-            self._dealer.close(linger=_LINGER_MS)
-            self._context.term()
+        self._leave("the client was closed")
+        self._hang_up()
+        self._context.destroy(linger=0)
         self._env.close()
 
     def __enter__(self) -> Self:
@@ -219,32 +208,28 @@ class RemoteEnvClient:
     # -- connection -----------------------------------------------------------------
 
     def _dial(self) -> None:
-        context = zmq.Context[_Socket]()
-        try:
-            self._dealer = context.socket(zmq.DEALER)
-            self._set_options(self._dealer)
-            self._monitor = self._dealer.get_monitor_socket()
-            self._poller = zmq.Poller()
-            self._poller.register(self._monitor, zmq.POLLIN)
-            self._poller.register(self._dealer, zmq.POLLIN)
-            self._dealer.connect(self._address)
-            # Invariant: if there is a context, there are its sockets and the poller.
-            self._context = context
-        except BaseException:
-            self._context = None
-            # Ending a context waits for its sockets, and the traceback may still hold one.
-            Thread(target=context.destroy, args=(0,), name=ENDING, daemon=True).start()
-            raise
+        """Begin an attempt; a socket that is interrupted here is closed with its context."""
+        now = time.monotonic()
+        self._due = now + _ATTEMPT_SECONDS
+        dealer = self._context.socket(zmq.DEALER)
+        self._set_options(dealer)
+        self._monitor = dealer.get_monitor_socket()
+        self._poller = zmq.Poller()
+        # The goodbye of a server comes before the end of its connection.
+        self._poller.register(dealer, zmq.POLLIN)
+        self._poller.register(self._monitor, zmq.POLLIN)
+        dealer.connect(self._address)
+        self._dealer = dealer
 
     def _set_options(self, dealer: _Socket) -> None:
-        # A message must not wait for the next connection when this one is gone.
-        dealer.set(zmq.IMMEDIATE, 1)
+        dealer.set(zmq.RECONNECT_IVL, -1)
+        dealer.set(zmq.LINGER, 0)
         dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
-        dealer.set(zmq.RECONNECT_IVL, _RECONNECT_MS[0])
-        dealer.set(zmq.RECONNECT_IVL_MAX, _RECONNECT_MS[1])
-        dealer.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
-        dealer.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * self._heartbeat / PINGS_PER_HEARTBEAT)))
-        dealer.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * self._heartbeat / PINGS_PER_HEARTBEAT)))
+        dealer.set(zmq.CONNECT_TIMEOUT, int(1000 * HANDSHAKE_SECONDS))
+        dealer.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
+        interval, patience = ping_ms(self._heartbeat)
+        dealer.set(zmq.HEARTBEAT_IVL, interval)
+        dealer.set(zmq.HEARTBEAT_TIMEOUT, patience)
         if self._keys is not None:
             dealer.set(zmq.CURVE_SERVERKEY, self._keys.server)
             dealer.set(zmq.CURVE_PUBLICKEY, self._keys.public)
@@ -252,32 +237,46 @@ class RemoteEnvClient:
         if "[" in self._address:
             dealer.set(zmq.IPV6, 1)
 
+    def _hang_up(self) -> None:
+        """End the attempt or the connection, and set the time of the next attempt."""
+        dealer, self._dealer = self._dealer, None
+        if dealer is not None:
+            self._poller = zmq.Poller()
+            dealer.disable_monitor()
+            self._monitor.close(linger=0)
+            dealer.close(linger=_LINGER_MS)
+            self._due = time.monotonic() + self._pause
+            self._pause = min(2 * self._pause, _SECONDS_BETWEEN_ATTEMPTS[1])
+
     def _wait(self, until: float | None) -> None:
         """Wait for messages and events, at most `until`, and process them."""
-        times = [until, self._session.deadline(), self._redial_at]
+        if self._dealer is None and time.monotonic() >= self._due:
+            self._dial()
+        # An attempt that has succeeded has no end.
+        times = [until, self._due if self._session.phase is Phase.AWAY else None]
         due = min([moment for moment in times if moment is not None], default=None)
         wait_ms = None if due is None else ceil(1000 * max(0.0, due - time.monotonic()))
         for source, _ in self._poller.poll(wait_ms):
+            dealer = self._dealer
+            if dealer is None:
+                break  # An event before this one has ended the connection.
             if source is self._monitor:
                 self._read_event()
-            elif (first := next_frame(self._dealer)) is not None:
-                parts = receive_parts(self._dealer, first)
-                self._apply(self._session.receive(parts, time.monotonic()))
-        if due is not None and time.monotonic() >= due:
-            self._apply(self._session.tick(time.monotonic()))
-            if self._redial_at is not None and time.monotonic() >= self._redial_at:
-                self._redial()
+            elif (first := next_frame(dealer)) is not None:
+                self._apply(self._session.receive(receive_parts(dealer, first)))
+        is_late = self._dealer is not None and time.monotonic() >= self._due
+        if is_late and self._session.phase is Phase.AWAY:
+            self._lose(f"no server answers at {self._address}")
         self._flush()
         self._log_state()
 
     def _log_state(self) -> None:
-        """Log the state of the connection if it has changed."""
-        state = self.state
+        """Log the state of the connection, once for each trouble."""
+        state = self._trouble or self._session.phase.value
         if state != self._logged_state:
             self._logged_state = state
-            in_trouble = state != self._session.phase.value
-            level = logging.WARNING if in_trouble else logging.INFO
-            LOG.log(level, "%s: %s", self.name, state)
+            level = logging.WARNING if self._trouble else logging.INFO
+            LOG.log(level, "%s: %s", self.name, self.state)
 
     def _read_event(self) -> None:
         """Process one event of the connection."""
@@ -285,56 +284,59 @@ class RemoteEnvClient:
             event = recv_monitor_message(self._monitor, zmq.NOBLOCK)["event"]
         except zmq.Again:
             return
-        now = time.monotonic()
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-            self._trouble = ""
-            self._redial_at, self._redial_pause = None, _REDIAL_SECONDS[0]
-            self._session.connected(now)
+            self._session.connected()
         elif event == zmq.EVENT_DISCONNECTED:
-            self._session.disconnected(now)
-            self._redial_at = now + _REDIAL_SECONDS[1]
-        elif event == zmq.EVENT_CONNECT_RETRIED and not self._trouble:
-            self._trouble = f"no server answers at {self._address}"
-        elif event in _REFUSED_HANDSHAKES:
+            is_new = self._session.phase is Phase.AWAY
+            self._lose(self._trouble if is_new else "the connection to the server broke")
+        elif event == zmq.EVENT_CLOSED:
+            self._lose(f"no server answers at {self._address}")
+        elif event != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL or not self._trouble:
             # Handshakes that fail for one reason may end with it or without any.
-            if not self._trouble or event != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
-                self._trouble = _REFUSED_HANDSHAKES[event]
-            self._redial_at = now + self._redial_pause
+            self._trouble = _REFUSED_HANDSHAKES.get(event, self._trouble)
 
-    def _redial(self) -> None:
-        """Connect again, in place of a connection that ZMQ may or may not be working on."""
-        with contextlib.suppress(zmq.ZMQError):
-            self._dealer.disconnect(self._address)
-        self._dealer.connect(self._address)
-        self._redial_pause = min(2 * self._redial_pause, _REDIAL_SECONDS[1])
-        self._redial_at = time.monotonic() + _REDIAL_SECONDS[1]
+    def _lose(self, cause: str) -> None:
+        """Process the end of an attempt or a connection."""
+        self._trouble = cause
+        event = self._session.disconnected(cause)
+        self._hang_up()
+        self._apply(event)
 
     def _flush(self) -> None:
         outbox = self._session.outbox
         while outbox:
             parts = outbox.popleft()
-            try:
-                send_parts(self._dealer, parts)
-            except zmq.Again:
-                # No connection, or a full one; lost messages are repeated.
-                continue
+            # If the connection is gone, its end will be reported.
+            with contextlib.suppress(zmq.Again):
+                if self._dealer is not None:
+                    send_parts(self._dealer, parts)
 
     def _leave(self, reason: str) -> None:
         self._session.leave(reason)
-        if self._context is not None:
-            self._flush()
+        self._flush()
 
     # -- env ------------------------------------------------------------------------
 
     def _apply(self, event: Event | None) -> None:
-        if isinstance(event, Refused):
-            raise ClientRefused(f"{self._address} refused the client {self.name!r}: {event.text}")
-        if isinstance(event, Ended):
+        if isinstance(event, StepRequest | ResetRequest):
+            self._request, self._trouble = event, ""
+            if event.number:
+                self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
+        elif isinstance(event, Refused):
+            self._flush()
+            self._hang_up()
+            self._trouble = event.text
+            if not event.retry:
+                raise ClientRefused(
+                    f"{self._address} refused the client {self.name!r}: {event.text}"
+                )
+        elif event is not None:
             self._request = None
+            self._flush()
+            self._hang_up()
+            self._trouble = ""
             LOG.warning("%s: session over: %s", self.name, event.cause)
             self._env.on_disconnect()
-        elif event is not None:
-            self._request = event
 
     def _execute(self, request: StepRequest | ResetRequest) -> None:
         if request.number == 0:

@@ -1,8 +1,8 @@
 """`ClientSession`: a client's end of env_server, without I/O.
 
-Rule: a request is executed at most once. A repeated request gets the earlier reply again, an older
-one is refused. Messages and changes of the connection come in, messages are queued, and time is an
-argument. Deliberately left out: sockets, keys, and the env itself.
+Rule: a connection is a session. It begins with a hello and ends with the connection or a goodbye,
+and nothing of it passes to the next one. Messages come in and are queued. Deliberately left out:
+sockets, keys, the times of attempts, and the env itself.
 """
 
 from __future__ import annotations
@@ -13,23 +13,18 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio.protocol.error_text import ErrorText
-from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
+from rlightning_aio.protocol.net.limited_log import LOG
 from rlightning_aio.protocol.net.payload import Packed, ResultFields, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.texts import in_one_line
 from rlightning_aio.protocol.net.wire import (
-    PINGS_PER_HEARTBEAT,
-    STALE_REQUEST,
     VERSION,
     Bye,
     ClientHello,
     ClientResult,
     Failure,
     FromServer,
-    Gone,
     Part,
-    Ping,
-    Pong,
     Reader,
     Refusal,
     Reset,
@@ -39,20 +34,16 @@ from rlightning_aio.protocol.net.wire import (
     WireError,
     Writer,
     portable,
-    random_token,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     import gymnasium as gym
 
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
 __all__ = ["ClientSession", "Ended", "Phase", "Refused", "ResetRequest", "StepRequest"]
-
-_SECONDS_BETWEEN_HELLOS: Final = (0.5, 8.0)
-"""The first pause, and the longest; each refusal doubles it."""
 
 _MAX_TEXT: Final = 50_000
 _LATEST_NS: Final = 2**63 - 1
@@ -63,7 +54,6 @@ class Phase(Enum):
 
     AWAY = "not connected"
     GREETING = "asking to be let in"
-    RESUMING = "reconnected, asking whether the session continues"
     SERVING = "serving"
 
 
@@ -87,17 +77,17 @@ class ResetRequest:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The session has ended, and with it the trainer's control of the env; another may follow."""
+    """The session has ended, and with it the trainer's control of the env; hang up."""
 
     cause: str
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The server will never admit this client."""
+    """The server didn't let this client in; hang up. With `retry` it may do so later."""
 
-    code: str
     text: str
+    retry: bool
 
 
 Event = StepRequest | ResetRequest | Ended | Refused
@@ -109,16 +99,12 @@ class ClientSession:
     Args:
         meta: of the env.
         name: of the client, unique at its server.
-        heartbeat: seconds within which a dead server is found, until the server sends its own.
         free_actions: the env accepts actions that do not fit its action space.
         reads_extras: the env reads columns that the policy attaches to the action.
-        new_token: makes nonces.
 
     Attributes:
         phase: state of the connection.
         outbox: messages that wait to be sent, oldest first; the sender removes them.
-        num_malformed: messages that were dropped as malformed.
-        refusal: reason of the server's last refusal, until it admits the client.
 
     Raises:
         UnsupportedSpace: a space can't be announced.
@@ -129,23 +115,16 @@ class ClientSession:
         meta: EnvMeta,
         name: str,
         *,
-        heartbeat: float,
         free_actions: bool = False,
         reads_extras: bool = False,
-        new_token: Callable[[], int] = random_token,
     ) -> None:
         self.phase = Phase.AWAY
         self.outbox: deque[list[bytes]] = deque()
-        self.num_malformed = 0
-        self.refusal: str | None = None
         self._name = name
-        self._heartbeat = heartbeat
-        self._new_token = new_token
         self._free_actions = free_actions
         self._hello = ClientHello(
             version=VERSION,
             name=name,
-            nonce=0,
             observation_space=describe(meta.observation_space, "the observation space"),
             action_space=describe(meta.action_space, "the action space"),
             num_envs=meta.num_envs,
@@ -162,62 +141,32 @@ class ClientSession:
         self._actions = SpaceLayout(action_space, "action")
         self._reader: Reader[FromServer] = Reader(FromServer)
         self._writer = Writer()
-        self._session: int | None = None
-        self._number = -1
-        self._reply: list[bytes] = []
-        self._ask_at: float | None = None
-        self._give_up_at: float | None = None
-        self._pause = _SECONDS_BETWEEN_HELLOS[0]
         self._lost_keys: set[str] = set()
-        self._log = LimitedLog(name)
 
     # The connection
 
-    def connected(self, now: float) -> None:
-        """Record that a connection to the server is open."""
-        self._give_up_at = None
-        self._pause = _SECONDS_BETWEEN_HELLOS[0]
-        if self._session is None:
-            self._say_hello_at(now)
-        else:
-            self.phase = Phase.RESUMING
-        self._ask(now)
+    def connected(self) -> None:
+        """Say hello over a new connection."""
+        self.phase = Phase.GREETING
+        self._send(self._hello)
 
-    def disconnected(self, now: float) -> None:
-        """Record that the connection broke; it may come back."""
-        if self.phase is not Phase.AWAY:
-            self.phase, self._ask_at = Phase.AWAY, None
-            if self._session is not None:
-                self._give_up_at = now + 2 * self._heartbeat / PINGS_PER_HEARTBEAT
+    def disconnected(self, cause: str) -> Event | None:
+        """Record that the connection is gone."""
+        return None if self.phase is Phase.AWAY else self._end(cause)
 
-    def _say_hello_at(self, when: float) -> None:
-        self.phase, self._ask_at = Phase.GREETING, when
-        self._hello.nonce = self._new_token()
+    def leave(self, reason: str) -> None:
+        """Send a goodbye if there is a session."""
+        if self.phase is Phase.SERVING:
+            self._send(Bye(reason=reason))
+        self.phase = Phase.AWAY
 
-    def _ask(self, now: float) -> None:
-        """Send a hello or a ping, and set the time to repeat it: it may get lost."""
-        if self.phase is Phase.GREETING:
-            self._send(self._hello)
-        elif self._session is not None:
-            self._send(Ping(session=self._session))
-        serving = self.phase is Phase.SERVING
-        self._ask_at = now + (self._heartbeat if serving else self._pause)
-
-    def deadline(self) -> float | None:
-        """Return the time at which `tick` is due (monotonic seconds); None if never."""
-        return self._ask_at if self._give_up_at is None else self._give_up_at
-
-    def tick(self, now: float) -> Ended | None:
-        """Repeat a hello or ping, or give the server up, if that is due."""
-        if self._give_up_at is not None and now >= self._give_up_at:
-            return self._end("the connection to the server broke and did not come back")
-        if self._ask_at is not None and now >= self._ask_at:
-            self._ask(now)
-        return None
+    def _end(self, cause: str) -> Ended | Refused:
+        held, self.phase = self.phase is Phase.SERVING, Phase.AWAY
+        return Ended(cause) if held else Refused(cause, retry=True)
 
     # Messages
 
-    def receive(self, parts: Sequence[Part], now: float) -> Event | None:
+    def receive(self, parts: Sequence[Part]) -> Event | None:
         """Read one message. No content makes it raise.
 
         Returns:
@@ -226,46 +175,29 @@ class ClientSession:
         """
         try:
             message, frames = self._reader.read(parts)
+            if isinstance(message, Bye):
+                return self._end(f"the server ended the session: {in_one_line(message.reason)}")
             if isinstance(message, Welcome | Refusal):
-                return self._on_answer(message, now)
-            if message.session != self._session:
-                self._on_other_session(message)
-                return None
-            return self._on_message(message, frames, now)
+                return self._on_answer(message)
+            return self._on_request(message, frames)
         except WireError as error:
-            self._complain(str(error), now)
-            return None
+            text = f"a message of the server is malformed: {in_one_line(str(error))}"
+            if self.phase is Phase.SERVING:
+                self._send(Bye(reason=text))
+            return self._end(text)
 
-    def _on_message(
-        self,
-        message: Step | Reset | Ping | Pong | Gone | Bye,
-        frames: Sequence[Part],
-        now: float,
-    ) -> Event | None:
-        if isinstance(message, Gone):
-            self._say_hello_at(now)
-            return self._end(f"the server ended the session: {in_one_line(message.text)}")
-        if isinstance(message, Bye):
-            # A server that closes answers no hello, so wait.
-            self._say_hello_at(now + self._pause)
-            return self._end(f"the server closed: {in_one_line(message.reason)}")
-        # A server may have forgotten this session while its `gone` got lost; then it is silent.
-        self.phase, self._ask_at = Phase.SERVING, now + self._heartbeat
-        if isinstance(message, Step | Reset):
-            return self._on_request(message, frames, now)
-        if isinstance(message, Ping):
-            self._send(Pong(session=message.session, number=message.number))
-        return None
+    def _on_answer(self, message: Welcome | Refusal) -> Event:
+        if self.phase is not Phase.GREETING:
+            raise WireError("an answer to a hello that was answered")
+        if isinstance(message, Refusal):
+            self.phase = Phase.AWAY
+            return Refused(in_one_line(message.text), message.retry)
+        self.phase = Phase.SERVING
+        return ResetRequest(0)
 
-    def _on_request(
-        self, message: Step | Reset, frames: Sequence[Part], now: float
-    ) -> Event | None:
-        if message.number == self._number:
-            self.outbox.append(self._reply)
-            return None
-        if message.number < self._number:
-            self._refuse_stale(message)
-            return None
+    def _on_request(self, message: Step | Reset, frames: Sequence[Part]) -> Event | None:
+        if self.phase is not Phase.SERVING:
+            raise WireError("a request without a session")
         if isinstance(message, Reset):
             return ResetRequest(message.number, message.seed, message.options)
         if self._free_actions:
@@ -273,71 +205,9 @@ class ClientSession:
         try:
             action = self._actions.unpack(frames, message.texts)
         except WireError as error:
-            self._complain(str(error), now)
             self.fail(message.number, ErrorText(type(error).__name__, str(error), ""))
             return None
         return StepRequest(message.number, action, message.extras)
-
-    def _refuse_stale(self, message: Step | Reset) -> None:
-        text = f"request {message.number} is older than {self._number}, which is done"
-        self._send(
-            Failure(
-                session=message.session,
-                number=message.number,
-                exception_type=STALE_REQUEST,
-                text=text,
-                traceback="",
-            )
-        )
-
-    def _on_answer(self, message: Welcome | Refusal, now: float) -> Event | None:
-        if isinstance(message, Welcome):
-            return self._on_welcome(message, now)
-        return self._on_refusal(message, now)
-
-    def _on_welcome(self, welcome: Welcome, now: float) -> Event | None:
-        if welcome.session == self._session:
-            # The server waits for the first result, or waited when it sent this.
-            if self._number == 0:
-                self.outbox.append(self._reply)
-            return None
-        if self.phase is not Phase.GREETING or welcome.nonce != self._hello.nonce:
-            return None
-        self.phase, self.refusal = Phase.SERVING, None
-        self._session = self._hello.previous = welcome.session
-        self._heartbeat = welcome.heartbeat
-        self._ask_at = now + welcome.heartbeat
-        self._number = -1
-        return ResetRequest(0)
-
-    def _on_refusal(self, refusal: Refusal, now: float) -> Event | None:
-        if self.phase is not Phase.GREETING or refusal.nonce != self._hello.nonce:
-            return None
-        self.refusal = text = in_one_line(refusal.text)
-        if not refusal.retry:
-            self._ask_at = None
-            return Refused(in_one_line(refusal.code), text)
-        self._pause = min(2 * self._pause, _SECONDS_BETWEEN_HELLOS[1])
-        self._ask_at = now + self._pause
-        return None
-
-    def _on_other_session(self, message: Step | Reset | Ping | Pong | Gone | Bye) -> None:
-        # The server has a session that this client has given up or never had.
-        if not isinstance(message, Gone | Bye | Pong):
-            self._send(Bye(session=message.session, reason="this client holds no such session"))
-
-    def _end(self, cause: str) -> Ended:
-        self._session = self._give_up_at = None
-        self._reply = []
-        return Ended(cause)
-
-    def _complain(self, text: str, now: float) -> None:
-        self.num_malformed += 1
-        self._log.warn(
-            "malformed",
-            in_one_line(f"dropped a message ({self.num_malformed} so far): {text}"),
-            now,
-        )
 
     # Answers
 
@@ -369,16 +239,15 @@ class ClientSession:
         Raises:
             Misfit: the outcome doesn't fit the announced spaces; nothing was sent.
         """
-        if self._session is None:
+        if self.phase is not Phase.SERVING:
             return
         result = ClientResult(
-            session=self._session, number=number, busy_ns=busy_ns, sent_ns=sent_ns,
-            info=info, extra=extra,
-        )  # fmt: skip
+            number=number, busy_ns=busy_ns, sent_ns=sent_ns, info=info, extra=extra
+        )
         packed = Packed([], result.texts)
         header = self._results.pack(outcome, packed)
         result.reward, result.terminated, result.truncated = header[1:]
-        self._answer(number, self._written(result, packed.frames))
+        self.outbox.append(self._written(result, packed.frames))
 
     def _written(self, result: ClientResult, frames: list[bytes]) -> list[bytes]:
         try:
@@ -403,27 +272,15 @@ class ClientSession:
 
     def fail(self, number: int, error: ErrorText) -> None:
         """Answer request `number` with the exception that the env raised."""
-        if self._session is not None:
+        if self.phase is Phase.SERVING:
             failure = Failure(
-                session=self._session,
                 number=number,
                 exception_type=_encodable(error.type_name),
                 text=_encodable(error.text),
                 traceback=_encodable(error.traceback),
                 blame=error.blame,
             )
-            self._answer(number, self._writer.write(failure))
-
-    def _answer(self, number: int, parts: list[bytes]) -> None:
-        self._number, self._reply = number, parts
-        self.outbox.append(parts)
-
-    def leave(self, reason: str) -> None:
-        """Send a goodbye if there is a session."""
-        if self._session is not None:
-            self._send(Bye(session=self._session, reason=reason))
-        self._session = self._ask_at = None
-        self.phase = Phase.AWAY
+            self._send(failure)
 
     def _send(self, message: Any) -> None:
         self.outbox.append(self._writer.write(message))

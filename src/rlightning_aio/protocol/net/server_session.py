@@ -1,55 +1,185 @@
 """`ServerSessions`: the trainer's end of env_server, without I/O.
 
-Rule: every request ends in exactly one result or one typed error, whatever the network loses,
-repeats, delays or reorders. Messages come in, messages and results are queued, and time is an
-argument. This module reads messages and answers; the parts below do the rest: `admission` opens
-sessions, `session_monitor` watches them, `client_requests` sends requests, `client_registry` keeps
-the records. Deliberately left out: sockets, keys, and the group's own bookkeeping.
+Rule: a connection is a session. It begins with a hello and ends with the connection, a goodbye or
+the first message that breaks the rules, and nothing is sent twice. Every request ends in exactly
+one result or one typed error, and every loss of a client is reported once: by the request in flight
+or, if there is none, by the next step. Messages come in, messages and results are queued, and time
+is an argument. Deliberately left out: sockets, keys, and the group's own bookkeeping.
 """
 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Final
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from rlightning_aio.errors import BadAction, EnvBusy, UnknownEnv
 from rlightning_aio.outcomes import BLAMES
+from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.error_text import ErrorText
-from rlightning_aio.protocol.net.admission import Admission, Peer
-from rlightning_aio.protocol.net.client_registry import ClientRegistry
-from rlightning_aio.protocol.net.client_requests import ClientRequests
-from rlightning_aio.protocol.net.limited_log import LimitedLog
-from rlightning_aio.protocol.net.outbox import Outbox
-from rlightning_aio.protocol.net.server_records import MessageEffect, RemoteResult
-from rlightning_aio.protocol.net.session_monitor import SessionMonitor
+from rlightning_aio.protocol.net.announcements import Rejection, announced
+from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
+from rlightning_aio.protocol.net.payload import Packed
 from rlightning_aio.protocol.net.texts import in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
+    MAX_BYTES_IN_ALL,
     MAX_NESTING,
-    STALE_REQUEST,
     Bye,
     ClientHello,
     ClientResult,
-    Failure,
     FromClient,
-    Gone,
     Part,
-    Ping,
-    Pong,
     Reader,
+    Refusal,
+    Reset,
+    Step,
+    Untransferable,
+    Welcome,
     WireError,
+    Writer,
     nests_too_deep,
-    random_token,
+    portable,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from rlightning_aio.protocol.net.server_records import PendingRequest, Session
-    from rlightning_aio.types import EnvMeta
+    from rlightning_aio.protocol.net.announcements import Announcement, ClientKind
+    from rlightning_aio.types import ClientTraits, EnvMeta
 
-__all__ = ["ServerSessions"]
+__all__ = ["MessageEffect", "OutgoingMessage", "RemoteResult", "ServerSession", "ServerSessions"]
 
-_MAX_MALFORMED: Final = 3
-"""Malformed answers to one request after which a session ends."""
+_MAX_SESSIONS: Final = 512
+
+
+class MessageEffect(Enum):
+    """The effect of a message that the server received."""
+
+    IN_SESSION = "it belongs to a session, or opened one"
+    TURNED_AWAY = "it was understood and refused"
+    MALFORMED = "it was dropped"
+
+
+class OutgoingMessage(NamedTuple):
+    """A message and the route of the connection that it is for."""
+
+    route: bytes
+    parts: list[bytes]
+
+
+@dataclass(slots=True)
+class RemoteResult:
+    """The result of one request to a client.
+
+    Attributes:
+        client: name of the client.
+        number: number of the request as it was submitted; None for a first result, which
+            answers no request.
+        observation: read-only arrays in the shape of the observation space.
+        reward, terminated, truncated: numbers, arrays ``[num_envs]``, or dicts of either
+            by agent.
+        info, extra: as the env returned them; ``info["client_lost"]`` says why a client is lost.
+        busy_ns: duration of the env's call, by the client's clock.
+        sent_ns: time at which the env produced the result, in ns since the epoch by the
+            client's clock; 0 if the client sent none.
+        error: the env's exception; the other fields are then unset.
+        is_reset: the result begins an episode.
+        is_loss: the result only marks that the client was lost.
+    """
+
+    client: str
+    number: int | None
+    observation: Any = None
+    reward: Any = 0.0
+    terminated: Any = False
+    truncated: Any = False
+    info: dict[str, Any] = field(default_factory=dict[str, Any])
+    extra: dict[str, Any] = field(default_factory=dict[str, Any])
+    busy_ns: int = 0
+    sent_ns: int = 0
+    error: ErrorText | None = None
+    is_reset: bool = False
+    is_loss: bool = False
+
+
+class _Request(NamedTuple):
+    """A request in flight.
+
+    Attributes:
+        number: as the trainer submitted it.
+        operation: ``step`` or ``reset``.
+        timeout: seconds allowed; deadline: when they end (monotonic seconds).
+    """
+
+    number: int
+    operation: str
+    timeout: float | None
+    deadline: float | None
+
+
+class _Loss(NamedTuple):
+    """A marked result that the next step of a client returns, and its size."""
+
+    result: RemoteResult
+    num_bytes: int
+
+
+@dataclass(slots=True, eq=False)
+class ServerSession:
+    """One connection of a client that was let in.
+
+    Attributes:
+        name: of the client.
+        route: address of the connection.
+        announced: contents of its hello.
+        joined: the first result has arrived.
+        first: the first result, while an earlier session's loss is not reported.
+        request: in flight.
+        last_number: number of the last request on the wire; 0 is the reset that begins a session.
+        observation: the last one that was queued.
+    """
+
+    name: str
+    route: bytes
+    announced: Announcement
+    joined: bool = False
+    first: RemoteResult | None = None
+    request: _Request | None = None
+    last_number: int = 0
+    observation: Any = None
+
+    def result(self, message: ClientResult, frames: Sequence[Part]) -> RemoteResult:
+        """Return the contents of a result.
+
+        Raises:
+            WireError: they are not what the client announced.
+        """
+        if nests_too_deep(message.info) or nests_too_deep(message.extra):
+            raise WireError(f"an info is nested more than {MAX_NESTING} deep")
+        header = (message.reward, message.terminated, message.truncated)
+        request = self.request
+        return RemoteResult(
+            self.name,
+            None if request is None else request.number,
+            *self.announced.results.unpack(frames, message.texts, header),
+            message.info,
+            message.extra,
+            message.busy_ns,
+            message.sent_ns,
+            is_reset=request is None or request.operation == "reset",
+        )
+
+    def marked(self, cause: str) -> RemoteResult:
+        """Return the result of the request in flight, or of the next one, of a lost client."""
+        return RemoteResult(
+            self.name,
+            None if self.request is None else self.request.number,
+            *self.announced.results.cut_short(self.observation),
+            info={"client_lost": f"client {self.name!r}: {cause}"},
+            is_loss=True,
+        )
 
 
 class ServerSessions:
@@ -57,15 +187,13 @@ class ServerSessions:
 
     Args:
         server_id: env_id of the server; its clients' envs are ``<server_id>/<name>``.
-        heartbeat: seconds within which a dead client is found.
         step_timeout, reset_timeout: seconds after which a client that has not answered counts as
             lost; None for never.
         objection: returns the trainer's reason to refuse an env, or None.
-        new_token: makes session tokens.
 
     Attributes:
+        clients: the env of each client that has joined (its first result has come), by name.
         outbox: messages that wait to be sent, oldest first; the sender removes them.
-        requests: sends steps and resets.
         num_malformed: messages that were dropped as malformed.
     """
 
@@ -73,190 +201,265 @@ class ServerSessions:
         self,
         server_id: str,
         *,
-        heartbeat: float,
         step_timeout: float | None = None,
         reset_timeout: float | None = None,
         objection: Callable[[EnvMeta], str | None] = lambda _: None,
-        new_token: Callable[[], int] = random_token,
     ) -> None:
-        self.outbox = Outbox()
+        self.clients: dict[str, EnvMeta] = {}
+        self.outbox: deque[OutgoingMessage] = deque()
         self.num_malformed = 0
+        self._server_id = server_id
+        self._timeouts = {"step": step_timeout, "reset": reset_timeout}
+        self._objection = objection
         self._reader: Reader[FromClient] = Reader(FromClient)
+        self._writer = Writer()
         self._log = LimitedLog(server_id)
-        registry = self._registry = ClientRegistry(server_id, self.outbox)
-        timeouts = (step_timeout, reset_timeout)
-        monitor = self._monitor = SessionMonitor(registry, self.outbox, heartbeat, timeouts)
-        self.requests = ClientRequests(server_id, registry, self.outbox, *timeouts)
-        self._admission = Admission(
-            server_id, registry, monitor, self.outbox, self._log,
-            objection=objection, new_token=new_token,
-        )  # fmt: skip
-
-    @property
-    def clients(self) -> Mapping[str, EnvMeta]:
-        """The env of each client that has joined (its first result has come), by client name."""
-        return self._registry.metas
+        self._dropped_extras: set[str] = set()
+        self._kind: ClientKind | None = None
+        self._by_route: dict[bytes, ServerSession] = {}
+        self._by_name: dict[str, ServerSession] = {}
+        self._losses: dict[str, _Loss] = {}
+        self._results: list[RemoteResult] = []
+        self._check_at: float | None = None
 
     @property
     def has_results(self) -> bool:
         """True if `take` would return any result."""
-        return bool(self._registry.results)
+        return bool(self._results)
 
     def take(self) -> list[RemoteResult]:
         """Return all queued results, oldest first; each is returned once."""
-        results, self._registry.results = self._registry.results, []
+        results, self._results = self._results, []
         return results
 
     def routes(self) -> set[bytes]:
-        """Return the routes that clients used last, one for each session."""
-        return {session.route for session in self._registry.sessions.values()}
+        """Return the routes of all sessions."""
+        return {*self._by_route}
 
-    def on_unreachable(self, route: bytes, now: float) -> None:
-        """Record that a message to `route` could not be sent: its connection is gone."""
-        self._monitor.on_unreachable(route, now)
+    # -- requests -------------------------------------------------------------------
 
-    def deadline(self) -> float | None:
-        """Return the time at which `tick` is due (monotonic seconds); None if never."""
-        return self._monitor.deadline()
+    def traits(self, client: str) -> ClientTraits:
+        """Return how a client that is present treats requests."""
+        if (session := self._by_name.get(client)) is None:
+            raise UnknownEnv(f"no client named {client!r} is connected to {self._server_id}")
+        return session.announced.traits
 
-    def tick(self, now: float) -> None:
-        """Ping silent clients and dismiss dead ones. Call it after reading all messages."""
-        self._monitor.tick(now)
+    def check_step(self, client: str, action: Any, extras: Mapping[str, Any]) -> None:
+        """Raise `BadAction` if `client` is present and the step cannot be sent to it."""
+        if (session := self._by_name.get(client)) is not None:
+            self._step_parts(session, action, extras)
 
-    def dismiss(self, client: str, cause: str) -> None:
-        """Send a client away, with the reason, whose first result the trainer did not accept."""
-        session = self._registry.session_named(client)
-        if session is not None:
-            self._registry.dismiss(session, cause)
-            # No request will ask for it.
-            session.record.unreported = None
+    def check_reset(
+        self, client: str, seed: int | list[int] | None, options: dict[str, Any] | None
+    ) -> None:
+        """Raise `ValueError` if `client` is present and the reset cannot be sent to it."""
+        if (session := self._by_name.get(client)) is not None:
+            self._reset_parts(session, seed, options)
 
-    def close(self, reason: str) -> None:
-        """End all sessions and send every client the reason. No loss is reported."""
-        self._registry.clear(reason)
-        self._monitor.stop()
+    def step(
+        self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
+    ) -> bool:
+        """Request a step.
+
+        Args:
+            client: name of a client.
+            number: returned with the result.
+            action: fits the client's action space, unless the client transforms actions.
+            extras: columns that the policy attached; sent if the client reads them.
+            now: monotonic seconds.
+
+        Returns:
+            True if a result with `number` will come. False if the client is absent and the
+            trainer knows that; its next first result comes when it is back.
+
+        Raises:
+            EnvBusy: the client has not answered its last request.
+            BadAction: the action does not fit, or the response cannot be sent.
+        """
+        session = self._by_name.get(client)
+        if (loss := self._losses.pop(client, None)) is not None:
+            loss.result.number = number
+            self._results.append(loss.result)
+            if session is not None and session.first is not None:
+                first, session.first = session.first, None
+                self._add(session, first)
+            return True
+        if session is None or not session.joined:
+            return False
+        self._send(session, "step", number, self._step_parts(session, action, extras), now)
+        return True
+
+    def reset(
+        self,
+        client: str,
+        number: int,
+        seed: int | list[int] | None,
+        options: dict[str, Any] | None,
+        now: float,
+    ) -> bool:
+        """Request a reset, after which no earlier loss is reported.
+
+        Returns and raises as `step`, and raises `ValueError` for options that cannot be sent.
+        """
+        session = self._by_name.get(client)
+        if session is None or not session.joined:
+            self._losses.pop(client, None)
+            return False
+        parts = self._reset_parts(session, seed, options)
+        self._losses.pop(client, None)
+        if session.first is not None:
+            session.observation, session.first = session.first.observation, None
+        self._send(session, "reset", number, parts, now)
+        return True
+
+    def _step_parts(
+        self, session: ServerSession, action: Any, extras: Mapping[str, Any]
+    ) -> list[bytes]:
+        step = Step(number=session.last_number + 1)
+        packed = Packed([], step.texts)
+        traits = session.announced.traits
+        try:
+            if traits.free_actions:
+                step.action = action
+            else:
+                session.announced.actions.pack(action, packed)
+            if extras and traits.reads_extras:
+                step.extras = self._portable_extras(extras)
+            return self._writer.write(step, packed.frames)
+        except (Misfit, Untransferable) as error:
+            raise BadAction(
+                f"response for {session.announced.meta.env_id}: {error}; nothing was sent"
+            ) from None
+
+    def _reset_parts(
+        self, session: ServerSession, seed: int | list[int] | None, options: dict[str, Any] | None
+    ) -> list[bytes]:
+        try:
+            return self._writer.write(
+                Reset(number=session.last_number + 1, seed=seed, options=options)
+            )
+        except Untransferable as error:
+            raise ValueError(
+                f"reset of {session.announced.meta.env_id}: seed or options can't be sent: {error}"
+            ) from None
+
+    def _portable_extras(self, extras: Mapping[str, Any]) -> dict[str, Any]:
+        lost: list[str] = []
+        kept = portable(extras, lost)
+        if new := sorted({*lost} - self._dropped_extras):
+            self._dropped_extras.update(new)
+            LOG.warning(
+                "%s: what the policy attached as %s can't be sent to a client and is dropped",
+                self._server_id, ", ".join(new),
+            )  # fmt: skip
+        return kept
+
+    def _send(
+        self, session: ServerSession, operation: str, number: int, parts: list[bytes], now: float
+    ) -> None:
+        if session.request is not None:
+            raise EnvBusy(
+                f"{session.announced.meta.env_id} has not answered its last "
+                f"{session.request.operation}; collect the result first"
+            )
+        session.last_number += 1
+        deadline = None
+        if (timeout := self._timeouts[operation]) is not None:
+            deadline = now + timeout
+            if self._check_at is None or deadline < self._check_at:
+                self._check_at = deadline
+        session.request = _Request(number, operation, timeout, deadline)
+        self.outbox.append(OutgoingMessage(session.route, parts))
 
     # -- messages -------------------------------------------------------------------
 
-    def receive(
-        self, route: bytes, user: str | None, parts: Sequence[Part], now: float
-    ) -> MessageEffect:
+    def receive(self, route: bytes, parts: Sequence[Part], now: float) -> MessageEffect:
         """Read one message and answer it. No content makes it raise.
 
         Args:
-            route: address for answers.
-            user: name of the key that the connection has proved; None without keys.
+            route: of the connection, for answers.
             parts: header and frames.
             now: monotonic seconds.
         """
+        session = self._by_route.get(route)
         try:
             message, frames = self._reader.read(parts)
+            if session is not None:
+                self._handle(session, message, frames)
+                return MessageEffect.IN_SESSION
             if isinstance(message, ClientHello):
-                return self._admission.on_hello(message, len(parts[0]), Peer(route, user), now)
-            session = self._session_of(message, route, user, now)
+                return self._on_hello(message, len(parts[0]), route, now)
         except WireError as error:
-            self._on_malformed(str(error), self._registry.session_awaited_over(route, user), now)
+            self.num_malformed += 1
+            text = in_one_line(str(error))
+            line = f"dropped a message ({self.num_malformed} so far): {text}"
+            self._log.warn("malformed", line, now)
+            if session is not None:
+                self._dismiss(session, f"a message of it is malformed: {text}")
             return MessageEffect.MALFORMED
-        if session is None:
+        # A client may have sent other messages before it read that its session is over.
+        return MessageEffect.TURNED_AWAY
+
+    def _on_hello(self, hello: ClientHello, size: int, route: bytes, now: float) -> MessageEffect:
+        """Answer a hello whose header has `size` bytes."""
+        try:
+            self._let_in(hello, size, route)
+        except Rejection as error:
+            text = in_one_line(str(error))
+            line = in_one_line(f"refused the client {hello.name!r}: {text}")
+            self._log.warn("refused", line, now)
+            self._post(route, Refusal(text=text, retry=error.retry))
             return MessageEffect.TURNED_AWAY
-        self._handle(session, message, frames, now)
         return MessageEffect.IN_SESSION
 
-    def _session_of(
-        self,
-        message: ClientResult | Failure | Ping | Pong | Bye,
-        route: bytes,
-        user: str | None,
-        now: float,
-    ) -> Session | None:
-        """Return the session of a message and note its sign of life; None without a session.
+    def _let_in(self, hello: ClientHello, size: int, route: bytes) -> None:
+        if hello.name in self._by_name:
+            raise Rejection(f"a client named {hello.name!r} is here already", retry=True)
+        if len(self._by_name) >= _MAX_SESSIONS:
+            raise Rejection(f"{len(self._by_name)} clients are here already", retry=True)
+        found = announced(hello, size, self._server_id, self._kind, self._objection)
+        self._make_room(found.num_bytes)
+        self._by_route[route] = self._by_name[hello.name] = ServerSession(hello.name, route, found)
+        self._post(route, Welcome(env_id=found.meta.env_id))
+
+    def _make_room(self, num_bytes: int) -> None:
+        """Forget losses, the oldest first, until there is room for another client."""
+        reserved = sum([one.announced.num_bytes for one in self._by_name.values()])
+        kept = sum([loss.num_bytes for loss in self._losses.values()])
+        while self._losses and (
+            reserved + kept + num_bytes > MAX_BYTES_IN_ALL or len(self._losses) > _MAX_SESSIONS
+        ):
+            kept -= self._losses.pop(next(iter(self._losses))).num_bytes
+        if reserved + num_bytes > MAX_BYTES_IN_ALL:
+            raise Rejection(
+                f"a result and an action take {num_bytes} bytes, and the {len(self._by_name)} "
+                f"clients that are here have reserved {reserved} of {MAX_BYTES_IN_ALL}",
+                retry=True,
+            )
+
+    def _handle(self, session: ServerSession, message: FromClient, frames: Sequence[Part]) -> None:
+        """Read a message of a session.
 
         Raises:
-            WireError: the session belongs to another key.
+            WireError: it breaks the rules.
         """
-        session = self._registry.sessions.get(message.session)
-        if session is None:
-            if not isinstance(message, Bye):
-                self.outbox.post(route, Gone(session=message.session, text="no such session"))
-            return None
-        if session.user != user:
-            raise WireError(f"{user!r} used the session of {session.user!r}")
-        session.route = route
-        session.received_at = now
-        session.unanswered_since = session.unreachable_since = None
-        return session
-
-    def _handle(
-        self,
-        session: Session,
-        message: ClientResult | Failure | Ping | Pong | Bye,
-        frames: Sequence[Part],
-        now: float,
-    ) -> None:
-        if isinstance(message, ClientResult):
-            self._on_result(session, message, frames, now)
-        elif isinstance(message, Failure):
-            self._on_failure(session, message)
-        elif isinstance(message, Ping):
-            self.outbox.post(session.route, Pong(session=session.token, number=message.number))
-            # A client pings after its connection broke: messages on the way may be lost.
-            self._monitor.repeat(session)
-        elif isinstance(message, Pong):
-            self._monitor.on_pong(session, message.number)
-        else:
+        if isinstance(message, Bye):
             cause = f"it left: {in_one_line(message.reason) or 'no reason given'}"
-            self._registry.lose(session, cause, logging.INFO)
-
-    def _on_malformed(self, error: str, session: Session | None, now: float) -> None:
-        """Count a malformed message, and end the session if it was one too many in answer."""
-        self.num_malformed += 1
-        line = f"dropped a message ({self.num_malformed} so far): {error}"
-        self._log.warn("malformed", in_one_line(line), now)
-        if session is not None:
-            session.num_malformed += 1
-            if session.num_malformed >= _MAX_MALFORMED:
-                cause = f"its messages don't fit what it announced: {in_one_line(error)}"
-                self._registry.dismiss(session, cause)
-
-    # -- replies --------------------------------------------------------------------
-
-    def _on_result(
-        self, session: Session, message: ClientResult, frames: Sequence[Part], now: float
-    ) -> None:
-        request = self._answered_request(session, message.number)
-        if request is None and not _is_first(session, message.number):
-            return  # No request waits for it any longer.
-        try:
-            if nests_too_deep(message.info) or nests_too_deep(message.extra):
-                raise WireError(f"an info is nested more than {MAX_NESTING} deep")
-            header = (message.reward, message.terminated, message.truncated)
-            outcome = session.announced.results.unpack(frames, message.texts, header)
-        except WireError as error:
-            self._on_malformed(str(error), session, now)
+            self._lose(session, cause, logging.INFO)
             return
-        result = RemoteResult(
-            session.record.name,
-            None if request is None else request.number,
-            *outcome,
-            message.info,
-            message.extra,
-            message.busy_ns,
-            message.sent_ns,
-            is_reset=request is None or request.operation == "reset",
-        )
-        if request is None:
-            self._registry.join(session, result)
-        else:
-            session.record.request = None
-            self._registry.add_result(session, result)
-
-    def _answered_request(self, session: Session, wire_number: int) -> PendingRequest | None:
-        """Return the pending request that a reply answers; None for any other reply."""
+        if isinstance(message, ClientHello):
+            raise WireError("a second hello")
         request = session.request
-        return request if request is not None and request.wire_number == wire_number else None
-
-    def _on_failure(self, session: Session, message: Failure) -> None:
-        request = self._answered_request(session, message.number)
+        if message.number != session.last_number or (request is None and session.joined):
+            raise WireError(f"an answer to request {message.number}, which is not in flight")
+        if isinstance(message, ClientResult):
+            result = session.result(message, frames)
+            if request is None:
+                self._join(session, result)
+            else:
+                session.request = None
+                self._add(session, result)
+            return
         error = ErrorText(
             in_one_line(message.exception_type),
             in_one_line(message.text),
@@ -264,19 +467,93 @@ class ServerSessions:
             message.blame if message.blame in BLAMES else "",
         )
         if request is None:
-            if _is_first(session, message.number):
-                self._registry.lose(session, f"its first reset raised {error.summary}")
+            self._dismiss(session, f"its first reset raised {error.summary}")
             return
-        if message.exception_type == STALE_REQUEST:
-            # The server never sent a newer request, so the two ends disagree on numbers.
-            self._registry.dismiss(session, f"it lost count: {error.text}")
+        session.request = None
+        self._results.append(RemoteResult(session.name, request.number, error=error))
+
+    def _join(self, session: ServerSession, result: RemoteResult) -> None:
+        kind = session.announced.kind
+        if self._kind is not None and kind != self._kind:
+            # A client of another kind joined while this one was resetting.
+            self._dismiss(session, "its spaces differ from those of the other clients")
             return
-        session.record.request = None
-        self._registry.results.append(
-            RemoteResult(session.record.name, request.number, error=error)
-        )
+        self._kind = kind
+        session.joined = True
+        self.clients[session.name] = session.announced.meta
+        LOG.info("%s: the client %r has joined", self._server_id, session.name)
+        if session.name in self._losses:
+            session.first = result
+        else:
+            self._add(session, result)
 
+    def _add(self, session: ServerSession, result: RemoteResult) -> None:
+        session.observation = result.observation
+        self._results.append(result)
 
-def _is_first(session: Session, wire_number: int) -> bool:
-    """Return True if a reply is the outcome of the reset that opens the session."""
-    return not session.joined and wire_number == 0
+    def _post(self, route: bytes, message: Welcome | Refusal | Bye) -> None:
+        self.outbox.append(OutgoingMessage(route, self._writer.write(message)))
+
+    # -- ends of sessions -----------------------------------------------------------
+
+    def disconnected(self, route: bytes, cause: str = "its connection broke") -> None:
+        """Record that a connection is gone, after all of its messages have been received."""
+        if (session := self._by_route.get(route)) is not None:
+            self._lose(session, cause)
+
+    def dismiss(self, client: str, cause: str) -> None:
+        """Send a client away, with the reason. No request reports that."""
+        if (session := self._by_name.get(client)) is not None:
+            self._dismiss(session, cause)
+            self._losses.pop(client, None)
+
+    def close(self, reason: str) -> None:
+        """End all sessions and send every client the reason. No loss is reported."""
+        for route in self._by_route:
+            self._post(route, Bye(reason=reason))
+        for table in (self._by_route, self._by_name, self._losses, self.clients, self._results):
+            table.clear()
+        self._check_at = None
+
+    def deadline(self) -> float | None:
+        """Return the time at which `tick` is due (monotonic seconds); None if never."""
+        return self._check_at
+
+    def tick(self, now: float) -> None:
+        """Dismiss clients whose time is up. Call it after reading all messages."""
+        if self._check_at is None or now < self._check_at:
+            return
+        waiting = [one for one in self._by_name.values() if one.request and one.request.deadline]
+        for session in waiting:
+            request = session.request
+            if request and request.deadline and now >= request.deadline:
+                cause = f"no result of a {request.operation} within {request.timeout} s"
+                self._dismiss(session, cause)
+        left = [one.request.deadline for one in waiting if one.request and one.request.deadline]
+        self._check_at = min(left, default=None)
+
+    def _dismiss(self, session: ServerSession, cause: str) -> None:
+        """End a session and send its client the reason."""
+        self._post(session.route, Bye(reason=cause))
+        self._lose(session, cause)
+
+    def _lose(self, session: ServerSession, cause: str, level: int = logging.WARNING) -> None:
+        """End a session. The request in flight reports `cause`, or the next one does."""
+        # A peer that never joins can be lost as often as it likes.
+        level = level if session.joined else logging.INFO
+        LOG.log(level, "%s: lost the client %r: %s", self._server_id, session.name, cause)
+        del self._by_route[session.route], self._by_name[session.name]
+        self.clients.pop(session.name, None)
+        if session.request is not None:
+            self._results.append(session.marked(cause))
+            session.request = None
+        elif session.joined and session.first is None:
+            num_results = len(self._results)
+            self._results = [
+                r for r in self._results if r.client != session.name or r.number is not None
+            ]
+            # Otherwise its first result was never taken.
+            if len(self._results) == num_results:
+                self._losses[session.name] = _Loss(
+                    session.marked(cause), session.announced.results.num_bytes
+                )

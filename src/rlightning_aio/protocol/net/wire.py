@@ -3,12 +3,11 @@
 Rule: a message is one msgpack header and any number of raw array frames; what arrives
 is checked for size, type and shape before it is used, and any fault raises `WireError` and nothing
 else. docs/wire-format.md describes the format for people. Deliberately left out: I/O, pickle, and
-everything about earlier messages (see `server_session` and `client_session`).
+the order of messages (see `server_session` and `client_session`).
 """
 
 from __future__ import annotations
 
-import secrets
 from math import prod
 from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeAlias, TypeVar, cast
 
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DTYPES",
+    "HANDSHAKE_SECONDS",
     "MAX_BYTES_IN_ALL",
     "MAX_FRAME_BYTES",
     "MAX_HEADER_BYTES",
@@ -33,8 +33,6 @@ __all__ = [
     "MAX_NAME_LENGTH",
     "MAX_NESTING",
     "MAX_PARTS",
-    "PINGS_PER_HEARTBEAT",
-    "STALE_REQUEST",
     "VERSION",
     "ArrayForm",
     "Bye",
@@ -43,10 +41,7 @@ __all__ = [
     "Failure",
     "FromClient",
     "FromServer",
-    "Gone",
     "Part",
-    "Ping",
-    "Pong",
     "Reader",
     "Refusal",
     "Reset",
@@ -56,11 +51,11 @@ __all__ = [
     "WireError",
     "Writer",
     "nests_too_deep",
+    "ping_ms",
     "portable",
-    "random_token",
 ]
 
-VERSION: Final = 1
+VERSION: Final = 2
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_HELLO_BYTES: Final = 256 << 10
 """Size of a hello's header; reading one takes 50 ms at most."""
@@ -72,12 +67,8 @@ MAX_PARTS: Final = 1024
 MAX_NAME_LENGTH: Final = 128
 MAX_NESTING: Final = 32
 """Levels of maps and arrays in a value. Each level costs several nested calls."""
-PINGS_PER_HEARTBEAT: Final = 8
-"""Pings to a silent peer within the heartbeat limit. A broken connection is given up after the time
-of two pings.
-"""
-STALE_REQUEST: Final = "StaleRequest"
-"""Exception type of the answer to a request that is older than the last one."""
+HANDSHAKE_SECONDS: Final = 5.0
+"""Time for the handshake of a connection."""
 
 DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
     # From the name: a dtype that is made otherwise equals that of arrays, and is not identical.
@@ -105,17 +96,18 @@ class Untransferable(ValueError):
     """The format has no form for a value that should be sent."""
 
 
-def random_token() -> int:
-    """Return a random number that cannot be guessed."""
-    return secrets.randbits(63)
+def ping_ms(heartbeat: float) -> tuple[int, int]:
+    """Return how often ZMQ pings a peer that may be silent for `heartbeat` seconds, and how long
+    it waits for a sign of life then, in milliseconds.
+    """
+    return max(1, int(250 * heartbeat)), max(2, int(500 * heartbeat))
 
 
 class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
-    """Client: I own an env, let me in. Answered by `Welcome` or `Refusal` of the same nonce."""
+    """Client: I own an env, let me in. Answered by `Welcome` or `Refusal`."""
 
     version: Count
     name: Name
-    nonce: Count
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
     num_envs: Annotated[int, Meta(ge=1, le=1 << 20)] = 1
@@ -127,24 +119,17 @@ class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
     """Actions may not fit the action space: the client transforms them."""
     reads_extras: bool = False
     """The client reads columns that the policy attaches to the action."""
-    previous: Count = 0
-    """The session that this client held before, which ends now; 0 for none."""
 
 
 class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
     """Server: you are in. The client resets its env and sends result 0."""
 
-    nonce: Count
-    session: Count
     env_id: str
-    heartbeat: Annotated[float, Meta(gt=0, le=86400)]
 
 
 class Refusal(Struct, tag="refusal", tag_field="type", kw_only=True):
     """Server: you are not in. ``retry`` is true if the same hello may succeed later."""
 
-    nonce: Count
-    code: str
     text: str
     retry: bool
 
@@ -152,7 +137,6 @@ class Refusal(Struct, tag="refusal", tag_field="type", kw_only=True):
 class Step(Struct, tag="step", tag_field="type", kw_only=True, omit_defaults=True):
     """Server: step the env. The action is in frames, or in ``action`` where it is free."""
 
-    session: Count
     number: Count
     texts: list[str] = []
     action: Any = None
@@ -162,7 +146,6 @@ class Step(Struct, tag="step", tag_field="type", kw_only=True, omit_defaults=Tru
 class Reset(Struct, tag="reset", tag_field="type", kw_only=True, omit_defaults=True):
     """Server: reset the env."""
 
-    session: Count
     number: Count
     seed: int | list[int] | None = None
     options: dict[str, Any] | None = None
@@ -171,7 +154,6 @@ class Reset(Struct, tag="reset", tag_field="type", kw_only=True, omit_defaults=T
 class ClientResult(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults=True):
     """Client: the result of request ``number``. The observation is in frames."""
 
-    session: Count
     number: Count
     busy_ns: Count = 0
     """Duration of the env's call."""
@@ -188,7 +170,6 @@ class ClientResult(Struct, tag="result", tag_field="type", kw_only=True, omit_de
 class Failure(Struct, tag="error", tag_field="type", kw_only=True, omit_defaults=True):
     """Client: request ``number`` raised."""
 
-    session: Count
     number: Count
     exception_type: str
     text: str
@@ -197,36 +178,14 @@ class Failure(Struct, tag="error", tag_field="type", kw_only=True, omit_defaults
     """Whom the env names, see `Outcome`."""
 
 
-class Ping(Struct, tag="ping", tag_field="type", kw_only=True):
-    """Either side: are you there? See docs/wire-format.md for the meaning of ``number``."""
-
-    session: Count
-    number: Count = 0
-
-
-class Pong(Struct, tag="pong", tag_field="type", kw_only=True):
-    """Either side: I am; ``number`` is the ping's."""
-
-    session: Count
-    number: Count = 0
-
-
-class Gone(Struct, tag="gone", tag_field="type", kw_only=True):
-    """Server: that session is over; say hello again."""
-
-    session: Count
-    text: str = ""
-
-
 class Bye(Struct, tag="bye", tag_field="type", kw_only=True):
-    """Either side: I am leaving."""
+    """Either side: the session is over, for this reason."""
 
-    session: Count
     reason: str = ""
 
 
-FromClient: TypeAlias = ClientHello | ClientResult | Failure | Ping | Pong | Bye
-FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Ping | Pong | Gone | Bye
+FromClient: TypeAlias = ClientHello | ClientResult | Failure | Bye
+FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Bye
 Message = TypeVar("Message")
 
 _OPEN_FIELDS: Final[Mapping[type[Struct], tuple[str, ...]]] = {

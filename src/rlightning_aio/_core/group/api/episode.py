@@ -101,7 +101,7 @@ class EnvEpisode:
             self._has_given_up_call = False
             abort: Any = self._group.abort([self.env.env_id])
             aborting = asyncio.ensure_future(abort)
-            # However often this is cancelled, it goes on, and the env is idle in the end.
+            # However often this is cancelled, it continues, and the env is idle in the end.
             await asyncio.wait([aborting])
             # Read, so that asyncio doesn't log an error that nobody asks for.
             _ = aborting.cancelled() or aborting.exception()

@@ -276,7 +276,7 @@ class GroupInterface(Facade):
                 one. None stops filming; a film in progress becomes a partial one.
             env_ids: the envs to film; None: all local ones. Envs that share a worker wait while it
                 renders, so give those of an entry that is filmed for long a worker each
-                (``envs_per_process: 1``). A replaced worker goes on filming.
+                (``envs_per_process: 1``). A replaced worker continues filming.
             every: film episodes 0, every, 2 * every, … of each, counted from now.
             episodes: film only these.
             sub_env: index of the sub-environment to film.

@@ -126,7 +126,7 @@ class SyncDriver:
     def _run(self, procedure: Procedure[T]) -> T:
         call_time = self.call_time
         ended, before = call_time.waited
-        # A signal handler may call within a call, which goes on counting.
+        # A signal handler may call within a call, which continues counting.
         began = before or time.monotonic()
         call_time.waited = (ended, began)
         try:
@@ -181,7 +181,7 @@ class SyncDriver:
         """Begin a call, which raises an interrupt that the last one has not raised if it `hears`.
 
         Returns True if it is no call within another; True if it holds back Ctrl-C, as a program
-        that handles SIGINT in its own way goes on doing so; and True if it was allowed before.
+        that handles SIGINT in its own way continues doing so; and True if it was allowed before.
         """
         me = threading.get_ident()
         # No function call before the assignment, so no other thread can run in between.

@@ -1,6 +1,6 @@
 """`Newest`: which results are still the newest of their envs, for those who keep results.
 
-A `Collector` keeps the results that it has not answered. Until it goes on, its program may reset
+A `Collector` keeps the results that it has not answered. Until it continues, its program may reset
 or restore envs, or step them otherwise; then the kept results are old. Rule: everything is found
 out when somebody asks, so an ordinary step pays nothing. Only what resets return to the program is
 kept, once somebody is interested, because nobody can ask an env for it again.

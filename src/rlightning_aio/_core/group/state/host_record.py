@@ -146,7 +146,7 @@ class HostRecord:
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
-        lost_slots: of envs that are not rebuilt though their host goes on.
+        lost_slots: of envs that are not rebuilt though their host continues.
         last_loss: its last death.
         killable: the host, if it can be killed; aborting: if it can end single requests; measured:
             if its use of the cores is known; membership: if envs join and leave it.

@@ -10,12 +10,13 @@ these that came while the socket closes would end the process (an assertion of l
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import zmq
 from zmq.utils import z85
 
 from rlightning_aio._core.hosts.env_server.rate_limiter import CONNECTION_COST
+from rlightning_aio.protocol.net.wire import HANDSHAKE_SECONDS
 from rlightning_aio.remote.keys import AllowedKeys, read_server_keys
 from rlightning_aio.remote.zmq_messages import is_readable, next_message
 
@@ -25,10 +26,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.env_server.rate_limiter import RateLimiter
     from rlightning_aio.protocol.net.limited_log import LimitedLog
 
-__all__ = ["HANDSHAKE_SECONDS", "Authenticator", "Question", "QuestionQueue"]
-
-HANDSHAKE_SECONDS: Final = 5.0
-"""Time after which ZMQ gives up a connection without an answer."""
+__all__ = ["Authenticator", "Question", "QuestionQueue"]
 
 
 class Question(NamedTuple):

@@ -1,8 +1,7 @@
 """`ConnectionLimiter`: watches the connections of an env_server's socket and ends useless ones.
 
 Rule: ZMQ accepts every connection and reports it through its monitor. A peer that then takes room
-or time without becoming a client is cut off. A client has one connection, the one that it used
-last; any others that it holds are useless. While the trainer is away, ZMQ keeps accepting, but
+or time without becoming a client is cut off. While the trainer is away, ZMQ keeps accepting, but
 stops when about a thousand events wait to be read. So no flood takes more descriptors than `ROOM`,
 which is added to the process's limit. Deliberately left out: the meaning of messages, and keys.
 """
@@ -21,7 +20,7 @@ from typing import TYPE_CHECKING, Final, cast
 import zmq
 
 from rlightning_aio._core.hosts.env_server.rate_limiter import CONNECTION_COST, message_cost
-from rlightning_aio.protocol.net.server_records import MessageEffect
+from rlightning_aio.protocol.net.server_session import MessageEffect
 from rlightning_aio.remote.zmq_messages import is_readable, next_message
 
 if TYPE_CHECKING:
@@ -64,21 +63,14 @@ class PeerConnection:
     Attributes:
         route: address for messages to it.
         descriptor: of its socket.
-        user: name of the key that it has proved; None without keys.
-        is_client: it has sent a message of a session.
-        num_wasted: messages without effect since then.
+        is_unauthenticated: it has neither proved a key nor sent a message of a session.
+        num_wasted: messages without effect since the last one of a session.
     """
 
     route: bytes
     descriptor: int
-    user: str | None
-    is_client: bool = False
+    is_unauthenticated: bool
     num_wasted: int = 0
-
-    @property
-    def is_unauthenticated(self) -> bool:
-        """True if the peer has neither a key nor a session."""
-        return not self.is_client and self.user is None
 
 
 class ConnectionLimiter:
@@ -89,8 +81,8 @@ class ConnectionLimiter:
         router: the socket, which is not bound yet.
         limiter: for unauthenticated peers, in seconds.
         log: of the env_server.
-        has_keys: connections have users.
-        used_routes: returns the routes that clients use now.
+        has_keys: connections have proved a key.
+        used_routes: returns the routes of sessions.
 
     Attributes:
         num_cut: connections that were cut off.
@@ -119,6 +111,7 @@ class ConnectionLimiter:
         self._by_route: dict[bytes, PeerConnection] = {}
         self._open: dict[int, PeerConnection | None] = {}
         self._cut: dict[bytes, None] = {}
+        self._closed: list[bytes] = []
         name = f"inproc://connections-{id(self)}"
         router.monitor(name, _ACCEPTED | _DISCONNECTED | sum(_FAILED))
         self._events = context.socket(zmq.PAIR)
@@ -136,7 +129,7 @@ class ConnectionLimiter:
     @property
     def num_unauthenticated(self) -> int:
         """Connections that have sent nothing useful yet."""
-        return sum(one is None or not one.is_client for one in self._open.values())
+        return sum(one is None or one.is_unauthenticated for one in self._open.values())
 
     def update(self, now: float) -> bool:
         """Read events and cut excess connections. Return True if there was an event."""
@@ -145,9 +138,7 @@ class ConnectionLimiter:
             if event in _FAILED:  # The value is a reason instead of a descriptor.
                 self._log.warn("handshake", _FAILED_HINT, now)
                 continue
-            closed = self._open.pop(value, None)
-            if closed is not None:
-                self._by_route.pop(closed.route, None)
+            self._note_closed(self._open.pop(value, None))
             if event == _ACCEPTED:
                 self._open[value] = None
         excess = len(self._open) - self._max_connections
@@ -189,11 +180,14 @@ class ConnectionLimiter:
         if found is None and route not in self._cut:
             # The connection may be newer than the events that were read last.
             self.update(now)
-            user = str(frame.get("User-Id")) if self._has_keys else None
-            found = PeerConnection(route, frame.get(zmq.SRCFD), user)
-            # A closed connection may have had a descriptor that belongs to another one now.
-            if self._open.get(found.descriptor, found) is None:
-                self._by_route[route] = self._open[found.descriptor] = found
+            found = PeerConnection(route, frame.get(zmq.SRCFD), not self._has_keys)
+            if found.descriptor not in self._open:  # It is closed already.
+                return None
+            if self._open[found.descriptor] is not None:
+                # A message of a closed connection whose descriptor another one has now.
+                self._close(found.descriptor)
+                return None
+            self._by_route[route] = self._open[found.descriptor] = found
         return found
 
     def record(
@@ -203,7 +197,7 @@ class ConnectionLimiter:
         if effect is MessageEffect.IN_SESSION:
             if connection.is_unauthenticated:
                 self._limiter.refund(CONNECTION_COST)
-            connection.is_client, connection.num_wasted = True, 0
+            connection.is_unauthenticated, connection.num_wasted = False, 0
             return
         connection.num_wasted += 1
         self.num_wasted += 1
@@ -224,14 +218,32 @@ class ConnectionLimiter:
             self._close(connection.descriptor)
 
     def _close(self, descriptor: int) -> None:
-        closed = self._open.pop(descriptor)
-        if closed is not None:
-            self._by_route.pop(closed.route, None)
+        self._note_closed(self._open.pop(descriptor))
         self.num_cut += 1
         # ZMQ may have closed it, and another thread may have opened a file with its number.
         with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as ours:
             if ours.getsockname()[1] == self._port and ours.type == socket.SOCK_STREAM:
                 ours.shutdown(socket.SHUT_RDWR)
+
+    def cut_route(self, route: bytes) -> None:
+        """Close the connection of a client that does not read."""
+        if (connection := self._by_route.get(route)) is not None:
+            self.cut(connection)
+
+    def take_closed(self) -> list[bytes]:
+        """Return the routes that have been closed since the last call, by either side.
+
+        Call it when all messages have been read.
+        """
+        closed, self._closed = self._closed, []
+        for route in closed:
+            self._by_route.pop(route, None)
+        return closed
+
+    def _note_closed(self, connection: PeerConnection | None) -> None:
+        # Messages that it has sent may still wait to be read.
+        if connection is not None:
+            self._closed.append(connection.route)
 
     def close(self) -> None:
         """Stop watching. ZMQ must not be left waiting for a reader of its events."""

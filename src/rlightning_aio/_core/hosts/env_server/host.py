@@ -30,7 +30,6 @@ from rlightning_aio._core.hosts.messages import (
     Withdrawn,
 )
 from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_of_band
-from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation, number_of, op_of, slot_of
 from rlightning_aio.protocol.net.server_session import ServerSessions
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder
-    from rlightning_aio.protocol.net.server_records import RemoteResult
+    from rlightning_aio.protocol.net.server_session import RemoteResult
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["EnvServerHost"]
@@ -115,12 +114,10 @@ class EnvServerHost:
         self._settings = server_settings(config)
         self._sessions = ServerSessions(
             self.server_id,
-            heartbeat=self._settings.heartbeat,
             step_timeout=config.step_timeout,
             reset_timeout=config.reset_timeout,
             objection=wiring.objection,
         )
-        self._requests = self._sessions.requests
         self._listener = Listener(self.server_id, self._settings, self._sessions)
         self._post = wiring.completions.append
         self._watcher = wiring.watcher
@@ -173,10 +170,10 @@ class EnvServerHost:
 
     def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
         row = self._rows[index]
-        self._requests.check_step(row.name, row.action(action), extras)
+        self._sessions.check_step(row.name, row.action(action), extras)
 
     def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
-        self._requests.check_reset(self._rows[index].name, seed, options)
+        self._sessions.check_reset(self._rows[index].name, seed, options)
 
     def missing(self, waited: float) -> float | None:
         settings = self._settings
@@ -226,31 +223,26 @@ class EnvServerHost:
         try:
             self._submit(entries, arguments, now)
         finally:
-            self._listener.flush(now)
+            self._listener.flush()
 
     def _submit(
         self, entries: NDArray[np.int64], arguments: Sequence[Any] | None, now: float
     ) -> None:
         for position, entry in enumerate(cast("list[int]", entries.tolist())):
             given = None if arguments is None else arguments[position]
-            try:
-                will_answer = self._request(entry, given, now)
-            except UnknownEnv:
-                # The client was absent, and its record was removed for another one.
-                will_answer = False
-            if not will_answer:
+            if not self._request(entry, given, now):
                 self._post(Withdrawn(self.host_id, entry))
 
     def _request(self, entry: int, given: Any, now: float) -> bool:
         """Send one request; return False if its client is absent and the trainer knows that."""
-        index, number, requests = slot_of(entry) - self.first_slot, number_of(entry), self._requests
+        index, number = slot_of(entry) - self.first_slot, number_of(entry)
         row = self._rows[index]
         row.entry = entry
         if op_of(entry) == Operation.STEP:
             action, extras = given or STEP_IN_ROW
-            return requests.step(row.name, number, row.action(action), extras, now)
+            return self._sessions.step(row.name, number, row.action(action), extras, now)
         seed, options = given or (cast("Slab", self._slab).take_seed(index), None)
-        return requests.reset(row.name, number, seed, options, now)
+        return self._sessions.reset(row.name, number, seed, options, now)
 
     def abort(self, entries: NDArray[np.int64]) -> None:
         """See `base.Aborting`. The client is lost, and may come back with a new session."""
@@ -258,7 +250,7 @@ class EnvServerHost:
             row = self._rows[slot_of(entry) - self.first_slot]
             self._sessions.dismiss(row.name, "the trainer aborted its request")
         now = time.monotonic()
-        self._listener.flush(now)
+        self._listener.flush()
         self.tick(now)
 
     # -- replies ------------------------------------------------------------------
@@ -320,7 +312,7 @@ class EnvServerHost:
             self._sessions.dismiss(name, "the server has no room for another client")
             return
         slab = self._slab if known is None else None
-        traits = self._requests.traits(name)
+        traits = self._sessions.traits(name)
         write = partial(self._rows[index].write_first, result)
         self._post(Joined(self.host_id, index, meta, traits, slab, write))
 

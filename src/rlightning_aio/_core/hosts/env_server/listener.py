@@ -22,7 +22,7 @@ from rlightning_aio._core.hosts.env_server.rate_limiter import (
 )
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.net.limited_log import LimitedLog
-from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS, PINGS_PER_HEARTBEAT
+from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS, ping_ms
 from rlightning_aio.remote.zmq_messages import is_readable, next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
@@ -114,15 +114,15 @@ class Listener:
     def _listen(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         settings = self._settings
         router = self._router = context.socket(zmq.ROUTER)
-        ping_ms = 1000 * settings.heartbeat / PINGS_PER_HEARTBEAT
+        interval, patience = ping_ms(settings.heartbeat)
         # Messages to a closed connection must fail, not vanish.
         router.set(zmq.ROUTER_MANDATORY, 1)
         router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         router.set(zmq.SNDHWM, _MAX_UNSENT_PER_CLIENT)
         router.set(zmq.RCVHWM, _MAX_UNREAD_PER_CLIENT)
         router.set(zmq.LINGER, _LINGER_MS)
-        router.set(zmq.HEARTBEAT_IVL, max(1, int(ping_ms)))
-        router.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2 * ping_ms)))
+        router.set(zmq.HEARTBEAT_IVL, interval)
+        router.set(zmq.HEARTBEAT_TIMEOUT, patience)
         self._authenticator.open(context, router)
         host = "127.0.0.1" if settings.host == "localhost" else settings.host
         if ":" in host:
@@ -154,7 +154,7 @@ class Listener:
         context, self._context = self._context, None
         if self._address is not None:
             self._sessions.close("the trainer closed its group")
-            self._send(0.0)
+            self._send()
             self.connections.close()
         self._descriptors.close()
         self._wake_up.close()
@@ -198,10 +198,13 @@ class Listener:
             if not has_message:
                 break
             has_message = self._receive(now) and is_readable(self._router)
-        else:
+        if has_message:
             self._call_back()
+        else:
+            # What these connections sent has been read.
+            self._end_closed()
         self._sessions.tick(now)
-        self._send(now)
+        self._send()
 
     def _update_connections(self, now: float) -> None:
         """Process connections that came or went, unless many did so a moment ago."""
@@ -233,7 +236,7 @@ class Listener:
             first = self._router.recv(zmq.NOBLOCK, copy=False)
             parts = receive_parts(self._router, first, MAX_PARTS + 1)
             self._is_skipping = self._router.get(zmq.RCVMORE) != 0
-        effect = self._sessions.receive(connection.route, connection.user, parts, now)
+        effect = self._sessions.receive(connection.route, parts, now)
         self.connections.record(connection, effect, sum([len(part) for part in parts]), now)
         if self._is_skipping:
             self.connections.cut(connection)
@@ -248,13 +251,18 @@ class Listener:
         self._is_skipping = frame.more
         self._limiter.spend(num_dropped * DROPPED_FRAME_COST, now)
 
-    def flush(self, now: float) -> None:
+    def flush(self) -> None:
         """Send new requests, and make sure that results wake the driver."""
-        self._send(now)
+        self._send()
         if self._sessions.has_results:
             self._call_back()
 
-    def _send(self, now: float) -> None:
+    def _end_closed(self) -> None:
+        """End the sessions of connections that are gone."""
+        for route in self.connections.take_closed():
+            self._sessions.disconnected(route)
+
+    def _send(self) -> None:
         outbox = self._sessions.outbox
         if not outbox:
             return
@@ -262,13 +270,12 @@ class Listener:
             route, parts = outbox.popleft()
             try:
                 send_parts(self._router, [route, *parts])
-            except zmq.Again:
-                # The client reads nothing, or slowly; lost messages are repeated.
-                continue
             except zmq.ZMQError as error:
-                if error.errno != zmq.EHOSTUNREACH:
+                if error.errno == zmq.EAGAIN:  # The client reads nothing.
+                    self.connections.cut_route(route)
+                elif error.errno != zmq.EHOSTUNREACH:
                     raise
-                self._sessions.on_unreachable(route, now)
+                self._sessions.disconnected(route)
         # Sending reads ZMQ's signals, so the descriptor may not report waiting messages.
         if is_readable(self._router):
             self._call_back()
