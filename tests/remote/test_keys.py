@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.remote.keys import AllowedKeys, make_keys, read_client_keys, read_keys
+from rlightning_aio.remote.keys import AllowedKeys, make_keys, read_client_keys, read_public_key
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -57,22 +57,22 @@ def test_keys_made_at_once_are_of_one_server(tmp_path: Path) -> None:
 
     with ThreadPoolExecutor(len(names)) as pool:
         made = [read_client_keys(folder) for folder in pool.map(make, names)]
-    server = read_keys(tmp_path / "server" / "server.key_secret").public
+    server = read_public_key(tmp_path / "server" / "server.key_secret")
     assert {keys.server for keys in made} == {server}
 
 
 def test_each_change_of_a_file_counts_at_once(tmp_path: Path) -> None:
     """Deleted, added, replaced, and written over in place."""
     keys, directory, arm, leg = laid_out(tmp_path)
-    assert (keys.owner(arm), keys.owner(leg), keys.owner(b"")) == ("arm", "leg", None)
+    assert (keys.holds(arm), keys.holds(leg), keys.holds(b"")) == (True, True, False)
     (directory / "arm.key").unlink()
-    assert keys.owner(arm) is None
+    assert not keys.holds(arm)
     shutil.copy(tmp_path / "arm" / "client.key", directory / "hand.key")
-    assert keys.owner(arm) == "hand"
+    assert keys.holds(arm)
     (directory / "hand.key").write_text((directory / "leg.key").read_text())
-    assert keys.owner(arm) is None
+    assert not keys.holds(arm)
     (directory / "leg.key").replace(directory / "hand.key")
-    assert (keys.owner(arm), keys.owner(leg)) == (None, "hand")
+    assert (keys.holds(arm), keys.holds(leg)) == (False, True)
 
 
 def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_path: Path) -> None:
@@ -81,11 +81,11 @@ def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_pat
     path = directory / "arm.key"
     os.utime(path)
     stamp = path.stat()
-    assert keys.owner(arm) == "arm"
+    assert keys.holds(arm)
     (directory / "leg.key").unlink()
     path.write_text(path.read_text().replace(arm.decode(), leg.decode()))
     os.utime(path, ns=(stamp.st_mtime_ns, stamp.st_mtime_ns))
-    assert (keys.owner(arm), keys.owner(leg)) == (None, "arm")
+    assert (keys.holds(arm), keys.holds(leg)) == (False, True)
 
 
 def test_files_that_have_not_changed_are_not_read_again(
@@ -93,9 +93,9 @@ def test_files_that_have_not_changed_are_not_read_again(
 ) -> None:
     """A lookup only compares their stamps."""
     keys, _, arm, _ = laid_out(tmp_path)
-    assert keys.owner(arm) == "arm"
-    monkeypatch.setattr("rlightning_aio.remote.keys.read_keys", None)
-    assert keys.owner(arm) == "arm"
+    assert keys.holds(arm)
+    monkeypatch.setattr("rlightning_aio.remote.keys.read_public_key", None)
+    assert keys.holds(arm)
 
 
 def test_a_file_without_a_key_is_skipped_with_one_warning(
@@ -111,7 +111,7 @@ def test_a_file_without_a_key_is_skipped_with_one_warning(
     os.mkfifo(directory / "pipe.key")
     (directory / "nowhere.key").symlink_to(directory / "nothing")
     for _ in range(3):
-        assert keys.owner(arm) == "arm"
+        assert keys.holds(arm)
         (directory / "other").touch()
         (directory / "other").unlink()
     messages = [record.getMessage() for record in caplog.records]
@@ -127,9 +127,9 @@ def test_a_directory_that_cannot_be_read_admits_no_client(
     """One warning; a directory that comes back counts again."""
     keys, directory, arm, _ = laid_out(tmp_path)
     away = directory.rename(tmp_path / "away")
-    assert [keys.owner(arm), keys.owner(arm)] == [None, None]
+    assert [keys.holds(arm), keys.holds(arm)] == [False, False]
     assert len(caplog.records) == 1
     assert "no client is let in" in caplog.text
     away.rename(directory)
-    assert keys.owner(arm) == "arm"
-    assert read_keys(directory / "arm.key").public == arm
+    assert keys.holds(arm)
+    assert read_public_key(directory / "arm.key") == arm

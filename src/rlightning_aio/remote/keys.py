@@ -1,60 +1,53 @@
 """The CURVE keys of an env_server and its clients: making them and reading them.
 
-Rule: key files are ZeroMQ's certificates, so ZeroMQ's tools read them; a key has 40 characters of
-Z85. ``make_keys(directory, names)`` makes one directory for each machine, so setting up a client
-means copying one of them. ``server/`` has the server's secret key and, in ``clients/``, the public
-key of every client that may connect; ``<name>/`` has one client's secret key and the server's
-public key. Deleting a file in ``server/clients/``, or writing another key into it, shuts that
-client out.
+Rule: key files are ZeroMQ's certificates, which `zmq.auth` writes and reads.
+``make_keys(directory, names)`` makes one directory for each machine, so setting up a client means
+copying one of them. ``server/`` has the server's secret key and, in ``clients/``, the public key of
+every client that may connect; ``<name>/`` has one client's secret key and the server's public key.
+Deleting a file in ``server/clients/``, or writing another key into it, shuts that client out.
 """
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
 import logging
 import os
 import re
 import shutil
+import tempfile
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import zmq
+# The types of paths in pyzmq's signatures are incomplete.
+from zmq.auth import (
+    create_certificates,  # pyright: ignore[reportUnknownVariableType]
+    load_certificate,  # pyright: ignore[reportUnknownVariableType]
+)
+from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import write_file
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Sequence
 
 __all__ = [
     "AllowedKeys",
     "ClientKeys",
-    "KeyPair",
     "ServerKeys",
     "make_keys",
     "read_client_keys",
-    "read_keys",
+    "read_public_key",
     "read_server_keys",
 ]
 
 _PUBLIC_SUFFIX: Final = ".key"
-_SECRET_SUFFIX: Final = ".key_secret"  # noqa: S105  # The name of a file, not a secret.
 _SERVER: Final = "server"
 _CLIENT: Final = "client"
 _ALLOWED: Final = "clients"
-# Z85 spelt out, see https://rfc.zeromq.org/spec/32/
-_KEY: Final = r'"([0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40})"'
+_KEY_BYTES: Final = 32
 
 _log = logging.getLogger(__name__)
-
-
-class KeyPair(NamedTuple):
-    """A public key and, where the file has it, the secret one; Z85 text."""
-
-    public: bytes
-    secret: bytes | None = None
 
 
 class ServerKeys(NamedTuple):
@@ -96,7 +89,9 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
         if (top / name).exists():
             raise ConfigError(f"{top / name} exists; remove it to make new keys for {name!r}")
     try:
-        _write_keys(top, names)
+        _make_folder(top / _SERVER, _SERVER)
+        for name in names:
+            _make_client(top, name)
     except OSError as error:
         raise ConfigError(
             f"no keys can be written into {top}: {error.strerror}: {error.filename}; name a "
@@ -105,45 +100,41 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
     return [top / name for name in names]
 
 
-def _write_keys(top: Path, names: Sequence[str]) -> None:
-    allowed = top / _SERVER / _ALLOWED
-    allowed.mkdir(parents=True, exist_ok=True)
-    with _locked(allowed):
-        server = top / _SERVER / (_SERVER + _SECRET_SUFFIX)
-        if not server.exists():
-            _write_pair(top / _SERVER, _SERVER)
-        server_keys = KeyPair(read_keys(server).public)
-        for name in names:
-            (top / name).mkdir()
-            try:
-                keys = _write_pair(top / name, _CLIENT)
-                write_file(top / name / (_SERVER + _PUBLIC_SUFFIX), _render(server_keys))
-                # Last: from now on the client may come in.
-                write_file(allowed / (name + _PUBLIC_SUFFIX), _render(keys))
-            except BaseException:
-                shutil.rmtree(top / name)
-                raise
-
-
-@contextlib.contextmanager
-def _locked(directory: Path) -> Generator[None]:
-    """Have others who make keys here wait, so that the server gets one secret only."""
-    descriptor = os.open(directory, os.O_RDONLY)
+def _make_client(top: Path, name: str) -> None:
+    server, folder = top / _SERVER, top / name
+    _make_folder(folder, _CLIENT, (server / (_SERVER + _PUBLIC_SUFFIX)).read_bytes())
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(descriptor)
+        # Last: from now on the client may come in.
+        public = (folder / (_CLIENT + _PUBLIC_SUFFIX)).read_bytes()
+        write_file(server / _ALLOWED / (name + _PUBLIC_SUFFIX), public)
+    except BaseException:
+        shutil.rmtree(folder)
+        raise
 
 
-def _write_pair(directory: Path, name: str) -> KeyPair:
-    """Make keys and write both files; the public half is returned."""
-    public, secret = zmq.curve_keypair()
-    write_file(directory / (name + _PUBLIC_SUFFIX), _render(KeyPair(public)))
-    # After the other one: where there is a secret, the pair is complete.
-    path = directory / (name + _SECRET_SUFFIX)
-    write_file(path, _render(KeyPair(public, secret)), mode=0o600)
-    return KeyPair(public)
+def _make_folder(folder: Path, name: str, server_key: bytes | None = None) -> None:
+    """Make a folder with new keys called `name` in one step, unless it exists.
+
+    A client's folder has the server's key, too, and a server's has a folder for those of clients.
+    """
+    if folder.exists():
+        return
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    # Others can't read this folder, so the secret was never readable.
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".keys-") as temporary:
+        made = Path(temporary) / name
+        made.mkdir()
+        _, secret = create_certificates(made, name)
+        Path(secret).chmod(0o600)
+        if server_key is None:
+            (made / _ALLOWED).mkdir()
+        else:
+            (made / (_SERVER + _PUBLIC_SUFFIX)).write_bytes(server_key)
+        try:
+            made.rename(folder)
+        except OSError:
+            if not folder.exists():  # Otherwise another call has made it meanwhile.
+                raise
 
 
 def read_client_keys(directory: str | os.PathLike[str]) -> ClientKeys:
@@ -152,10 +143,9 @@ def read_client_keys(directory: str | os.PathLike[str]) -> ClientKeys:
     Raises:
         ConfigError: a file is missing or holds no key; the message names it.
     """
-    public, secret = _read_secret_keys(Path(directory) / (_CLIENT + _SECRET_SUFFIX))
-    return ClientKeys(
-        public, secret, read_keys(Path(directory) / (_SERVER + _PUBLIC_SUFFIX)).public
-    )
+    folder = Path(directory)
+    public, secret = _read_pair(folder, _CLIENT)
+    return ClientKeys(public, secret, read_public_key(folder / (_SERVER + _PUBLIC_SUFFIX)))
 
 
 def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
@@ -164,37 +154,51 @@ def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
     Raises:
         ConfigError: a file is missing or holds no key; the message names it.
     """
-    _, secret = _read_secret_keys(Path(directory) / (_SERVER + _SECRET_SUFFIX))
+    _, secret = _read_pair(Path(directory), _SERVER)
     clients = Path(directory) / _ALLOWED
     if not clients.is_dir():
         raise ConfigError(f"{clients} is not a directory; the public keys of clients belong there")
     return ServerKeys(secret, clients)
 
 
-def _read_secret_keys(path: Path) -> tuple[bytes, bytes]:
-    keys = read_keys(path)
-    if keys.secret is None:
+def _read_pair(directory: Path, name: str) -> tuple[bytes, bytes]:
+    path = directory / f"{name}.key_secret"
+    public, secret = _read(path)
+    if secret is None:
         raise ConfigError(f"{path} has no line secret-key; `rlightning-aio keygen` makes keys")
-    return keys.public, keys.secret
+    return public, secret
 
 
-def read_keys(path: Path) -> KeyPair:
-    """Return the keys in one file.
+def read_public_key(path: Path) -> bytes:
+    """Return the public key in a file, as Z85 text.
 
     Raises:
         ConfigError: it can't be read, or holds no key; the message names it.
     """
+    return _read(path)[0]
+
+
+def _read(path: Path) -> tuple[bytes, bytes | None]:
     try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
+        public, secret = load_certificate(path)
+    except OSError as error:
         raise ConfigError(
             f"can't read the key {path}: {error}; `rlightning-aio keygen` makes keys"
         ) from None
-    public = re.search(rf"^\s*public-key\s*=\s*{_KEY}\s*$", text, re.MULTILINE)
-    secret = re.search(rf"^\s*secret-key\s*=\s*{_KEY}\s*$", text, re.MULTILINE)
-    if public is None:
-        raise ConfigError(f"{path} has no line public-key with a key of 40 characters")
-    return KeyPair(public[1].encode(), secret[1].encode() if secret else None)
+    except ValueError:
+        raise ConfigError(f"{path} has no line public-key with a key") from None
+    for key in (public, secret):
+        if key is not None and not _is_key(key):
+            raise ConfigError(f"{path} has a line that is no key of 40 characters")
+    return public, secret
+
+
+def _is_key(text: bytes) -> bool:
+    try:
+        return len(z85.decode(text)) == _KEY_BYTES
+    # What `z85.decode` raises depends on what is wrong.
+    except Exception:  # noqa: BLE001
+        return False
 
 
 class _Stamp(NamedTuple):
@@ -210,9 +214,9 @@ _TICK_NS: Final = 1_000_000_000
 
 
 class AllowedKeys:
-    """The owners of the keys that are now in a directory.
+    """The keys that are now in a directory.
 
-    `owner` compares the stamps of all files (a few microseconds for each), and reads files that
+    `holds` compares the stamps of all files (a few microseconds for each), and reads files that
     have changed. A file that holds no key is skipped with one warning.
 
     Args:
@@ -225,20 +229,20 @@ class AllowedKeys:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self._read: dict[str, tuple[_Stamp, bytes | None]] = {}
-        self._owners: dict[bytes, str] = {}
+        self._keys: set[bytes] = set()
         self._faulty: set[str] = set()
         self._is_unreadable = False
 
-    def owner(self, key: bytes) -> str | None:
-        """Return the name of the client with the public key `key` (Z85 text); None if unknown."""
+    def holds(self, key: bytes) -> bool:
+        """Return True if there is a file with the public key `key` (Z85 text)."""
         stamps = self._stamps()
         if stamps != {name: stamp for name, (stamp, _) in self._read.items()}:
             self._refresh(stamps)
-        return self._owners.get(key)
+        return key in self._keys
 
     def is_known(self, key: bytes) -> bool:
         """Return True if `key` was a client's when the files were read last."""
-        return key in self._owners
+        return key in self._keys
 
     def _stamps(self) -> dict[str, _Stamp]:
         stamps: dict[str, _Stamp] = {}
@@ -272,11 +276,7 @@ class AllowedKeys:
             read[name] = stamp if is_settled else _UNSETTLED, self._key_in(name)
         self._read = read
         self._faulty &= read.keys()
-        self._owners = {
-            key: name.removesuffix(_PUBLIC_SUFFIX)
-            for name, (_, key) in read.items()
-            if key is not None
-        }
+        self._keys = {key for _, key in read.values() if key is not None}
 
     def _key_in(self, name: str) -> bytes | None:
         """Return the key in the file `name`; None, with a warning, if there is none."""
@@ -286,7 +286,7 @@ class AllowedKeys:
                 raise ConfigError(f"{str(path)!a} has a name that can't name a client")
             if not path.is_file():
                 raise ConfigError(f"{path} is not a file")
-            key = read_keys(path).public
+            key = read_public_key(path)
         except ConfigError as error:
             if name not in self._faulty:
                 self._faulty.add(name)
@@ -294,11 +294,3 @@ class AllowedKeys:
             return None
         self._faulty.discard(name)
         return key
-
-
-def _render(keys: KeyPair) -> bytes:
-    lines = ["# A key of rlightning-aio.", "curve", f'    public-key = "{keys.public.decode()}"']
-    if keys.secret is not None:
-        lines[0] = "# A key of rlightning-aio. SECRET: leave no copy where others can read it."
-        lines.append(f'    secret-key = "{keys.secret.decode()}"')
-    return "\n".join([*lines, ""]).encode()

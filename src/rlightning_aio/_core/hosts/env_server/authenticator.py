@@ -3,8 +3,10 @@
 Rule: ZMQ asks about every connection in the middle of its handshake, and reads nothing from it
 before the answer. A known key is admitted at once. All other peers wait until the rate limiter has
 budget for one more. Their addresses take turns, so a crowd at one address does not keep out peers
-at another. With an authenticator, ZMQ also refuses protocols before ZMTP 3. A connection in one of
-these that came while the socket closes would end the process (an assertion of libzmq 4.3).
+at another. (That is why `zmq.auth` only makes and reads the certificates: its authenticator answers
+one question after the other.) With an authenticator, ZMQ also refuses protocols before ZMTP 3. A
+connection in one of these that came while the socket closes would end the process (an assertion of
+libzmq 4.3).
 """
 
 from __future__ import annotations
@@ -149,17 +151,15 @@ class Authenticator:
         return self._limiter.time_of(CONNECTION_COST, now) if self._waiting else None
 
     def _answer(self, question: Question, now: float) -> None:
-        verdict, user = b"200", b""
-        if self._allowed is not None:
-            name = self._allowed.owner(question.key)
-            verdict, user = (b"400", b"") if name is None else (b"200", name.encode())
+        is_client = self._allowed is not None and self._allowed.holds(question.key)
+        verdict = b"200" if self._allowed is None or is_client else b"400"
         try:
-            self._socket.send_multipart([*question.envelope, verdict, b"", user, b""])
+            self._socket.send_multipart([*question.envelope, verdict, b"", b"", b""])
         except zmq.ZMQError as error:
             if error.errno != zmq.EHOSTUNREACH:
                 raise
             return
-        if not user:
+        if not is_client:
             self._limiter.spend(CONNECTION_COST, now)
         if verdict != b"200":
             assert self._allowed is not None
