@@ -10,10 +10,11 @@ Then the first 6 of 8 attempts whose latencies are log-normal, against waiting f
 long it takes until the env of a surplus attempt plays the next; and how long after its cancellation
 in a step that never ends an env is free, and has begun another episode, at each place.
 
-Then 2,000 attempts in flight, whose steps wait for a second on average (log-normal): how late the
-event loop is, with the start of all of them, what a step costs the trainer's thread where results
-arrive one after another, and the garbage collector's pauses; as it is, and after
-`gc.collect(); gc.freeze()`, which leaves out what exists already. And what a step costs whose
+Then 2,000 attempts of ten steps in flight, whose steps wait for a second on average, or for a tenth
+of it (log-normal), on the event loop and in worker processes: how late the event loop is, with the
+start of all of them, what a step costs the trainer's thread, with its share of the starts and ends,
+and the garbage collector's pauses; as it is, and after `gc.collect(); gc.freeze()`, which leaves
+out what exists already. And what a step costs whose
 result comes all alone, while the other attempts wait; and the memory of an attempt.
 
     python benchmarks/attempts.py [--ray] [--json]
@@ -320,9 +321,12 @@ async def until_free_everywhere(*, ray: bool) -> dict[str, dict[str, float]]:
 
 
 class Waiting(Waits):
-    """An awaitable env, whose steps wait for a second on average, or as long as they are told."""
+    """An awaitable env, whose steps wait as long as they are told, or for `mean` s on average."""
 
     steps = 0
+
+    def __init__(self, mean: float = 1.0) -> None:
+        self.mean = mean
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         del options
@@ -330,7 +334,7 @@ class Waiting(Waits):
         return IDLE, {}
 
     async def step(self, action: Any) -> Any:
-        await asyncio.sleep((self.latency() / MEAN, 0, 3600)[action])
+        await asyncio.sleep((self.mean * self.latency() / MEAN, 0, 3600)[action])
         self.steps += 1
         return IDLE, 1.0, self.steps >= LONG and action == WAIT, False, {}
 
@@ -354,8 +358,10 @@ def collector_pauses() -> Generator[list[float]]:
     gc.callbacks.remove(note)
 
 
-async def many(number: int, seconds: float, *, freezes: bool) -> dict[str, float]:
-    """Keep a number of attempts in flight for some seconds."""
+async def many(
+    number: int, seconds: float, placement: str, mean: float, *, freezes: bool
+) -> dict[str, float]:
+    """Keep a number of attempts in flight for some seconds; `mean` is that of a step."""
     steps, lags = 0, list[float]()
 
     async def agent(episode: Any) -> None:
@@ -369,7 +375,9 @@ async def many(number: int, seconds: float, *, freezes: bool) -> dict[str, float
         for seed in itertools.takewhile(lambda _: time.monotonic() < until, itertools.count()):
             yield EpisodeSpec("", seed)
 
-    async with rl.build_env_group(Waiting, num_workers=number, placement="loop") as group:
+    async with rl.build_env_group(
+        Waiting, num_workers=number, placement=placement, env_kwargs={"mean": mean}
+    ) as group:
         gc.collect()
         if freezes:
             gc.freeze()
@@ -463,8 +471,11 @@ def main() -> None:
     freed = asyncio.run(until_free_everywhere(ray=args.ray))
     memory = rl.run(memory_of_attempts())  # Before others have used and freed as much.
     flights = {
-        "as it is": rl.run(many(args.in_flight, args.seconds, freezes=False)),
-        "frozen": rl.run(many(args.in_flight, args.seconds, freezes=True)),
+        f"{placement}, steps of {mean:g} s{', frozen' if freezes else ''}": rl.run(
+            many(args.in_flight, args.seconds, placement, mean, freezes=freezes)
+        )
+        for placement in ("loop", "process")
+        for mean, freezes in ((1.0, False), (1.0, True), (0.1, False))
     }
     more = {
         **rules,
