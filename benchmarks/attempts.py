@@ -67,6 +67,13 @@ FAULTS: Final = {
 """What goes wrong, and the outcome that is to say so."""
 GIVE_UP_SECONDS: Final = 20.0
 MEDIAN_SECONDS, IN_FLIGHT, LONG, CUT = 0.05, 2000, 10, 5
+FLIGHTS: Final = (
+    ("loop", 1.0, False),
+    ("loop", 1.0, True),
+    ("loop", 0.1, False),
+    ("process", 0.1, False),
+)
+"""Of attempts: the placement, seconds of a step, and whether `gc.freeze` is called before."""
 WAIT, AT_ONCE, FOREVER = range(3)
 """For how long a step waits."""
 
@@ -474,8 +481,7 @@ def main() -> None:
         f"{placement}, steps of {mean:g} s{', frozen' if freezes else ''}": rl.run(
             many(args.in_flight, args.seconds, placement, mean, freezes=freezes)
         )
-        for placement in ("loop", "process")
-        for mean, freezes in ((1.0, False), (1.0, True), (0.1, False))
+        for placement, mean, freezes in FLIGHTS
     }
     more = {
         **rules,
