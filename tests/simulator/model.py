@@ -773,9 +773,8 @@ class Model:
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
         acts = self._raising(env, request)
-        if NOT_SHOWN not in str(fault):
-            acts = [act for act in acts if act[0] != UNSHOWN]
-        raising = [act for act in acts if act[0] in (*RAISING, UNSHOWN)]
+        kinds = (*RAISING, UNSHOWN) if NOT_SHOWN in str(fault) else RAISING
+        raising = [act for act in acts if act[0] in kinds]
         is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
         if env.entry.on_error == "restart" and fault.exception_type != "KeyboardInterrupt":
             require(raising or is_rubbish, "an error of nobody", repr(fault), request)
