@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,6 +14,9 @@ from rlightning_aio.remote import RemoteEnvClient
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+ADD = "_add_socket"
+"""Of pyzmq's contexts: what notes a new socket. No other moment is between the two."""
 
 
 @pytest.mark.parametrize(("owner", "name"), [(zmq, "Poller"), (zmq.Socket, "connect")])
@@ -28,6 +33,22 @@ def test_an_interrupt_while_dialing_closes_what_is_open(
     env = CountingEnv()
     client = RemoteEnvClient(env, "127.0.0.1", 9)
     monkeypatch.setattr(owner, name, interrupted)
+    with pytest.raises(KeyboardInterrupt), client:
+        client.run()
+    assert env.closed
+
+
+def test_a_signal_while_a_socket_is_made_comes_after_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A context would wait for ever for a socket that it doesn't know yet."""
+    real: Callable[..., object] = getattr(zmq.Context, ADD)
+
+    def signalled(*args: object) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(*args)
+
+    env = CountingEnv()
+    client = RemoteEnvClient(env, "127.0.0.1", 9)
+    monkeypatch.setattr(zmq.Context, ADD, signalled)
     with pytest.raises(KeyboardInterrupt), client:
         client.run()
     assert env.closed

@@ -13,9 +13,11 @@ import contextlib
 import logging
 import os
 import re
+import signal
 import socket
 import time
 from math import ceil
+from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
@@ -52,6 +54,8 @@ from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.net.client_session import Event
 
@@ -211,15 +215,16 @@ class RemoteEnvClient:
         """Begin an attempt; a socket that is interrupted here is closed with its context."""
         now = time.monotonic()
         self._due = now + _ATTEMPT_SECONDS
-        dealer = self._context.socket(zmq.DEALER)
-        self._set_options(dealer)
-        self._monitor = dealer.get_monitor_socket()
-        self._poller = zmq.Poller()
-        # The goodbye of a server comes before the end of its connection.
-        self._poller.register(dealer, zmq.POLLIN)
-        self._poller.register(self._monitor, zmq.POLLIN)
-        dealer.connect(self._address)
-        self._dealer = dealer
+        with _signals_held_back():
+            dealer = self._context.socket(zmq.DEALER)
+            self._set_options(dealer)
+            self._monitor = dealer.get_monitor_socket()
+            self._poller = zmq.Poller()
+            # The goodbye of a server comes before the end of its connection.
+            self._poller.register(dealer, zmq.POLLIN)
+            self._poller.register(self._monitor, zmq.POLLIN)
+            dealer.connect(self._address)
+            self._dealer = dealer
 
     def _set_options(self, dealer: _Socket) -> None:
         dealer.set(zmq.RECONNECT_IVL, -1)
@@ -239,12 +244,13 @@ class RemoteEnvClient:
 
     def _hang_up(self) -> None:
         """End the attempt or the connection, and set the time of the next attempt."""
-        dealer, self._dealer = self._dealer, None
-        if dealer is not None:
-            self._poller = zmq.Poller()
-            dealer.disable_monitor()
-            self._monitor.close(linger=0)
-            dealer.close(linger=_LINGER_MS)
+        if self._dealer is not None:
+            with _signals_held_back():
+                self._poller = zmq.Poller()
+                self._dealer.disable_monitor()
+                self._monitor.close(linger=0)
+                self._dealer.close(linger=_LINGER_MS)
+                self._dealer = None
             self._due = time.monotonic() + self._pause
             self._pause = min(2 * self._pause, _SECONDS_BETWEEN_ATTEMPTS[1])
 
@@ -377,6 +383,31 @@ class RemoteEnvClient:
         self._flush()
 
 
+@contextlib.contextmanager
+def _signals_held_back() -> Generator[None]:
+    """Handle signals after the block.
+
+    An exception within pyzmq could leave a socket that nobody closes, so that its context never
+    ends; and one raised while a socket is thrown away would be ignored.
+    """
+    if current_thread() is not main_thread():
+        yield  # Handlers run in the main thread alone.
+        return
+    caught: list[int] = []
+    before: dict[int, Any] = {}
+    try:
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not None:  # None: not Python's.
+                before[number] = signal.signal(number, lambda number, _: caught.append(number))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in caught:
+            signal.raise_signal(number)
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server uses other security: keys on one side only?",
