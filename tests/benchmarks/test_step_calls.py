@@ -22,7 +22,8 @@ MOST = {
     "the same, asynchronous": STEP,
     "step": STEP,
     "VectorEnv.step": {"calls": 79 + TWINS},
-    "Collector.collect, 16 transitions": {"calls": 300 + 2 * TWINS},
+    # It steps twice, and on some machines each round waits once more in the second: 294 or 306.
+    "Collector.collect, 16 transitions": {"calls": 306 + 2 * TWINS},
     "death with resume: files": {"files of src": 24},
 }
 
