@@ -193,20 +193,6 @@ def test_frames_of_any_size_and_user_defined_envs(tmp_path: Path) -> None:
     assert " 10 fps" in said
 
 
-def test_a_replaced_worker_continues_filming(tmp_path: Path) -> None:
-    """The film of the lost episode is marked, until the next one takes its number."""
-    with filming(entry(Brighter, placement="process"), tmp_path) as group:
-        play(group, 5)
-        batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
-        assert batch.restarted.all()
-        for _ in range(3):
-            batch, _ = group.step(batch.respond(action=[0]))
-    assert films(tmp_path) == {
-        "env-0-episode-0.mp4": [0, 1, 2, 3],
-        "env-0-episode-1.mp4": [0, 1, 2, 3],
-    }
-
-
 def test_films_are_added_to_a_folder_of_films(tmp_path: Path) -> None:
     """No film is overwritten by another run."""
     for _ in range(2):
@@ -256,11 +242,21 @@ async def test_an_awaitable_env_that_is_rebuilt_continues_to_be_filmed(tmp_path:
     assert films(tmp_path) == {"env-0-episode-0.mp4": [0, 1, 2, 3]}
 
 
-def test_an_env_that_is_rebuilt_continues_to_be_filmed(tmp_path: Path) -> None:
-    """After an exception, as in a replaced worker."""
-    with filming(entry(Raises, on_env_error="restart"), tmp_path) as group:
+@pytest.mark.parametrize(
+    ("config", "action"),
+    [
+        (entry(Brighter, placement="process"), 9),
+        (entry(Raises, on_env_error="restart"), 8),
+    ],
+    ids=["a replaced worker", "an env that is rebuilt"],
+)
+def test_what_takes_the_place_of_an_env_continues_filming(
+    tmp_path: Path, config: dict[str, Any], action: int
+) -> None:
+    """The film of the lost episode is marked, until the next one takes its number."""
+    with filming(config, tmp_path) as group:
         play(group, 5)
-        batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 8)]))
+        batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", action)]))
         assert batch.restarted.all()
         for _ in range(3):
             batch, _ = group.step(batch.respond(action=[0]))

@@ -157,6 +157,12 @@ async def test_episodes_that_begin_together_have_their_own_seeds_options_and_err
         assert [ret.info["count"] for ret in found] == [1] * 6
 
 
+async def test_a_seed_that_is_no_int_is_refused_even_an_empty_one() -> None:
+    async with rl.build_env_group(Counter, num_workers=1, placement="inline") as group:
+        (found,) = await begun([group.episode(group.env_ids[0], "")])
+        assert isinstance(found, ValueError)
+
+
 async def test_two_episodes_of_one_env_that_begin_together_are_one_too_many() -> None:
     async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
         one, other = group.env_ids

@@ -204,9 +204,9 @@ class AgentSteps:
         """Check steps of one kind; return their slots, and what sends them."""
         env_ids, first = [step.env_id for step in asked], asked[0].what
         if isinstance(first, EpisodeStart):
-            seeds = None
+            seeds: Any = None
             if first.seed is not None:
-                seeds = [cast("EpisodeStart", step.what).seed or 0 for step in asked]
+                seeds = [cast("EpisodeStart", step.what).seed for step in asked]
             return self._resets.prepared(now, seeds, first.options, env_ids)
         slots, packed = self._steps.write(BatchedData(env_ids, [step.what for step in asked]), now)
         if len(slots) < len(asked):

@@ -67,19 +67,14 @@ class Resets:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
         if env_ids is None and self._members.possible:
             now = yield from self._await_members(now)
-        slots, send = self.prepared(now, seed, options, env_ids)
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return ticket, slots
+        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        return (yield from self._reset(now, seed, options, slots))
 
     def prepared(
-        self,
-        now: float,
-        seed: Seeds,
-        options: dict[str, Any] | None,
-        env_ids: Sequence[str] | None,
+        self, now: float, seed: Seeds, options: dict[str, Any] | None, env_ids: Sequence[str]
     ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
         """Check resets; return the slots, and what sends the resets for a ticket."""
-        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._dispatch.distinct(env_ids)
         return slots, self._prepared(now, seed, options, slots)
 
     def reset_members(
@@ -97,9 +92,7 @@ class Resets:
             self._members.rank()
             offsets = self._envs.seed_offset[slots]
             seeds = (checked_seed(seed) + offsets - offsets[:1]).tolist()
-        send = self._prepared(now, seeds, options, slots)
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return ticket, slots
+        return (yield from self._reset(now, seeds, options, slots))
 
     def reset_async(
         self,
@@ -134,6 +127,13 @@ class Resets:
             now = yield Wait(self._supervisor.next_check(began + missing))
             self._waiting.check(now)
         return now
+
+    def _reset(
+        self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
+    ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
+        send = self._prepared(now, seed, options, slots)
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        return ticket, slots
 
     def _prepared(
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
