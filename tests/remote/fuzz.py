@@ -1,4 +1,7 @@
-"""Corrupted messages for both ends, while requests between them must still be answered."""
+"""Corrupted messages for both ends, while requests between them must still be answered.
+
+The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs any number.
+"""
 
 from __future__ import annotations
 

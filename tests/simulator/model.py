@@ -45,8 +45,6 @@ if TYPE_CHECKING:
 MARKS = {"worker_restarted", "client_lost"}
 UNSHOWN = "unshown"
 """What an env does that can't show the state to which it was put back after a death."""
-AGAIN = " (in the reset after its env "
-"""So goes on what is raised in the reset of an awaitable env that hung before."""
 COLLECTOR = "collector"
 """Owner of the requests whose results a collect returns."""
 
@@ -603,8 +601,6 @@ class Model:
         acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
             acts += state.faults(Request("reset"))
-        if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
-            acts += env.fresh().faults(self._begun_again(env, request))
         found = [act for act in acts if act[0] in (*RAISING, "rubbish")]
         shows = request.kind == "step" and not request.due and env.may_be_lost
         if shows and any("bound" in info for state in env.saves for info in state.infos):
@@ -750,10 +746,10 @@ class Model:
             env.seen = max(env.seen + 1, request.deaths)
             return
         if env.client is not None:
+            env.client.is_known = True
             if isinstance(fault, EnvAway):
                 env.client.note_away(request)
                 return
-            env.client.note_raised(request)
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
         if request.kind != "call":
@@ -784,33 +780,21 @@ class Model:
             require(raising or is_rubbish, "an error of nobody", repr(fault), request)
             self._put_away(env, request)
         elif raising:
-            self._judge_raising(env, request, fault, raising)
+            likely = [act for act in raising if str(act[1]) in fault.exception_text]
+            effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
+            check_raised(fault, effect, token)
+            if effect == UNSHOWN:
+                env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
+                env.torn = env.after_loss()
+                self.counts["resumed, and not shown"] += 1
+            if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
+                check_outcome(fault, request, effect, token)
+            self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
             require(is_rubbish and not request.resets, "an error of nobody", repr(fault), request)
             env.state.scripts.step(request.acts)
             env.state.infos = []
             env.dirty = True
-
-    def _judge_raising(
-        self, env: Env, request: Request, fault: EnvRaised, raising: list[Act]
-    ) -> None:
-        """Check an exception that is one of those that an env was to raise."""
-        likely = [act for act in raising if str(act[1]) in fault.exception_text]
-        effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
-        check_raised(fault, effect, token)
-        if effect == UNSHOWN:
-            env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
-            env.torn = env.after_loss()
-            self.counts["resumed, and not shown"] += 1
-        if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
-            check_outcome(fault, request, effect, token)
-        if request.resets:  # An awaitable env that hangs after that is reset like this again.
-            env.state.begun = request.seed, request.options
-        elif AGAIN in fault.exception_text:
-            begun, env.state = env.state.begun, env.fresh()
-            env.state.begun, env.loose = begun, []
-            env.seen = min(env.seen + 1, env.deaths)
-        self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
 
     def _most_errors(self, env: Env) -> int:
         """How often in a row an env may have raised, also in its request before its worker died."""
@@ -845,8 +829,7 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
         "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
         UNSHOWN: (f"the result can't be pickled: {NOT_SHOWN}", "TypeError", TypeError),
     }[effect]
-    found = fault.exception_text.partition(AGAIN)[0]
-    require(found == text, "another error", fault.exception_text, text)
+    require(fault.exception_text == text, "another error", fault.exception_text, text)
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
     require(isinstance(fault, builtin), "another class", type(fault))
     require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")

@@ -330,7 +330,8 @@ def _with_clients(
         limit=rng.choice([None, 3]), placement="client", heartbeat=rng.choice([5.0, 30.0]),
         timeout=TIMEOUT if "hang" in features and rng.random() < 0.7 else None,
     )  # fmt: skip
-    return features | {CLIENTS}, [*(plans if rng.random() < 0.6 else ()), robots]
+    features = features - {"snapshots"} | {CLIENTS}
+    return features, [*(plans if rng.random() < 0.6 else ()), robots]
 
 
 def _restarted(rng: Random, plan: Plan) -> Plan:

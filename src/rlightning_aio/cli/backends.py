@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 from typing import Annotated
@@ -18,7 +19,7 @@ from rlightning_aio.cli.terminal import (
     print_result,
     print_table,
 )
-from rlightning_aio.registry import BACKENDS, Backend, plugins
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend
 
 __all__ = ["backends"]
 
@@ -79,5 +80,5 @@ def _row(backend: Backend) -> _Row:
 
 
 def _plugged_in() -> list[Backend]:
-    points = sorted(plugins("backends"), key=attrgetter("name"))
-    return [point.load() for point in points if point.name not in BACKENDS]
+    points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+    return [p.load() for p in sorted(points, key=attrgetter("name")) if p.name not in BACKENDS]

@@ -1,1 +1,2 @@
 ADVANCE: int
+PLAN_SIZE: int

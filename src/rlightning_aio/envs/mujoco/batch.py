@@ -23,7 +23,7 @@ from gymnasium.vector.utils import batch_space
 
 from rlightning_aio.envs.mujoco.infos import Begun, Finished, of_resets, of_step
 from rlightning_aio.envs.mujoco.randomize import Randomizer
-from rlightning_aio.envs.mujoco.resets import can_draw, drawn
+from rlightning_aio.envs.mujoco.resets import can_draw, drawn, generator_of, noise_of
 from rlightning_aio.envs.mujoco.tasks import task_of
 from rlightning_aio.envs.mujoco.threads import Simulations, state_of
 from rlightning_aio.envs.state import load_state, save_state
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
+
+    from rlightning_aio.envs.mujoco.outputs import StepArrays
+    from rlightning_aio.envs.mujoco.task import Task
 
 __all__ = ["FAILED", "MujocoBatch", "is_brief"]
 
@@ -122,26 +125,28 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             own_models=bool(randomize),
         )
         self._randomizer = Randomizer(self._simulations, randomize) if randomize else None
-        self._task = kind(self.env, self._simulations)
+        # Where the generator of a simulation is; not for those of the set, which have new ones.
+        self._generators, self._unknown = np.zeros(num_envs, np.uintp), set(range(num_envs))
         # The Gymnasium env resets and renders with these data.
         self._data = self.env.data
         self._made: Any = env
-        self._own: list[dict[str, Any]] = [{} for _ in range(num_envs)]
-        for k in range(num_envs):
-            self._take_back(k)
         self._mode = autoreset_mode
-        self._read_step_limit()
         # Steps of all; those of a simulation began at its element of `_began`, and `_soonest` is
         # the first at which one of them can be truncated.
         self._clock = 0
-        self._began = np.zeros(num_envs, np.int64)
+        self._began = self._simulations.began
+        self._read_options(kind)
+        self._own: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+        for k in range(num_envs):
+            self._take_back(k)
         # The observations that were returned last; never written to.
         self._last = np.zeros((num_envs, *self.env.observation_space.shape))
         self._ended: NDArray[np.bool_] | None = None
         self._nobody = np.zeros(num_envs, np.bool_)
         self._is_whole = True  # No step or reset was interrupted.
 
-    def _read_step_limit(self) -> None:
+    def _read_options(self, kind: type[Task]) -> None:
+        """Read the options of the env."""
         self._limiter: Any = None
         self._limit: int = np.iinfo(np.int64).max
         for wrapper in wrappers_of(self._made):
@@ -149,6 +154,19 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
                 self._limiter = wrapper
                 self._limit = self._limiter._max_episode_steps  # noqa: SLF001
         self._soonest = 0
+        simulations, env = self._simulations, self.env
+        simulations.limit(self._limit)
+        self._task = task = kind(env, simulations)
+        # A reset of the task only draws noise, and MuJoCo needs nothing else.
+        self._resets_together = (
+            task.noise != "more"
+            and env.render_mode != "human"
+            and not (task.needs_forces and env.model.nsensor)
+            and can_draw(env._reset_noise_scale)  # noqa: SLF001
+        )
+        noise = noise_of(env, task.noise, self._generators) if self._resets_together else None
+        simulations.draw(noise)
+        self._draws = noise is None
 
     @property
     def _num_steps(self) -> NDArray[np.int64]:
@@ -157,7 +175,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     @_num_steps.setter
     def _num_steps(self, values: NDArray[np.int64]) -> None:
-        self._began, self._soonest = self._clock - values, 0
+        self._began[:], self._soonest = self._clock - values, 0
 
     # -- resets -------------------------------------------------------------------------
 
@@ -202,17 +220,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         is_masked = self._mode == AutoresetMode.DISABLED
         self._last = observations.copy() if is_masked else observations
 
-    @property
-    def _resets_together(self) -> bool:
-        """True if the reset of the task only draws noise, and MuJoCo needs nothing else."""
-        task, env = self._task, self.env
-        return (
-            task.noise != "more"
-            and env.render_mode != "human"
-            and not (task.needs_forces and env.model.nsensor)
-            and can_draw(env._reset_noise_scale)  # noqa: SLF001
-        )
-
     def _begin(
         self,
         ids: NDArray[np.intp],
@@ -248,21 +255,22 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None
     ) -> list[dict[str, Any]]:
         """Draw first states of the simulations `ids`, for MuJoCo to begin with. Return infos."""
-        env, simulations, each = self.env, self._simulations, list[dict[str, Any]]()
-        given = [None] * len(ids) if seeds is None else seeds
-        own, chosen = self._own, list[int](ids.tolist())
-        generators: list[Any] = [own[k].get("_np_random") for k in chosen]
-        if seeds is not None or None in generators:
-            generators = [self._generator(k, seed) for k, seed in zip(chosen, given, strict=True)]
-        if self._randomizer is not None:
-            each = [
-                {"randomized": self._randomizer.draw(k, seed)}
-                for k, seed in zip(chosen, given, strict=True)
-            ]
-            simulations.set_const(ids.astype(np.int32))
-        scale: Any = env._reset_noise_scale  # noqa: SLF001
-        noise = drawn(generators, self._task.noise, scale, env.model.nq, env.model.nv)
-        simulations.starts[ids] = np.concatenate([env.init_qpos, env.init_qvel]) + noise
+        simulations, each = self._simulations, list[dict[str, Any]]()
+        if seeds is not None or self._unknown or self._randomizer is not None or self._draws:
+            chosen = list[int](ids.tolist())
+            given = [None] * len(chosen) if seeds is None else seeds
+            found = [self._generator(k, seed) for k, seed in zip(chosen, given, strict=True)]
+            if self._randomizer is not None:
+                each = [
+                    {"randomized": self._randomizer.draw(k, seed)}
+                    for k, seed in zip(chosen, given, strict=True)
+                ]
+                simulations.set_const(ids.astype(np.int32))
+            if self._draws:
+                env, kind = self.env, self._task.noise
+                scale: Any = env._reset_noise_scale  # noqa: SLF001
+                noise = drawn(found, kind, scale, env.model.nq, env.model.nv)
+                simulations.starts[ids] = np.concatenate([env.init_qpos, env.init_qvel]) + noise
         simulations.begin(ids)
         return each
 
@@ -271,7 +279,12 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         own = self._own[k]
         if seed is not None or own.get("_np_random") is None:
             own["_np_random"], own["_np_random_seed"] = seeding.np_random(seed)
-        return own["_np_random"]
+            self._unknown.add(k)
+        generator: np.random.Generator = own["_np_random"]
+        if k in self._unknown:
+            self._generators[k] = generator_of(generator)
+            self._unknown.remove(k)
+        return generator
 
     def _reset(
         self, k: int, observations: NDArray[Any], seed: int | None, options: dict[str, Any] | None
@@ -296,6 +309,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def _take_back(self, k: int) -> None:
         now = cast("dict[str, Any]", self.env.__dict__)
         self._own[k] = {name: now[name] for name in _OWN if name in now}
+        self._unknown.add(k)
 
     # -- steps --------------------------------------------------------------------------
 
@@ -330,16 +344,14 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             )
         self._is_whole, task = False, self._task
         due = ended.nonzero()[0] if self._mode == _NEXT_STEP and ended is not self._nobody else None
+        self._clock += 1
         begun, failures = self._simulate(actions, due)
-        rewards, terminated, columns = task.stepped()
-        observations = task.observations
+        columns = task.stepped()
+        frame, failed = task.frame, list(failures)
+        observations = frame.observations
         if due is not None:
             begun = begun or self._begin(due, observations)
-            self._began[due], rewards[due] = self._clock + 1, 0.0
-        failed = list(failures)
-        if failed:
-            observations[failed], rewards[failed] = self._last[failed], 0.0
-        terminated, truncated, ended = self._end(terminated, due, failed)
+        ended = self._ends(frame, due, failed)
         finished = None
         if self._mode == _SAME_STEP and ended is not self._nobody:
             ids = ended.nonzero()[0]
@@ -351,30 +363,28 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._is_whole = True
         # PyTorch takes a subclass of dict for a leaf, and TorchRL looks for `final_obs` there.
         made = self._infos(infos) if finished is None else infos()
-        return observations, rewards, terminated, truncated, made
+        return observations, frame.rewards, frame.terminated, frame.truncated, made
 
-    def _end(
-        self, terminated: NDArray[np.bool_] | None, due: Any, failed: list[int]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Count a step, and record who has ended. Return terminations, truncations, and both."""
-        self._clock += 1
-        can_end = terminated is not None or bool(failed)
-        if terminated is None:
-            terminated = np.zeros(self.num_envs, np.bool_)
-        elif due is not None:
-            terminated[due] = False
-        if self._clock < self._soonest:
-            truncated = np.zeros(self.num_envs, np.bool_)
-        else:
-            self._soonest, can_end = int(self._began.min()) + self._limit, True
-            truncated = self._clock - self._began >= self._limit
+    def _ends(self, frame: StepArrays, due: Any, failed: list[int]) -> NDArray[np.bool_]:
+        """Complete the ends of a step, and rewards of those that did none. Return who has ended."""
+        simulations, limit = self._simulations, self._limit
+        has_judged, any_ended = simulations.has_judged, simulations.any_ended
+        if not has_judged and self._clock < self._soonest:
+            frame.truncated[:] = False
+        elif not has_judged:
+            self._soonest = int(self._began.min()) + limit
+            frame.truncated[:] = self._clock - self._began >= limit
+        if due is not None and not (has_judged and self._resets_together):
+            self._began[due], frame.rewards[due] = self._clock, 0.0
+            frame.terminated[due] = frame.truncated[due] = frame.ended[due] = False
         if failed:
-            terminated[failed], truncated[failed] = False, True
-        ended = terminated | truncated if can_end else self._nobody
-        if can_end and not np.count_nonzero(ended):  # `any` takes four times as long.
-            ended = self._nobody
-        self._ended = ended
-        return terminated, truncated, ended
+            frame.observations[failed], frame.rewards[failed] = self._last[failed], 0.0
+            frame.terminated[failed], frame.truncated[failed] = False, True
+        if failed or not has_judged:
+            np.logical_or(frame.terminated, frame.truncated, out=frame.ended)
+            any_ended = bool(np.count_nonzero(frame.ended))  # `any` takes four times as long.
+        self._ended = frame.ended if any_ended else self._nobody
+        return self._ended
 
     def _simulate(
         self, actions: NDArray[Any], due: NDArray[np.intp] | None
@@ -395,7 +405,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             task.renew()
             if due is not None and each is not None:
                 begun = Begun(due, task.begun(due), each)
-        failures = simulations.advance(ids)
+        failures = simulations.advance(ids, self._clock)
         if failures:
             # What was not computed may be anything.
             task.keep(list(failures), self._last)
@@ -429,7 +439,12 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._limiter._elapsed_steps = int(self._num_steps[k])  # noqa: SLF001
         try:
             found = self._made.get_wrapper_attr(name)
-            return found(*args, **kwargs) if callable(found) else found
+            if not callable(found):
+                return found
+            try:
+                return found(*args, **kwargs)
+            finally:
+                self._note_options(self._task.place)
         finally:
             self._take_back(k)
             self.env.data = self._data
@@ -461,9 +476,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _note_options(self, place: Any) -> None:
         """Read the options of the env, which may have changed; the bodies stay where they are."""
-        self._read_step_limit()
-        self._task = type(self._task)(self.env, self._simulations)
-        self._task.place = place
+        self._read_options(type(self._task))
+        if place is not None:
+            self._task.place[:] = place
 
     def is_wrapped(self, name: ClassName) -> bool:
         """Return True if the env has a wrapper of the class `name`."""
@@ -477,7 +492,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             # With the model and all options.
             "env": save_state(self._made),
             "simulations": self._simulations.save_state(),
-            "place": self._task.place,
+            "place": None if self._task.place is None else self._task.place.copy(),
             "own": self._own,
             "randomizer": None if self._randomizer is None else self._randomizer.save_state(),
             **{name: getattr(self, name) for name in _STATE},
@@ -498,6 +513,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         load_state(self._made, state["env"])
         self._simulations.load_state(state["simulations"])
         self._own = [dict(own) for own in state["own"]]
+        self._unknown.update(range(self.num_envs))
         if self._randomizer is not None:
             self._randomizer.load_state(drawn)
         for name in _STATE:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.envs.mujoco.tasks import Columns
+    from rlightning_aio.envs.mujoco.task import Columns
 
 __all__ = ["Begun", "Finished", "of_resets", "of_step"]
 

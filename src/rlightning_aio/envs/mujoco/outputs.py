@@ -4,7 +4,8 @@ Rule: the data of a simulation are in the cache of the thread that computed them
 follow from them only until the thread goes on. So the compiled function `_advance.c` resets or
 steps a simulation, computes its forces and copies parts of its fields, before MuJoCo goes on. Where
 it was not built, `threads` has MuJoCo copy whole fields, and NumPy picks the parts; for contact
-forces MuJoCo then keeps all data of each simulation.
+forces MuJoCo then keeps all data of each simulation. The compiled function draws the noise of
+resets and computes rewards and ends, too, which other threads than the trainer's then do.
 """
 
 from __future__ import annotations
@@ -15,21 +16,24 @@ import sys
 from ctypes import c_double, c_int64, c_void_p
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
 
 import numpy as np
 
 from rlightning_aio.protocol import kernel
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
 __all__ = [
     "AdvancePlan",
     "FieldPart",
-    "Output",
+    "Noise",
+    "Outputs",
+    "StepArrays",
+    "Terms",
     "address_of",
     "compiled",
     "inline_offset_of",
@@ -39,7 +43,9 @@ __all__ = [
 
 _MOST_PARTS: Final = 32
 _MOST_KNOWN: Final = 6
-_KINDS: Final = ("copy", "squares", "within", "also_within")
+# Without the GIL, another thread may be about to take a reference.
+_HAS_GIL: Final[bool] = getattr(sys, "_is_gil_enabled", lambda: True)()
+_KINDS: Final = ("copy", "squares", "within", "also_within", "centre")
 """Of parts, in the order of the compiled function's."""
 _TYPES: Final[dict[str, Any]] = {
     "int": ctypes.c_int,
@@ -52,22 +58,14 @@ _TYPES: Final[dict[str, Any]] = {
 }
 
 
-def _num_references(known: Iterable[tuple[Any, int]]) -> list[int]:
-    return [sys.getrefcount(values) for values, _ in known]
-
-
-(_UNSHARED,) = _num_references([(np.empty(1), 0)])
-# Without the GIL, another thread may be about to take a reference.
-_HAS_GIL: Final[bool] = getattr(sys, "_is_gil_enabled", lambda: True)()
-
-
 class FieldPart(NamedTuple):
     """Values `first` to `stop` of a flattened field of a simulation.
 
     Attributes:
         kind: ``copy``, clipped; ``squares``, the sum of squares of the clipped values; ``within``,
             1 if all are between `low` and `high`, else 0; ``also_within``, the same, and to be
-            joined to the part before, which is 0 then.
+            joined to the part before, which is 0 then; ``centre``, of places of bodies in the
+            plane, with their `weights`, of all simulations or ``[n, bodies]``.
     """
 
     field: str
@@ -75,10 +73,16 @@ class FieldPart(NamedTuple):
     stop: int | None = None
     low: float = -math.inf
     high: float = math.inf
-    kind: Literal["copy", "squares", "within", "also_within"] = "copy"
+    kind: Literal["copy", "squares", "within", "also_within", "centre"] = "copy"
+    weights: NDArray[np.float64] | None = None
 
-    def of(self, field: NDArray[Any]) -> NDArray[Any]:
-        """Make the part of fields ``[n, ...]``."""
+    def of(self, field: NDArray[Any], ids: Any) -> NDArray[Any]:
+        """Make the part of fields ``[n, ...]`` of the simulations `ids`."""
+        if self.weights is not None:
+            weights = self.weights if self.weights.ndim == 1 else self.weights[ids].T
+            places = np.ascontiguousarray(field[..., :2].transpose(1, 2, 0))
+            scales = weights.reshape(len(weights), 1, -1)
+            return (np.add.reduce(scales * places, axis=0) / self.weight_of(ids)).T
         found = field.reshape(len(field), math.prod(field.shape[1:]))[:, self.first : self.stop]
         if self.kind.endswith("within"):
             return np.all((self.low < found) & (found < self.high), axis=1, keepdims=True)
@@ -87,6 +91,82 @@ class FieldPart(NamedTuple):
         if self.kind == "squares":
             return np.add.reduce(np.square(found), axis=1, keepdims=True)
         return found
+
+    def weight_of(self, ids: Any) -> Any:
+        """Sum of the weights."""
+        weights = cast("NDArray[np.float64]", self.weights)
+        return np.add.reduce(weights if weights.ndim == 1 else weights[ids], axis=-1)
+
+    def width(self, template: Any) -> int:
+        """The number of values that it adds to those before."""
+        if self.kind == "copy":
+            return self.size(template)
+        return {"centre": 2, "also_within": 0}.get(self.kind, 1)
+
+    def size(self, template: Any) -> int:
+        return len(range(getattr(template, self.field).size)[self.first : self.stop])
+
+
+class Terms(NamedTuple):
+    """What a step of a robot is worth: ``forward + alive - (control + contact)``.
+
+    The `..._at` are columns; the first ones are where the robot is.
+
+    Attributes:
+        num_places: number of coordinates, 1 or 2.
+        forward: weight of the velocity along the first one.
+        control: weight of the squares of the controls, or of a column.
+        control_at: that column.
+        healthy_at: whether the robot is healthy.
+        alive: the reward for being so.
+        ends: an unhealthy robot is terminated.
+        contact_at: cost of contacts, with a weight and bounds.
+    """
+
+    num_places: int
+    forward: float
+    control: float
+    control_at: int | None = None
+    healthy_at: int | None = None
+    alive: float = 0.0
+    ends: bool = False
+    contact_at: int | None = None
+    contact: float = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def are_plain(self) -> bool:
+        """True if NumPy computes with the weights as with numbers of C."""
+        weights = (self.forward, self.control, self.alive, self.contact)
+        are_finite = all(_is_number(value) and abs(value) <= 2**53 for value in weights)
+        return are_finite and _is_number(self.low) and _is_number(self.high)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and not math.isnan(value)
+
+
+class StepArrays(NamedTuple):
+    """What a step of all writes.
+
+    Attributes:
+        observations: ``[n, width]``.
+        columns: what rewards and infos are made of, ``[..., n]``.
+        rewards, terminated, truncated: of all.
+        ended: terminated or truncated.
+    """
+
+    observations: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    ended: NDArray[np.bool_]
+
+
+class _Frame(ctypes.Structure):
+    _fields_ = tuple((name, c_void_p) for name in StepArrays._fields)
 
 
 class _Part(ctypes.Structure):
@@ -97,9 +177,41 @@ class _Part(ctypes.Structure):
         ("count", c_int64),
         ("low", c_double),
         ("high", c_double),
-        ("values", c_void_p),
-        ("row", c_int64),
-        ("column", c_int64),
+        ("weights", c_void_p),
+        ("weights_row", c_int64),
+        ("is_column", c_int64),
+        ("place", c_int64),
+    )
+
+
+class _Terms(ctypes.Structure):
+    _fields_ = (
+        ("num_places", c_int64),
+        ("velocity", c_int64),
+        ("healthy_at", c_int64),
+        ("control_at", c_int64),
+        ("contact_at", c_int64),
+        ("ends", c_int64),
+        ("forward", c_double),
+        ("alive", c_double),
+        ("control", c_double),
+        ("contact", c_double),
+        ("low", c_double),
+        ("high", c_double),
+        ("places", c_void_p),
+        ("timestep", c_void_p),
+    )
+
+
+class Noise(ctypes.Structure):
+    """How the compiled function draws positions and velocities; see `_advance.c`."""
+
+    _fields_ = (
+        ("generators", c_void_p),
+        ("normal", c_void_p),
+        ("scale", c_double),
+        ("positions", c_void_p),
+        ("velocities", c_void_p),
     )
 
 
@@ -116,6 +228,7 @@ class AdvancePlan(ctypes.Structure):
         ("num_moving", c_int64),
         ("fields", c_int64 * 3),
         ("sizes", c_int64 * 3),
+        ("num_simulations", c_int64),
         ("num_steps", c_void_p),
         ("starts", c_void_p),
         ("before", c_void_p),
@@ -125,87 +238,132 @@ class AdvancePlan(ctypes.Structure):
         ("warning", c_int64),
         ("unstable", c_int64 * 3),
         ("warned", c_int64),
+        ("draws", c_int64),
+        ("noise", Noise),
+        ("judges", c_int64),
+        ("terms", _Terms),
+        ("clock", c_int64),
+        ("limit", c_int64),
+        ("began", c_void_p),
+        ("any_ended", c_int64),
+        ("frame", c_void_p),
+        ("width", c_int64),
         ("num_parts", c_int64),
         ("parts", _Part * _MOST_PARTS),
     )
 
 
-class Output:
-    """Parts of all simulations, next to each other, after their last step or reset.
+def _most_references(arrays: tuple[NDArray[Any], ...]) -> int:
+    """Return how many somebody has to one of the arrays; views and tensors have some, too."""
+    return max(map(sys.getrefcount, arrays))
+
+
+_UNSHARED: Final = _most_references(tuple(map(np.empty, range(1, 7))))
+
+
+class Outputs:
+    """Parts of all simulations, after their last step or reset, and what follows from them.
 
     Args:
-        parts: in order.
+        observed: parts of observations, next to each other.
+        watched: parts that become columns.
+        num_further: number of columns after these, for what is computed.
         template: data of the model.
         count: the number of simulations.
         plan: of the compiled function, which is to make the copies; None if NumPy makes them.
-        by_columns: `values` is ``[width, count]``, not ``[count, width]``.
 
     Attributes:
-        values: as an array; assign another one with `put`.
+        frame: where they are written.
     """
 
     def __init__(
         self,
-        parts: Sequence[FieldPart],
+        observed: Sequence[FieldPart],
+        watched: Sequence[FieldPart],
+        num_further: int,
         template: Any,
         count: int,
         plan: AdvancePlan | None,
-        *,
-        by_columns: bool = False,
     ) -> None:
-        self.parts, self._by_columns = parts, by_columns
-        self._slots: list[tuple[_Part, int]] = []
-        width = 0
-        for part in parts:
-            size = len(range(getattr(template, part.field).size)[part.first : part.stop])
-            step = count if by_columns else 1
-            width -= part.kind == "also_within"
-            if plan is not None:
-                slot = plan.parts[plan.num_parts]
-                plan.num_parts += 1
-                slot.field, slot.first = offset_of(part.field, template), part.first
-                slot.count, slot.low, slot.high = size, part.low, part.high
-                slot.kind = _KINDS.index(part.kind)
-                self._slots.append((slot, 8 * width * step))
-            width += size if part.kind == "copy" else 1
-        for slot, _ in self._slots:
-            slot.row, slot.column = (1, count) if by_columns else (width, 1)
-        self.values: NDArray[np.float64]
-        self._known: list[tuple[NDArray[np.float64], int]] = []
-        self.put(np.zeros((width, count) if by_columns else (count, width)))
+        self._parts, self._plan, self._count = (observed, watched), plan, count
+        self.widths = [sum(part.width(template) for part in parts) for parts in self._parts]
+        self._shapes = (count, self.widths[0]), (self.widths[1] + num_further, count)
+        if plan is not None:
+            plan.num_parts, plan.width = 0, self.widths[0]
+            for is_column, parts in enumerate(self._parts):
+                self._explain(plan, parts, is_column, template)
+        self._known: list[tuple[StepArrays, _Frame | None]] = []
+        self.frame: StepArrays
+        self._use(self._made(np.zeros(self._shapes[0]), np.zeros(self._shapes[1])))
 
-    def put(self, values: NDArray[np.float64], address: int | None = None) -> None:
-        """Write to `values` from now on; their address is asked for if it isn't given."""
-        self.values = values
-        if self._slots:
-            address = address_of(values) if address is None else address
-            for slot, offset in self._slots:
-                slot.values = address + offset
+    def _explain(
+        self, plan: AdvancePlan, parts: Sequence[FieldPart], is_column: int, template: Any
+    ) -> None:
+        place = 0
+        for part in parts:
+            slot = plan.parts[plan.num_parts]
+            plan.num_parts += 1
+            slot.kind, slot.field = _KINDS.index(part.kind), offset_of(part.field, template)
+            slot.first, slot.count = part.first, part.size(template)
+            slot.low, slot.high, slot.is_column = part.low, part.high, is_column
+            slot.place = place - (part.kind == "also_within")
+            if part.weights is not None:
+                slot.weights = address_of(part.weights)
+                slot.weights_row = slot.count // 3 if part.weights.ndim == 2 else 0
+            place += part.width(template)
+
+    def _made(
+        self, observations: NDArray[np.float64], columns: NDArray[np.float64]
+    ) -> tuple[StepArrays, _Frame | None]:
+        flags = [np.zeros(self._count, np.bool_) for _ in range(3)]
+        frame = StepArrays(observations, columns, np.zeros(self._count), *flags)
+        return frame, None if self._plan is None else _Frame(*map(address_of, frame))
+
+    def _use(self, made: tuple[StepArrays, _Frame | None]) -> None:
+        self.frame, self._at = made
+        if self._plan is not None and self._at is not None:
+            self._plan.frame = ctypes.addressof(self._at)
 
     def renew(self) -> None:
-        """Leave `values` to whoever has them, and write to an array that nobody else has.
+        """Leave the frame to whoever has it, and write to another one.
 
-        A new one, and asking for its address, take as long as ten operations of NumPy, so those
-        that nobody has any more are used again. Views and tensors have the array, too.
+        Making arrays, and asking for their addresses, takes longer than a step's own Python, so
+        those that nobody has any more are used again.
         """
-        counts = _num_references(self._known)
-        if _HAS_GIL and _UNSHARED in counts:
-            self.put(*self._known[counts.index(_UNSHARED)])
-            return
-        values = np.empty(self.values.shape)
-        self._known = [*self._known[1 - _MOST_KNOWN :], (values, address_of(values))]
-        self.put(*self._known[-1])
+        known = self._known
+        for k, made in enumerate(known):
+            if _HAS_GIL and _most_references(made[0]) <= _UNSHARED:
+                del known[k]
+                break
+        else:
+            del known[: 1 - _MOST_KNOWN]
+            made = self._made(*map(np.empty, self._shapes))
+        known.append(made)
+        self._use(made)
 
-    def copy(self) -> None:
-        """Leave `values` to whoever has them, and write to a copy."""
-        self.put(self.values.copy())
+    def begin(self, observations: NDArray[np.float64]) -> None:
+        """Write to `observations` and to a copy of the columns, as some simulations stay."""
+        self._use(self._made(observations, self.frame.columns.copy()))
 
     def read(self, ids: Any, fields: Mapping[str, NDArray[Any]]) -> None:
         """Write the parts of the simulations `ids`, whose fields ``[len(ids), ...]`` are given."""
-        rows = self.values.T if self._by_columns else self.values
+        self._write(self.frame.observations, self._parts[0], ids, fields)
+        self.watch(ids, fields)
+
+    def watch(self, ids: Any, fields: Mapping[str, NDArray[Any]]) -> None:
+        """The same, without observations."""
+        self._write(self.frame.columns.T, self._parts[1], ids, fields)
+
+    def _write(
+        self,
+        rows: NDArray[np.float64],
+        parts: Sequence[FieldPart],
+        ids: Any,
+        fields: Mapping[str, NDArray[Any]],
+    ) -> None:
         first = 0
-        for part in self.parts:
-            found = part.of(fields[part.field])
+        for part in parts:
+            found = part.of(fields[part.field], ids)
             if part.kind == "also_within":
                 first -= 1
                 found = found & (rows[ids, first : first + 1] != 0)
@@ -219,14 +377,15 @@ def address_of(array: NDArray[Any]) -> int:
 
 
 def compiled() -> int | None:
-    """Address of the compiled function; None where it was not built, or is not wanted."""
+    """Address of the compiled function; None where this version was not built, or is not wanted."""
     if kernel.selected == "python":
         return None
     try:
         from rlightning_aio.envs.mujoco import _advance
     except ImportError:
         return None
-    return _advance.ADVANCE
+    is_ours = getattr(_advance, "PLAN_SIZE", None) == AdvancePlan.parts.offset
+    return _advance.ADVANCE if is_ours else None
 
 
 def offset_of(field: str, data: Any) -> int:
@@ -244,7 +403,7 @@ def offset_of(field: str, data: Any) -> int:
 
 
 def live_timestep(options: Any) -> ctypes.c_double:
-    """Find the time step in the memory of an `mjOption`, where reading it takes less time.
+    """Find the time step in the memory of an `mjOption`, where the compiled function reads it.
 
     Raises:
         RuntimeError: another value is there than its binding says.

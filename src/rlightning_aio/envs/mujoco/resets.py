@@ -6,17 +6,21 @@ Only tasks that draw positions and velocities around the first ones can do this 
 
 from __future__ import annotations
 
+import ctypes
 from functools import cache
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from rlightning_aio.envs.mujoco.outputs import Noise, address_of, compiled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["can_draw", "drawn"]
+__all__ = ["can_draw", "drawn", "generator_of", "noise_of"]
 
 
 def can_draw(scale: Any) -> bool:
@@ -54,6 +58,38 @@ def drawn(
     if kind == "normal":
         noise[:, width:] *= scale
     return noise
+
+
+def noise_of(env: Any, kind: str, generators: NDArray[np.uintp]) -> Noise | None:
+    """Return what the compiled function draws, the same as `drawn`; None if it can't.
+
+    Args:
+        env: the unwrapped Gymnasium env.
+        kind: see `drawn`.
+        generators: of each simulation, where they are in memory.
+    """
+    draw = _normal() if kind == "normal" else 0
+    states = (env.init_qpos, env.init_qvel)
+    plain = all(each.dtype == np.float64 and each.flags.c_contiguous for each in states)
+    if compiled() is None or draw is None or not plain or not _uniform_is_product():
+        return None
+    scale = env._reset_noise_scale  # noqa: SLF001
+    return Noise(address_of(generators), draw or None, scale, *map(address_of, states))
+
+
+def generator_of(generator: np.random.Generator) -> int:
+    """Address of the C functions of a generator, which is to be kept meanwhile."""
+    return generator.bit_generator.ctypes.bit_generator.value
+
+
+@cache
+def _normal() -> int | None:
+    """Address of NumPy's C function that draws a normal number; None where it isn't exported."""
+    try:
+        library = ctypes.CDLL(import_module("numpy.random._generator").__file__)
+        return ctypes.cast(library.random_standard_normal, ctypes.c_void_p).value
+    except (AttributeError, OSError):
+        return None
 
 
 @cache

@@ -23,7 +23,9 @@ import numpy as np
 from rlightning_aio.envs.mujoco.outputs import (
     AdvancePlan,
     FieldPart,
-    Output,
+    Noise,
+    Outputs,
+    Terms,
     address_of,
     compiled,
     inline_offset_of,
@@ -112,6 +114,10 @@ class Simulations:
         starts: positions and velocities after a reset, ``[count, nq + nv]``.
         squares: of the controls of the last steps, summed up, ``[count]``.
         before: `moving` before the last steps, or after the last reset.
+        outputs: what the task reads of them, after `watch`.
+        began: the clock at the last reset of each.
+        has_judged: the last `advance` wrote rewards and ends.
+        any_ended: if so, whether an episode has ended.
         busy_ns: duration of the last call of `advance`; 0 before the first.
 
     Raises:
@@ -158,7 +164,11 @@ class Simulations:
         self.starts = np.zeros((count, model.nq + model.nv))
         self._even_steps = 0  # The number of steps of all, if it is the same.
         self.before = self.moving.copy()
-        self._outputs: list[Output] = []
+        self.began = np.zeros(count, np.int64)
+        self.outputs: Outputs
+        self._parts: list[FieldPart] = []
+        self._kept: Any = None
+        self._has_terms = self._can_judge = self.has_judged = self.any_ended = False
         self._fields: dict[str, NDArray[Any]] = {}
         self._plan = None if function is None else self._planned()
         self._kind: Any
@@ -189,25 +199,62 @@ class Simulations:
             self.moving.shape[1],
             (c_int64 * 3)(*fields),
             (c_int64 * 3)(model.nq, model.nv, model.nu),
+            self.count,
             *map(address_of, arrays),
+            began=address_of(self.began),
             warning=inline_offset_of("warning"),
             unstable=(c_int64 * 3)(*_UNSTABLE),
         )
 
-    def output(self, *parts: FieldPart, by_columns: bool = False) -> Output:
-        """Copy parts of each simulation after its steps or resets; see `Output`."""
-        found = Output(parts, self._template, self.count, self._plan, by_columns=by_columns)
-        self._outputs.append(found)
-        if self._plan is None:
-            for part in parts:
+    def watch(
+        self, observed: list[FieldPart], watched: list[FieldPart], num_further: int = 0
+    ) -> Outputs:
+        """Copy parts of each simulation after its steps or resets; see `Outputs`."""
+        self._parts = [*observed, *watched]
+        plan = self._plan
+        self.outputs = Outputs(observed, watched, num_further, self._template, self.count, plan)
+        if plan is None:
+            for part in self._parts:
                 self._field(part.field)  # MuJoCo copies it from now on.
-        return found
+        else:
+            plan.terms.num_places = 0
+        self._has_terms = self._can_judge = False
+        return self.outputs
 
-    def forget_outputs(self) -> None:
-        """Copy nothing from now on."""
-        self._outputs.clear()
+    def judge(
+        self, terms: Terms, velocity: int, places: NDArray[np.float64], timestep: Any
+    ) -> None:
+        """Compute rewards and ends by the compiled function, if that is possible.
+
+        Args:
+            terms: of rewards.
+            velocity: the first of the columns that are computed.
+            places: before a step, ``[terms.num_places, count]``; written to.
+            timestep: of MuJoCo, in its memory.
+        """
+        if self._plan is None or not terms.are_plain:
+            return
+        at, given = self._plan.terms, terms._asdict()
+        for name in ("healthy_at", "control_at", "contact_at"):
+            given[name] = -1 if given[name] is None else given[name]
+        for name, value in given.items():
+            setattr(at, name, value)
+        at.velocity, at.places = velocity, address_of(places)
+        at.timestep = ctypes.addressof(timestep)
+        self._kept, self._has_terms = (places, timestep), True
+        self._use(self._kind)
+
+    def draw(self, noise: Noise | None) -> None:
+        """Draw the noise of resets in MuJoCo's threads; None if `starts` has the first states."""
         if self._plan is not None:
-            self._plan.num_parts = 0
+            self._plan.draws = noise is not None
+            if noise is not None:
+                self._plan.noise = noise
+
+    def limit(self, num_steps: int) -> None:
+        """Truncate episodes after so many steps."""
+        if self._plan is not None:
+            self._plan.limit = num_steps
 
     def _field(self, name: str) -> NDArray[Any]:
         """A field of all simulations, ``[count, ...]``, where no function was compiled."""
@@ -278,10 +325,17 @@ class Simulations:
 
     # -- steps --------------------------------------------------------------------------
 
-    def advance(self, ids: NDArray[np.int32] | None = None) -> dict[int, str]:
+    def advance(
+        self, ids: NDArray[np.int32] | None = None, clock: int | None = None
+    ) -> dict[int, str]:
         """Step or reset the simulations `ids`, or all, each as its element of `num_steps` says.
 
         Contact forces are 0 after a reset.
+
+        Args:
+            ids: None for all.
+            clock: count of steps, after this one, to compute rewards and ends if that is possible,
+                and to note when episodes began; see `has_judged`.
 
         Returns:
             Reasons of failures by simulation. After an error of MuJoCo the simulation is in its
@@ -296,11 +350,13 @@ class Simulations:
             failures = self._advance_by_numpy(ids)
         else:
             chosen, count = _chosen(ids)
+            self.has_judged = judges = clock is not None and self._can_judge
+            plan.judges, plan.any_ended, plan.clock = judges, 0, clock or 0
             num_failed = self._library.mjb_apply(
                 self._batch, chosen, count, self._function, self._plan_at, True
             )
             failures = self._failures() if num_failed or plan.warned else {}
-            plan.warned = 0
+            self.any_ended, plan.warned = bool(plan.any_ended), 0
         self.busy_ns = time.monotonic_ns() - began
         for k, cause in failures.items():
             if not self.num_steps[k]:
@@ -333,6 +389,7 @@ class Simulations:
     def _use(self, kind: type[Any]) -> None:
         """Take controls of a type from now on."""
         self._kind, plan = kind, self._plan
+        self._can_judge = self._has_terms and kind in _CONTROLS
         kind = kind if kind in _CONTROLS else np.float64
         self._controls = np.zeros((self.count, self._model.nu), kind)
         self.squares = self._summed = np.zeros(self.count, kind)
@@ -370,10 +427,9 @@ class Simulations:
                 library.mjb_apply(batch, *chosen, forces, None, False)
                 # Computes nothing, but copies the outputs.
                 library.mjb_forward(batch, *chosen, 0)
-        for output in self._outputs:
-            output.read(
-                all_ids, {part.field: self._field(part.field)[all_ids] for part in output.parts}
-            )
+        self.outputs.read(
+            all_ids, {part.field: self._field(part.field)[all_ids] for part in self._parts}
+        )
         return failures
 
     def _failures(self) -> dict[int, str]:
@@ -395,17 +451,13 @@ class Simulations:
         self.rows[:], self.before[:], self.num_steps[:] = state
         self._even_steps = 0
 
-    def put(self, k: int, data: Any, unread: Output) -> None:
-        """Continue simulation `k` from `data`, and copy its parts to all outputs but one."""
+    def put(self, k: int, data: Any) -> None:
+        """Continue simulation `k` from `data`, and copy its parts to the columns."""
         state_of(self._model, data, self.rows[k])
         self.before[k] = self.moving[k]
         self.begin(k)
-        for output in self._outputs:
-            if output is not unread:
-                output.read(
-                    [k],
-                    {part.field: getattr(data, part.field)[np.newaxis] for part in output.parts},
-                )
+        fields = {part.field: getattr(data, part.field)[np.newaxis] for part in self._parts}
+        self.outputs.watch([k], fields)
 
     def data_of(self, k: int) -> Any:
         """All data of simulation `k` after its last step, by repeating that step."""

@@ -1,0 +1,108 @@
+"""What MuJoCo's threads compute besides simulations: noise of resets, rewards and ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from vector.toys import assert_alike
+
+from rlightning_aio.envs.mujoco import outputs, resets
+from rlightning_aio.envs.mujoco.batch import MujocoBatch
+
+pytestmark = pytest.mark.usefixtures("implementation")
+
+
+def pair(task: str, mode: AutoresetMode, **options: Any) -> tuple[MujocoBatch, SyncVectorEnv]:
+    def make() -> Any:
+        return gym.make(task, disable_env_checker=True, max_episode_steps=7, **options)
+
+    ours = MujocoBatch(make(), 3, mode, num_threads=2)
+    return ours, SyncVectorEnv([make] * 3, autoreset_mode=mode)
+
+
+def compare(ours: MujocoBatch, theirs: SyncVectorEnv, num_steps: int = 30) -> None:
+    actions = np.random.default_rng(5)
+    for step in range(num_steps):
+        action = actions.uniform(-1, 1, ours.action_space.shape).astype(np.float32)
+        assert_alike(ours.step(action), theirs.step(action), f"step {step}")
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("task", ["Hopper-v5", "Ant-v5"])
+def test_generators_go_on_as_gymnasiums(task: str, mode: AutoresetMode) -> None:
+    """After resets that drew uniform, and normal, noise from them; also after a draw by a call."""
+    ours, theirs = pair(task, mode)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    for _ in range(2):
+        compare(ours, theirs)
+        drawn = [
+            [each.bit_generator.state for each in envs.call("np_random")] for envs in (ours, theirs)
+        ]
+        assert drawn[0] == drawn[1]
+        for generators in (ours.call("np_random"), theirs.call("np_random")):
+            for generator in generators:
+                generator.random(3)
+    ours.close()
+    theirs.close()
+
+
+def test_noise_is_the_same_where_numpy_hides_its_normal_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(resets, "_normal", lambda: None)
+    ours, theirs = pair("Ant-v5", AutoresetMode.NEXT_STEP)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    compare(ours, theirs)
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("task", ["Swimmer-v5", "Walker2d-v5", "Humanoid-v5"])
+def test_weights_may_be_numbers_of_numpy(task: str) -> None:
+    """Then Gymnasium computes with other types than with Python's numbers."""
+    weights = {"forward_reward_weight": np.float64(1.5), "ctrl_cost_weight": np.float32(0.3)}
+    ours, theirs = pair(task, AutoresetMode.NEXT_STEP, **weights)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    compare(ours, theirs)
+    ours.close()
+    theirs.close()
+
+
+def test_an_option_that_a_call_changes_takes_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Like one that `set_attr` sets."""
+
+    def ease(env: Any) -> None:
+        env._healthy_reward, env._healthy_z_range = 2.5, (1.2, 2.0)
+
+    monkeypatch.setattr(HopperEnv, "ease", ease, raising=False)
+    ours, theirs = pair("Hopper-v5", AutoresetMode.NEXT_STEP)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    compare(ours, theirs, 4)
+    ours.call("ease")
+    theirs.call("ease")
+    compare(ours, theirs)
+    ours.close()
+    theirs.close()
+
+
+def test_types_of_actions_may_change() -> None:
+    """Squares of some are summed up by NumPy, and rewards are then computed by it, too."""
+    ours, theirs = pair("HalfCheetah-v5", AutoresetMode.NEXT_STEP)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    for kind in (np.float32, np.float16, np.float64, np.float16, np.float32):
+        action = np.random.default_rng(5).uniform(-1, 1, ours.action_space.shape).astype(kind)
+        assert_alike(ours.step(action), theirs.step(action), str(kind))
+    ours.close()
+    theirs.close()
+
+
+def test_a_build_of_another_version_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of an older checkout: its function would take the plan for another structure."""
+    built = pytest.importorskip("rlightning_aio.envs.mujoco._advance")
+    monkeypatch.setattr(built, "PLAN_SIZE", 8)
+    assert outputs.compiled() is None
