@@ -21,7 +21,7 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
-from rlightning_aio.errors import EpisodeLost, WorkerDied
+from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -471,6 +471,49 @@ async def test_clients_of_an_env_server_play() -> None:
         assert playing == {"robots-0/c0", "robots-0/c1", "robots-0/c2"}
     for client in clients:
         await asyncio.to_thread(client.join)
+
+
+async def test_a_client_plays_that_came_before() -> None:
+    """Its first result, which nobody has asked for, keeps no one from playing."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        await episode.step([0.0, 0.0])
+        return episode.env_id
+
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    async with rl.build_env_group(server) as group:
+        handle: Any = group["robots-0"]
+        client = ClientThread(handle.address, "c0", CountingEnv(0))
+        while group.pending != ["robots-0/c0"]:  # noqa: ASYNC110  # Nothing tells that it has come.
+            await asyncio.sleep(0.01)
+        ((attempt,),) = await played(group, tasks(1), agent)
+        assert attempt.result == "robots-0/c0"
+        await group.reset()
+        group.reset_async()
+        with pytest.raises(EnvBusy, match="c0"):
+            await played(group, tasks(1), agent)
+    client.join()
+
+
+async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
+    """It is read while an env of another entry is there."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        await episode.step([0.0, 0.0])
+        return episode.env_id
+
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
+    specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(["here", "robots"])]
+    found: list[str] = []
+    async with rl.build_env_group([local, server]) as group:
+        handle: Any = group["robots-0"]
+        async for (attempt,) in play(group, specs, agent):
+            found.append(attempt.result)
+            if len(found) == 1:
+                client = ClientThread(handle.address, "c0", CountingEnv(0))
+    assert found == ["here-0", "robots-0/c0"]
+    client.join()
 
 
 async def test_numbers_that_are_not_finite_are_in_the_file(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.attempts import Attempt, AttemptEpisode, AttemptGroup
 
-_LOST: Final = ("env_died", "env_hung", "env_raised", "not_started")
+_LOST: Final = ("env_died", "env_hung", "env_raised", "env_away", "not_started")
 _SIZED: Final = ("vector", "single", "digits", "number")
 
 
@@ -114,11 +114,13 @@ class Attempts(InContext):
                 await self._dawdle(rng, env, episode)
                 if rng.random() < 0.1:
                     return ""
-                if "calls" in self.features and rng.random() < 0.2:
+                if "calls" in self.features and env.client is None and rng.random() < 0.2:
                     self._check_value(played, await episode.call("peek", 7))
             elif len(played.acts) >= 4:
                 return ""
             (act,) = self.acts(rng, env, plain=self.plain)
+            if env.client is not None:
+                env.client.asked.append(act)
             env.hangs += env.entry.form == "awaitable" and act[0].startswith("hang")
             columns = {"tokens": [len(played.acts)]} if "extras" in self.features else {}
             try:
@@ -241,7 +243,8 @@ class Attempts(InContext):
         except RLightningError as error:
             self.count(error)
             self._end(error)
-        require(not self.group.pending, "pending after all attempts", self.group.pending)
+        left = [one for one in self.group.pending if self.by_id[one].client is None]
+        require(not left, "pending after all attempts", left)
         ends = [one.end for tries in self.played.values() for one in tries]
         require(all(ends), "an agent plays on", ends)
         return found
@@ -249,7 +252,7 @@ class Attempts(InContext):
     async def _in_time(self, taking: asyncio.Task[None]) -> None:
         """All envs are free within a second of a cancellation, unless the world is slow."""
         faults, slow = self.program.faults, "slow" in self.features
-        is_calm = faults == Faults(deaths=faults.deaths) and not slow
+        is_calm = faults == Faults(deaths=faults.deaths) and not (slow or self.clients)
         _, late = await asyncio.wait({taking}, timeout=1.0 if is_calm else self.hang)
         require(not late, "the envs are not free in time")
 
@@ -346,7 +349,9 @@ class Attempts(InContext):
     def _script(self, played: Played, steps: int | None = None) -> Script:
         """The script of an env, where some steps of an attempt lead to."""
         env, spec = self.by_id[played.episode.env_id], played.episode.spec
-        script = Script(env.codes[0], env.entry.own_limit)
+        code = words_of(env.entry.layout, played.episode.first).code
+        require(env.client is None or env.client.is_code(code), "another client", code)
+        script = Script(env.codes[0] if env.client is None else code, env.entry.own_limit)
         script.reset(spec.seed, None if spec.options is None else {**spec.options})
         for act in played.acts[:steps]:
             script.step(*act)

@@ -131,6 +131,10 @@ class Client:
     def is_alive(self) -> bool:
         return self.process is not None and self.process.alive
 
+    def is_code(self, code: int) -> bool:
+        """Return True if one of its processes has this code."""
+        return self.env.codes[0] < code <= self._code
+
     def start(self, address: str) -> None:
         """Start another process of it."""
         self._code += 1

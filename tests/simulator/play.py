@@ -81,13 +81,10 @@ class Play(Session):
         self.model = Model(self.envs, self.counts, starts_fail=starts_fail, calm=calm)
         ids = list(dict.fromkeys(env.shared_id for env in self.envs))
         require(ids == self.group.env_ids, "ids", self.group.env_ids)
-        self.clients = [env.client for env in self.envs if env.client is not None]
-        if self.clients:
-            self.address = self.group[ids[-1]].address
-            rng = Random(self.program.seed)
-            for client in self.clients:
-                if rng.random() < 0.7:
-                    client.start(self.address)
+        rng = Random(self.program.seed)
+        for client in self.clients:
+            if rng.random() < 0.7:
+                client.start(self.address)
 
     async def play(self, number: int, op: Op) -> None:
         await super().play(number, op)
@@ -1203,30 +1200,6 @@ class Play(Session):
         limbo = any(env.limbo and env.host.mortal for env in envs)
         with self.expected((wrong, WorkerDied, *[EnvBusy] * limbo), kind):
             self.group.step_async(BatchedData(ids, values))
-
-    async def op_client(self, rng: Random) -> None:
-        """Start a client, or do something to it."""
-        if rng.random() < 0.3:  # Let it come back.
-            await self.rest(rng.choice([10, 100, 400]))
-            return
-        client = rng.choice(self.clients)
-        process = client.process
-        if process is None or not process.alive:
-            client.start(self.address)
-            return
-        kind = rng.choice(["cut", "stop", "kill", "leave"])
-        self.counts[f"clients: {kind}"] += 1
-        delay = rng.choice([0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0])
-        act = {
-            "cut": process.cut,
-            "stop": partial(process.stop, rng.choice([0.03, 1.0, 5.0, 40.0])),
-            "kill": partial(process.end, -9),
-            "leave": client.leave,
-        }[kind]
-        self.world.after(delay, lambda: self.is_calm or not process.alive or act())
-        if rng.random() < 0.6:  # Somebody starts it again.
-            again = lambda: client.is_alive or client.start(self.address)  # noqa: E731
-            self.world.after(delay + rng.choice([0.0, 0.1, 3.0, 30.0]), again)
 
     async def op_look(self, rng: Random) -> None:
         """What is asked of a group without waiting."""

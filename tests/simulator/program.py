@@ -234,17 +234,20 @@ ROWS: dict[str, tuple[int, str | None]] = {
 }  # fmt: skip
 KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
     "group": (12, OPS),
-    "training": (5, {"rollout": (6, None), "learn": (2, None), "kill": (2, "die")}),
+    "training": (
+        5,
+        {"rollout": (6, None), "learn": (2, None), "kill": (2, "die"), "client": (4, CLIENTS)},
+    ),
     "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
     "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls")}),
     "sb3": (2, ROWS),
-    "attempts": (0, {"attempts": (6, None), "kill": (2, "die")}),
+    "attempts": (0, {"attempts": (6, None), "kill": (2, "die"), "client": (4, CLIENTS)}),
 }
 """Kinds of programs: the weight of each, and its operations; see `draw` for that of attempts."""
 _ATTEMPTS: Final = 0.06
 """The share of programs that are of attempts, in place of what else they would be."""
 _CLIENTS: Final = 0.2
-"""The share of programs of groups that have clients."""
+"""The share of programs that have clients, of those that may have them."""
 
 
 def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60) -> Program:
@@ -272,7 +275,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
     features = _with_bound(seed, kind, features, plans)
-    has_clients = kind == "group" and apart.random() < _CLIENTS and CLIENTS not in without
+    has_clients = kind in ("group", "training", "attempts") and apart.random() < _CLIENTS
+    has_clients = has_clients and CLIENTS not in without
     if has_clients:
         features, plans = _with_clients(apart, features, plans)
     ops_of_kind = KINDS[kind][1]

@@ -15,6 +15,7 @@ import signal
 import time
 import warnings
 from collections import Counter
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from rlightning_aio.errors import StartFailed
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Iterator, Sequence
 
+    from simulator.clients import Client
     from simulator.program import Op, Plan, Program
 
 
@@ -42,10 +44,12 @@ class Session:
             stopped for minutes.
         envs: of the group, as the model knows them.
         unclosable: envs that may raise when they are closed.
+        clients: that lend envs to an env_server; address: of that.
     """
 
     group: Any
     envs: list[Env]
+    clients: Sequence[Client] = ()
 
     def __init__(self, program: Program, world: Any = None) -> None:
         self.program, self.world = program, world
@@ -80,6 +84,9 @@ class Session:
             if not await self.start():
                 return
             self.envs = self.program.envs(self.group.get_workers(), self.world)
+            self.clients = [env.client for env in self.envs if env.client is not None]
+            if self.clients:
+                self.address = self.group[self.clients[0].env.shared_id].address
             self.begin()
             for number, op in enumerate(self.program.ops):
                 await self.play(number, op)
@@ -202,6 +209,30 @@ class Session:
         else:
             self.world.kill(pids)
         return env
+
+    async def op_client(self, rng: Random) -> None:
+        """Start a client, or do something to it."""
+        if rng.random() < 0.3:  # Let it come back.
+            await self.rest(rng.choice([10, 100, 400]))
+            return
+        client = rng.choice(self.clients)
+        process = client.process
+        if process is None or not process.alive:
+            client.start(self.address)
+            return
+        kind = rng.choice(["cut", "stop", "kill", "leave"])
+        self.counts[f"clients: {kind}"] += 1
+        delay = rng.choice([0.0, 1e-4, 1e-3, 1e-2, 0.1, 1.0])
+        act = {
+            "cut": process.cut,
+            "stop": partial(process.stop, rng.choice([0.03, 1.0, 5.0, 40.0])),
+            "kill": partial(process.end, -9),
+            "leave": client.leave,
+        }[kind]
+        self.world.after(delay, lambda: self.is_calm or not process.alive or act())
+        if rng.random() < 0.6:  # Somebody starts it again.
+            again = lambda: client.is_alive or client.start(self.address)  # noqa: E731
+            self.world.after(delay + rng.choice([0.0, 0.1, 3.0, 30.0]), again)
 
     # -- errors
 

@@ -18,6 +18,7 @@ from simulator.trails import Trail, Transition
 from rlightning_aio.collecting import Collector
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import (
+    EnvAway,
     EnvFault,
     EnvRaised,
     NothingPending,
@@ -50,6 +51,22 @@ class InContext(Session):
         self.limit = self.drawn_limit(Random(self.program.seed))
         self.by_id = {env.env_id: env for env in self.envs}
         self.enter()
+        if self.clients:
+            self.revive()
+
+    def revive(self) -> None:
+        """Start clients, and again and again those that have ended, or whose env hangs."""
+        for client in self.clients:
+            if client.hangs and client.process is not None:
+                client.process.end(-9)
+            if not client.is_alive:
+                client.start(self.address)
+        self.world.after(20.0, self.revive)
+
+    def end(self) -> None:
+        for client in self.clients:
+            client.done = [act for act in client.done if act[0] != "reset"]
+            client.check_done()
 
     def enter(self) -> None:
         self.context = nullcontext() if self.limit is None else self.group.auto_reset(self.limit)
@@ -92,28 +109,21 @@ class Training(InContext):
         rng = Random(self.program.seed)
         self.options = self._options(rng)
         self.recorded = RecordedGroup(self.group)
-        self._begin_with(self.recorded)
+        self._begin_with(self.group if self.clients else self.recorded)
 
     def _begin_with(self, group: Any) -> None:
-        self.trails = {
-            env.first + k: Trail(
-                code,
-                env.entry.own_limit,
-                self.limit_of(env),
-                cut_together=env.entry.mode != "disabled",
-            )
-            for env in self.envs
-            for k, code in enumerate(env.codes)
-        }
-        self.env_of = {env.first + k: env for env in self.envs for k in range(len(env.codes))}
+        self.trails: dict[tuple[int, int], Trail] = {}
+        local = [env for env in self.envs if env.client is None]
+        self.env_of = {env.first + k: env for env in local for k in range(len(env.codes))}
         single = len(self.program.plans) == 1
         policy: Any = self.policy if single else {p.name: self.policy for p in self.program.plans}
         self.collector: Any = Collector(group, policy, **self.options)
 
     def _options(self, rng: Random) -> dict[str, Any]:
         width = sum(len(env.codes) for env in self.envs)
+        blocks = not self.clients
         options: dict[str, Any] = {"seed": rng.choice([None, 7]), "infos": ("extra",)}
-        blocks = all(
+        blocks = blocks and all(
             plan.form != "stacked" or plan.mode == "same_step" for plan in self.program.plans
         )
         if blocks and rng.random() < 0.3:
@@ -128,7 +138,10 @@ class Training(InContext):
             raise PolicyFailed
         envs = [self.by_id[env_id] for env_id in batch.env_ids()]
         acts = [self.acts(self.rng, env, plain=self.plain) for env in envs]
-        for env, own in zip(envs, acts, strict=True):
+        for env, own, index in zip(envs, acts, batch.index, strict=True):
+            if env.client is not None:
+                env.client.asked.extend(own)
+                require(self.env_of.setdefault(int(index), env) is env, "another's index", index)
             env.hangs += env.entry.form == "awaitable" and own[0][0].startswith("hang")
         actions = [action_of(env, own) for env, own in zip(envs, acts, strict=True)]
         shape = batch.is_reset.shape
@@ -175,14 +188,18 @@ class Training(InContext):
             self.check_first(fault)
             self.lose(fault)
             return
-        require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
-        self.raised[fault.env_id] += 1
-        if self.rng.random() < 0.5:
-            return  # The collector does it.
-        try:
-            self.group.reset_async(env_ids=[fault.env_id])
-        except WorkerDied as died:
-            self.lose(died)
+        for one in (fault, *fault.others):
+            env = self.by_id[one.env_id]
+            if env.client is not None and isinstance(one, EnvAway):
+                continue  # It comes back by itself.
+            require(isinstance(one, EnvRaised), "an odd error", repr(one))
+            self.raised[one.env_id] += 1
+            if env.client is None and self.rng.random() < 0.5:
+                continue  # The collector does it.
+            try:
+                self.group.reset_async(env_ids=[one.env_id])
+            except WorkerDied as died:
+                self.lose(died)
 
     def check_first(self, fault: WorkerDied) -> None:
         """Check that no death is raised twice while envs of other workers are left.
@@ -209,7 +226,7 @@ class Training(InContext):
                 break
         else:
             raise Violation("no rollout is collected any more")
-        if not self.disturbed and not any(env.deaths for env in self.envs):
+        if not (self.disturbed or self.clients or any(env.deaths for env in self.envs)):
             await self.replay()
         await super().finish()
 
@@ -245,11 +262,6 @@ class Training(InContext):
         parts = [found] if len(self.program.plans) == 1 else [found[name] for name in sorted(found)]
         total = sum(part.index.size for part in parts)
         require(total == self.options["num_transitions"], "the size of a rollout", total)
-        for env in self.envs:
-            for k in range(len(env.codes)):
-                trail = self.trails[env.first + k]
-                trail.allow(env.losses + self.raised[env.env_id])
-                trail.resumes = env.entry.every is not None
         for part in parts:
             self._take(part)
         if self.kept:
@@ -263,9 +275,11 @@ class Training(InContext):
         ended: dict[int, list[tuple[float, int]]] = {}
         for place in np.ndindex(rollout.shape):
             index = int(rollout.index[place])
-            env, trail = self.env_of[index], self.trails[index]
-            layout, number = env.entry.layout, len(trail.ended)
+            env = self.env_of[index]
+            layout = env.entry.layout
             words = words_of(layout, _at(rollout.observation, place))
+            trail = self._trail(env, index, words.code)
+            number = len(trail.ended)
             require(words_of(layout, _at(rollout.seen, place)) == words, "another seen", words)
             trail.add(
                 Transition(
@@ -284,6 +298,21 @@ class Training(InContext):
         for index, total, length, _ in zip(*rollout.episodes.values(), strict=True):
             found.setdefault(int(index), []).append((float(total), int(length)))
         require(found == ended, "episodes", found, ended)
+
+    def _trail(self, env: Env, index: int, code: int) -> Trail:
+        """What was stored of an env; each process of a client has another code, and a trail."""
+        if (index, code) not in self.trails:
+            before = max((other for place, other in self.trails if place == index), default=-1)
+            is_own = code in env.codes if env.client is None else env.client.is_code(code)
+            require(is_own and code > before, "a transition of another env", index, code)
+            together = env.entry.mode != "disabled"
+            limits = env.entry.own_limit, self.limit_of(env)
+            self.trails[index, code] = Trail(code, *limits, cut_together=together)
+        trail = self.trails[index, code]
+        troubles = 0 if env.client is None else env.client.troubles
+        trail.allow(env.losses + self.raised[env.env_id] + troubles)
+        trail.resumes = env.entry.every is not None
+        return trail
 
 
 class Evaluations(InContext):

@@ -45,6 +45,8 @@ class Players:
         """Look which envs are there now, clients included; return those that are."""
         present: set[str] = set()
         for worker in self._group.get_workers():
+            if not worker["env_ids"]:  # A server, whose clients may come.
+                self._kinds.setdefault(_Player(worker["entry"]))
             for env_id in worker["env_ids"]:
                 present.add(env_id)
                 if env_id in self._players:

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio._core.group.api.facade import asked
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
@@ -61,8 +62,8 @@ async def play(
             rewards = attempts.rewards
 
     Args:
-        group: initialised, with nothing `pending`; of any placement. Each env plays one attempt at
-            a time, also one with sub-environments.
+        group: initialised, with nothing `pending` but first results of clients; of any placement.
+            Each env plays one attempt at a time, also one with sub-environments.
         tasks: `EpisodeSpec`, or tuples (task, seed) or (task, seed, options); an iterable or an
             async iterable, read only as envs become free.
         agent: a coroutine function, which gets an `AttemptEpisode`.
@@ -82,7 +83,7 @@ async def play(
     """
     if size < 1:
         raise ValueError(f"size must be at least 1, not {size!r}")
-    if busy := group.pending:
+    if busy := asked(group):
         raise EnvBusy(f"{busy[0]!r} has a request whose result was not collected; collect it")
     engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
     running = asyncio.create_task(engine.run())

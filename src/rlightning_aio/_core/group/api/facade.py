@@ -8,6 +8,7 @@ import time
 import warnings
 import weakref
 from contextlib import nullcontext
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.drivers.scope import Scope
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AutoResetContext",
     "Facade",
+    "asked",
     "default_min_results",
     "ensure_auto_reset",
     "only_result",
@@ -106,6 +108,11 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     if core.continuity.auto_reset_is_open:
         return nullcontext()
     return AutoResetContext(core, None, on_done=True, needs_limits=False)
+
+
+def asked(group: Any) -> list[str]:
+    """Ids as in `EnvGroup.pending`, but for clients that have come and were asked nothing yet."""
+    return group._driver.look(partial(group._core.pending, unasked=False))  # noqa: SLF001
 
 
 def default_min_results(group: Any) -> int:

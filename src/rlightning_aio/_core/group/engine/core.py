@@ -219,9 +219,13 @@ class Core:
             self.continuity.note_shows(slots.tolist(), positions)
             return self.steps.settled(*(yield from self._resets.show_restored(now, slots)))
 
-    def pending(self) -> list[str]:
-        """Return the ids of envs whose result, value or error was not returned yet."""
+    def pending(self, *, unasked: bool = True) -> list[str]:
+        """Return the ids of envs whose result, value or error was not returned yet.
+
+        Not `unasked`: without clients whose first result answers no request.
+        """
         self.lifetime.check_open()
         self.intake.drain()
         state, owner = self.requests.state, self.requests.owner
-        return self.envs.names.ids(np.flatnonzero((state != State.IDLE) & (owner != NOBODY)))
+        slots = np.flatnonzero((state != State.IDLE) & (owner != NOBODY))
+        return self.envs.names.ids(slots if unasked else slots[~self.requests.joined(slots)])
