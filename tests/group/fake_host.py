@@ -30,6 +30,7 @@ from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
     NO_ACTION,
     Attached,
@@ -113,7 +114,7 @@ class Shared:
     num_hosts: int
 
 
-class FakeHost:
+class FakeHost(Host):
     """See `hosts.base.Host`. Requests wait until the test has them executed (`finish`).
 
     Attributes:
@@ -283,7 +284,7 @@ class FakeHost:
 
 
 class FakeWorker(FakeHost):
-    """See `hosts.base.Polled` and `Killable`. Its rings are real.
+    """See `hosts.base.Killable`. Its rings are real.
 
     Attributes:
         frames: unread replies.
@@ -293,6 +294,7 @@ class FakeWorker(FakeHost):
         refusals: number of further starts that fail.
     """
 
+    on_bell = True
     alive = False
     refusals = 0
     traffic = 0
@@ -398,6 +400,9 @@ class FakeInline(FakeHost):
             return False
         self.finish()
         return True
+
+    def step_now(self) -> Any:
+        raise AssertionError
 
 
 class FakeGroup:

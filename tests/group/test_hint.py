@@ -16,6 +16,7 @@ from rlightning_aio import EnvConfig, sync
 from rlightning_aio._core.group.state.host_record import HostRecord
 from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision.hint import HINT_AFTER_BATCHES, Hints, hint
+from rlightning_aio._core.hosts.base import Host
 
 
 def latencies(step: float, transfer: float) -> dict[str, dict[str, float]]:
@@ -72,7 +73,7 @@ MS = 1_000_000
 
 
 @dataclass
-class Worker:
+class Worker(Host):
     """A host, and what the kernel's accounts say of its threads."""
 
     first_slot: int
@@ -83,6 +84,11 @@ class Worker:
 
     def processor_times(self) -> tuple[int, int] | None:
         return None if self.ran is None else (self.ran, self.queued)
+
+    def _not_asked(self, *args: Any) -> Any:
+        raise AssertionError
+
+    current_request = traffic = catch_up = kill = destroy = _not_asked  # See `Killable`.
 
     def inspect(self, slot: int, answer: Any, after: float) -> None:
         answer(f"step of env {slot}, env.py:{after * 1000:.0f}", "all stacks")

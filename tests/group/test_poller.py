@@ -15,16 +15,18 @@ from hypothesis import strategies as st
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.state.requests import Requests
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.rings import TrainerBell, WorkerBell, bell_size
 
 
 @dataclass(eq=False)
-class Worker:
+class Worker(Host):
     """The part of a process host that a poller uses."""
 
     host_id: int
     polled: int = 0
+    on_bell = True
 
     def poll(self) -> None:
         self.polled += 1
@@ -33,6 +35,7 @@ class Worker:
 class Server(Worker):
     """The part of an env_server that a poller uses."""
 
+    on_bell = False
     server_id, address, members = "server-0", "tcp://nowhere", ()
     first_slot = num_envs = 0
 
@@ -54,7 +57,7 @@ class Server(Worker):
 
 
 @dataclass(eq=False)
-class Inline:
+class Inline(Host):
     """An inline host that records what it executes."""
 
     host_id: int
@@ -67,6 +70,9 @@ class Inline:
         self.waiting -= 1
         self.log.append(self.host_id)
         return True
+
+    def step_now(self) -> None:
+        raise AssertionError
 
 
 class Scene:

@@ -22,6 +22,7 @@ from rlightning_aio._core.group.supervision import hang_detector
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
@@ -55,7 +56,7 @@ def is_given_up(loss: HostLoss | None) -> TypeGuard[HostLoss]:
 
 
 @dataclass
-class StandIn:
+class StandIn(Host):
     """See `hosts.base.Killable`. It does what the test says, and records its orders.
 
     Attributes:

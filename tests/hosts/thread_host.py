@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
@@ -49,7 +50,7 @@ JOIN_SECONDS = 1.0
 """Time for a thread to end before the host stops waiting for it."""
 
 
-class ThreadHost:
+class ThreadHost(Host):
     """The side of the trainer; see `base.Host` and `base.Source`.
 
     Args:

@@ -1,11 +1,11 @@
 """The seam between the core of a group and the places that run envs.
 
 A `Host` starts, accepts requests, and ends. It reports everything by completions, which it appends
-to the queue of its group (see `messages`). The other protocols are optional: a host with a
-descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
-executes in the thread of the caller is `Executing`, one that can end single requests is `Aborting`,
-one that can say where its envs stand is `Inspectable`, and a host whose envs join and leave has
-`Membership`. The core checks for these protocols, never for a class of hosts.
+to the queue of its group (see `messages`). What only some hosts can do has a default there, which
+does nothing. Three more protocols are optional: a host that can hang is `Killable`, one that
+executes in the thread of the caller is `Executing`, and one whose envs join and leave has
+`Membership`. The core checks for these, never for a class of hosts. A host with a descriptor has
+the driver watch it, or a part of it, as a `Source`.
 Left out on purpose: waiting. Neither side ever waits.
 """
 
@@ -21,23 +21,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, StartOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, OutOfBand, StartOrder
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.exchange import Ring
     from rlightning_aio.protocol.rings import TrainerBell
     from rlightning_aio.types import EnvMeta
 
 __all__ = [
-    "Aborting",
     "Executing",
     "Host",
     "HostFactory",
-    "Inspectable",
     "Killable",
-    "Measured",
     "Membership",
-    "Polled",
-    "SharesThread",
     "Source",
     "Watcher",
     "Wiring",
@@ -101,11 +96,15 @@ class Host(Protocol):
         host_id: its index among the hosts of the group.
         first_slot: slot of the env of index 0; the other envs follow.
         num_envs: the most envs it can have.
+        on_bell: it counts its results on the group's bell, and `poll` appends them.
+        needs_loop: its envs make progress only while the driver waits in its event loop.
     """
 
     host_id: int
     first_slot: int
     num_envs: int
+    on_bell: bool = False
+    needs_loop: bool = False
 
     def start(self) -> None:
         """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`.
@@ -155,14 +154,37 @@ class Host(Protocol):
         """Release descriptors and memory immediately; no completion follows. Idempotent."""
         ...
 
+    # -- what only some hosts can do --------------------------------------------------
 
-@runtime_checkable
-class Measured(Protocol):
-    """A host whose envs are in a process of this machine."""
+    def poll(self) -> None:
+        """Append completions of finished requests, without blocking."""
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """End requests soon, without blocking or harm to other envs, as far as that is possible.
+
+        Args:
+            entries: of requests, which may have ended already.
+
+        One completion follows for each, as for any request, when nothing of it goes on in its env;
+        nobody uses what it holds.
+        """
+
+    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
+        """Find out where the code of an env stands, without blocking.
+
+        Args:
+            slot: of the env.
+            after: seconds from now, at which the host looks.
+            answer: gets the calls that it is in, from the outermost in (empty if that is not
+                known), and the stacks of all threads. Called now or soon, while the driver reads,
+                unless the host dies before.
+        """
+        del slot, after  # For those that know more.
+        answer("", "")
 
     def processor_times(self) -> tuple[int, int] | None:
-        """Return the ns for which its threads have run, and have waited for a core, or None."""
-        ...
+        """Return the ns for which its threads have run, and have waited for a core, if known."""
+        return None
 
 
 @runtime_checkable
@@ -202,60 +224,18 @@ class Killable(Protocol):
 
 
 @runtime_checkable
-class Inspectable(Protocol):
-    """A host that can say where its envs stand."""
-
-    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
-        """Find out where the code of an env stands, without blocking.
-
-        Args:
-            slot: of the env.
-            after: seconds from now, at which the host looks.
-            answer: gets the calls that it is in, from the outermost in (empty if that is not
-                known), and the stacks of all threads. Called now or soon, while the driver reads,
-                unless the host dies before.
-        """
-        ...
-
-
-@runtime_checkable
-class Aborting(Protocol):
-    """A host that can end a request without harm to its other envs."""
-
-    def abort(self, entries: NDArray[np.int64]) -> None:
-        """End requests soon, without blocking, as far as that is possible.
-
-        Args:
-            entries: of requests, which may have ended already.
-
-        One completion follows for each, as for any request, when nothing of it goes on in its env;
-        nobody uses what it holds.
-        """
-        ...
-
-
-@runtime_checkable
-class Polled(Protocol):
-    """A host with results that don't wake the driver."""
-
-    def poll(self) -> None:
-        """Append completions of finished requests, without blocking."""
-        ...
-
-
-@runtime_checkable
-class SharesThread(Protocol):
-    """A host whose envs make progress only while the driver waits in its event loop."""
-
-    shares_thread: bool
-
-
-@runtime_checkable
 class Executing(Protocol):
     """A host that executes requests in the thread of the caller."""
 
     def execute_next(self) -> bool:
         """Execute one waiting request and append its completion; return False if there is none."""
+        ...
+
+    def step_now(self) -> OutOfBand | None:
+        """Step its first env with the action in its row, without a request.
+
+        No request to that env may be waiting. Returns what of the result is out of band.
+        """
         ...
 
 
@@ -308,10 +288,6 @@ class Membership(Host, Protocol):
         Raises:
             TimeoutError: it has waited longer than that.
         """
-        ...
-
-    def poll(self) -> None:
-        """Append completions, as of `Polled`."""
         ...
 
     def is_readable(self) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio._core.group.state.samples import percentiles
-from rlightning_aio._core.hosts.base import Executing, SharesThread
+from rlightning_aio._core.hosts.base import Executing
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -155,6 +155,6 @@ def _most_at_once(record: HostRecord) -> int:
         return 0
     if record.membership is not None:
         return len(record.slots)
-    if record.awaits_several or isinstance(record.host, SharesThread):
+    if record.awaits_several or record.host.needs_loop:
         return record.config.max_concurrency or len(record.slots)
     return 1

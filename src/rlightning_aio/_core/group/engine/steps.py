@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, NoReturn, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from rlightning_aio._core.group.engine.first_observations import FirstObservatio
 from rlightning_aio._core.group.engine.newest import Newest
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio._core.hosts.base import Executing
 from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
@@ -49,24 +50,14 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Watcher
-    from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
 
-__all__ = ["Flags", "Parts", "Steps", "StepsAtOnce"]
+__all__ = ["Flags", "Parts", "Steps"]
 
 _STEP: Final = int(Operation.STEP)
 Flags: TypeAlias = "list[bool]"
-
-
-@runtime_checkable
-class StepsAtOnce(Protocol):
-    """A host that can step its first env in the call of the group, without a request."""
-
-    def step_now(self) -> OutOfBand | None:
-        """Step that env with the action in its row; return what of the result is out of band."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -132,12 +123,12 @@ class Steps:
         self.newest = Newest(tables, parts.supervisor.members)
         self.collecting = False
         # The host of the only env, which steps in the calls of a synchronous group.
-        self._alone: StepsAtOnce | None = None
+        self._alone: Executing | None = None
 
     def begin(self, *, shares_thread: bool) -> None:
         """Note what kind of envs were started, and whether other tasks may run during a step."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
-        here = hosts[0] if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce) else None
+        here = hosts[0] if len(hosts) == 1 and isinstance(hosts[0], Executing) else None
         self._alone = here if len(envs) == 1 and not shares_thread else None
         self._requests.in_rings = None not in self._requests.rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0

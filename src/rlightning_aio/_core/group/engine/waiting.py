@@ -19,7 +19,7 @@ import numpy as np
 from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait
 from rlightning_aio._core.group.state.conditions import OF_HOSTS
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
-from rlightning_aio._core.hosts.base import Executing, Membership, Polled, SharesThread
+from rlightning_aio._core.hosts.base import Executing, Membership
 from rlightning_aio._core.hosts.spinner import Spinner
 
 if TYPE_CHECKING:
@@ -328,7 +328,7 @@ class Poller:
         self.inline: deque[tuple[int, Executing]] = deque()
         self._requests = requests
         self._clock = clock
-        self._workers: dict[int, Polled] = {}
+        self._on_bell: dict[int, Host] = {}
         self._on_loop: list[int] = []
         self._memberships: dict[int, Membership] = {}
         self._spinner = Spinner(enabled=True)
@@ -340,18 +340,18 @@ class Poller:
             self.inline.append((host.host_id, host))
         elif isinstance(host, Membership):
             self._memberships[host.host_id] = host
-        elif isinstance(host, Polled):
-            self._workers[host.host_id] = host
-        if isinstance(host, SharesThread):
+        elif host.on_bell:
+            self._on_bell[host.host_id] = host
+        if host.needs_loop:
             self._on_loop.append(host.host_id)
 
     # -- reading results --------------------------------------------------------------
 
     def poll(self) -> None:
         """Read results that are ready without a wake-up."""
-        workers = self._workers
-        for host_id in self.bell.with_news() if workers else ():
-            workers[host_id].poll()
+        on_bell = self._on_bell
+        for host_id in self.bell.with_news() if on_bell else ():
+            on_bell[host_id].poll()
         for host_id, server in self._memberships.items():
             if self._requests.in_flight[host_id]:
                 server.poll()
@@ -394,7 +394,7 @@ class Poller:
         if any(in_flight[host_id] for host_id in self._on_loop):
             return False
         num_busy = 0
-        for host_id in self._workers:
+        for host_id in self._on_bell:
             if in_flight[host_id]:
                 num_busy += 1
         servers: list[Membership] = []
@@ -427,7 +427,7 @@ class Poller:
         Returns True if they are ready already, so no wake-up needs to be awaited.
         """
         bell, in_flight = self.bell, self._requests.in_flight
-        total = sum(map(in_flight.__getitem__, self._workers))
+        total = sum(map(in_flight.__getitem__, self._on_bell))
         if not total:
             bell.disarm()
             return False

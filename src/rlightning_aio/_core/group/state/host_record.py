@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Aborting, Inspectable, Killable, Measured, Membership
+from rlightning_aio._core.hosts.base import Killable, Membership
 from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -148,8 +148,7 @@ class HostRecord:
         rebuild_error: the error of its replacement while rebuilding the envs.
         lost_slots: of envs that are not rebuilt though their host continues.
         last_loss: its last death.
-        killable: the host, if it can be killed; aborting: if it can end single requests; measured:
-            if its use of the cores is known; membership: if envs join and leave it.
+        killable: the host, if it can be killed; membership: if envs join and leave it.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
@@ -185,8 +184,6 @@ class HostRecord:
     lost_slots: set[int] = field(default_factory=set[int])
     last_loss: HostLoss | None = None
     killable: Killable | None = field(init=False)
-    aborting: Aborting | None = field(init=False)
-    measured: Measured | None = field(init=False)
     membership: Membership | None = field(init=False)
     limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
@@ -198,8 +195,6 @@ class HostRecord:
 
     def __post_init__(self) -> None:
         self.killable = self.host if isinstance(self.host, Killable) else None
-        self.aborting = self.host if isinstance(self.host, Aborting) else None
-        self.measured = self.host if isinstance(self.host, Measured) else None
         self.membership = self.host if isinstance(self.host, Membership) else None
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
@@ -209,6 +204,11 @@ class HostRecord:
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    @property
+    def is_worker_here(self) -> bool:
+        """Its envs are in a worker process of this machine."""
+        return self.killable is not None and self.is_local
 
     @property
     def is_down(self) -> bool:
@@ -260,14 +260,14 @@ class HostRecord:
         return self.traffic != before
 
     def inspect(self, slot: int, answer: Callable[[str, str], None], after: float = 0.0) -> None:
-        """Have `answer` get where an env stands, as of `Inspectable`; nothing if nobody can say it.
+        """Have `answer` get where an env stands, as of `Host.inspect`.
 
         Robots are not asked: the signal would end a system call of their SDK early.
         """
-        if isinstance(self.host, Inspectable) and not self.is_hardware:
-            self.host.inspect(slot, answer, after)
-        else:
+        if self.is_hardware:
             answer("", "")
+        else:
+            self.host.inspect(slot, answer, after)
 
     def kill(self, *, dump: bool) -> None:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""

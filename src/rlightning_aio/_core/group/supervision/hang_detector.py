@@ -63,8 +63,7 @@ class HangDetector:
             if record.is_down:
                 no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
                 continue
-            if record.aborting is not None:
-                record.aborting.abort(own)
+            record.host.abort(own)
             if record.killable is not None and record.abort_by is None:
                 record.abort_by = now + _ABORT_SECONDS
                 self.any_ending = True

@@ -119,7 +119,7 @@ class Hints:
         self.due = float("inf") if is_last else min(2 * self.due, HINT_AFTER_BATCHES)
         measured: dict[str, list[HostRecord]] = {}
         for record in self._records:
-            if record.measured is not None:
+            if record.is_worker_here:
                 measured.setdefault(record.config.name, []).append(record)
         for name, records in measured.items():
             sharing = [record for record in records if len(record.slots) > 1]
@@ -182,11 +182,7 @@ class Hints:
             _log.warning("%s", _advice_to_share(name, len(records), num_cores, step_us))
 
     def _look_at_latencies(self, stats: Stats, num_cores: int) -> None:
-        workers = Counter(
-            record.config.name
-            for record in self._records
-            if record.killable is not None and record.is_local
-        )
+        workers = Counter(record.config.name for record in self._records if record.is_worker_here)
         warned = {name for name, since in self._since.items() if since is None}
         configs = [r.config for r in self._records if r.config.name not in warned]
         text = hint(configs, workers, num_cores, stats.summary(time.monotonic_ns())["latency_us"])
@@ -197,8 +193,7 @@ class Hints:
 def _now(records: Sequence[HostRecord]) -> _Since | None:
     ran = queued = 0
     for record in records:
-        assert record.measured is not None
-        times = record.measured.processor_times()
+        times = record.host.processor_times()
         if times is None:
             return None
         ran += times[0]

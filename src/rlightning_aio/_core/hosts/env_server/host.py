@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rlightning_aio._core.hosts.base import Membership
 from rlightning_aio._core.hosts.env_server.listener import Listener
 from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio._core.hosts.messages import (
@@ -102,8 +103,8 @@ class _ClientRow:
             return self.write(result)
 
 
-class EnvServerHost:
-    """See `base.Host`, `Polled` and `Membership`. It also posts results that answer no request."""
+class EnvServerHost(Membership):
+    """See `base.Host` and `Membership`. It also posts results that answer no request."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         config = order.config
@@ -245,7 +246,7 @@ class EnvServerHost:
         return self._sessions.reset(row.name, number, seed, options, now)
 
     def abort(self, entries: NDArray[np.int64]) -> None:
-        """See `base.Aborting`. The client is lost, and may come back with a new session."""
+        """See `base.Host.abort`. The client is lost, and may come back with a new session."""
         for entry in cast("list[int]", entries.tolist()):
             row = self._rows[slot_of(entry) - self.first_slot]
             self._sessions.dismiss(row.name, "the trainer aborted its request")

@@ -11,6 +11,7 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.messages import (
     Built,
@@ -48,8 +49,8 @@ _Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
 _STEP: Final = int(Operation.STEP)
 
 
-class InlineHost:
-    """Runs envs in this process; see `base.Host`, `Aborting` and `Executing`."""
+class InlineHost(Host):
+    """Runs envs in this process; see `base.Host` and `Executing`."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -112,7 +113,7 @@ class InlineHost:
             self._queue.append((entry, execute))
 
     def abort(self, entries: NDArray[np.int64]) -> None:
-        """See `base.Aborting`. Steps that simulators have begun by themselves are executed."""
+        """See `base.Host.abort`. Steps that simulators have begun by themselves are executed."""
         aborted = set(cast("list[int]", entries.tolist()))
         for waiting in list(self._queue):
             entry = waiting[0]
@@ -138,7 +139,6 @@ class InlineHost:
         return True
 
     def step_now(self) -> OutOfBand | None:
-        """Step env 0 with the action in its row; the queue must have no request to it."""
         runner = self._runners[0]
         try:
             return self._watcher.interruptible(runner.step)

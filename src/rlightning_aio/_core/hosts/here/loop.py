@@ -14,6 +14,7 @@ import numpy as np
 
 from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import Built, Closed, Reported, Result
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.runner import attach_all
@@ -30,10 +31,11 @@ if TYPE_CHECKING:
 __all__ = ["LoopHost"]
 
 
-class LoopHost:
-    """See `base.Host`, `Aborting`, `Inspectable`, `Polled` and `SharesThread`. No descriptor."""
+class LoopHost(Host):
+    """Runs awaitable envs on the event loop of the trainer; see `base.Host`."""
 
-    shares_thread = True
+    on_bell = True
+    needs_loop = True
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -97,7 +99,7 @@ class LoopHost:
             self._envs.submit(entry, None if arguments is None else arguments[position])
 
     def abort(self, entries: NDArray[np.int64]) -> None:
-        """See `base.Aborting`."""
+        """End requests by a cancellation of what their envs await; see `base.Host.abort`."""
         for entry in entries.tolist():
             self._envs.abort(entry)
 

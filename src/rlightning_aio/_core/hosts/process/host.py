@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -288,11 +289,13 @@ def _surroundings(config: EnvConfig) -> tuple[object, ...]:
     return config.interpreter, tuple(sorted(config.env_vars.items()))
 
 
-class ProcessHost:
+class ProcessHost(Host):
     """The trainer's handle on one worker process.
 
-    See `base.Host`, `Inspectable`, `Killable` and `Polled`.
+    See `base.Host` and `Killable`.
     """
+
+    on_bell = True
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -353,7 +356,7 @@ class ProcessHost:
         self._fork_server.destroy()
 
     def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
-        """See `base.Inspectable`. A worker that steps one env stands where that stands."""
+        """See `base.Host.inspect`. A worker that steps one env stands where that stands."""
         del slot
         self._inspecting.append(answer)
         if len(self._inspecting) == 1:
@@ -430,7 +433,7 @@ class ProcessHost:
             self._link.submit(entries, arguments)
 
     def abort(self, entries: NDArray[np.int64]) -> None:
-        """See `base.Aborting`. A worker only reads this between requests, if its envs block."""
+        """See `base.Host.abort`. A worker only reads this between requests, if its envs block."""
         if self._link is not None:
             for entry in entries.tolist():
                 self._link.send(FrameKind.ABORT, entry)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.limits import limits_of
@@ -124,7 +125,7 @@ class _Life:
         kill(self.actor)
 
 
-class RayHost:
+class RayHost(Host):
     """The trainer's handle on one actor; see `base.Host`, `Source` and `Killable`.
 
     Raises:
