@@ -13,10 +13,10 @@ import pytest
 from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
-from rlightning_aio import Outcome
+from rlightning_aio import Outcome, sync
 from rlightning_aio.attempts import Attempt
 from rlightning_aio.attempts.file import log_of
-from rlightning_aio.evaluation import EpisodeSpec, ResultsFile
+from rlightning_aio.evaluation import EpisodeSpec, ResultsFile, evaluate
 
 
 @pytest.mark.parametrize(
@@ -77,6 +77,14 @@ def test_a_seed_for_a_queue_is_refused() -> None:
     """It would be ignored."""
     with pytest.raises(ValueError, match="seed is for a number of episodes"):
         evaluated(group_of(), seed=3)
+
+
+def test_clients_are_not_evaluated() -> None:
+    """They come and go."""
+    server = {"name": "robots", "backend": "env_server"}
+    refused = pytest.raises(ValueError, match="robots-0 is an env_server")
+    with sync.build_env_group(server) as group, refused:
+        evaluate(group, None, 1)
 
 
 @pytest.mark.parametrize("as_list", [True, False])
