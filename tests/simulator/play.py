@@ -674,8 +674,13 @@ class Play(Session):
         self.context, self.model.context = context, Context(limit, on_done)
 
     async def op_leave(self, rng: Random) -> None:
-        if self.context is not None and not self.nested:
-            self.leave()
+        if self.context is None or self.nested:
+            return
+        self.leave()
+        if rng.random() < 0.5:  # What a step outside did to limits shows in the next context.
+            await self.op_step(rng)
+            await self.op_enter(rng)
+            await self.op_step(rng)
 
     def leave(self) -> None:
         self.context.__exit__(None, None, None)
