@@ -7,6 +7,7 @@ Rule: the hot path only appends. Whatever is computed is computed from many samp
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
 __all__ = ["LEAST_ROWS", "EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
 
 WINDOW_SECONDS: Final = 10.0
-_MOST_ROWS: Final = 1 << 14
-"""The number of results that are summed at once, which bounds how long that takes."""
-LEAST_ROWS: Final = 64
+_MOST_ROWS: Final = 1 << 12
+"""The number of results that are summed at once: their columns still fit into a core's cache."""
+LEAST_ROWS: Final = 16
 """For how many results each sample counts: to sum them one by one would take longer than a step."""
 
 
@@ -252,5 +253,6 @@ def percentiles(values: NDArray[np.float64]) -> tuple[float, float]:
     process that is out of descriptors, which must still be able to collect.
     """
     ranks = np.array([0.5, 0.99]) * (len(values) - 1)
-    p50, p99 = np.interp(ranks, np.arange(len(values)), np.sort(values)).tolist()
+    near = [k for rank in ranks.tolist() for k in (math.floor(rank), math.ceil(rank))]
+    p50, p99 = np.interp(ranks, near, np.partition(values, near)[near]).tolist()
     return p50, p99
