@@ -1,7 +1,7 @@
 """Transitions of requests: every line of `LEGAL`, and why no other can happen.
 
-`Requests` has no method for each event of its table; `Driven` maps events to calls. A state machine
-then does all of it at random, over several hosts, and compares with a naive model.
+`Requests` has no method for each event of its table; `Driven` maps events to calls. What many
+events of several hosts lead to, random programs show (`tests/simulator`).
 """
 
 from __future__ import annotations
@@ -10,14 +10,10 @@ import itertools
 import os
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rlightning_aio._core.group.state.checked import CheckedRequests
 from rlightning_aio._core.group.state.request_states import (
@@ -29,11 +25,10 @@ from rlightning_aio._core.group.state.request_states import (
     State,
 )
 from rlightning_aio.errors import EnvFault
-from rlightning_aio.protocol.entries import SLOT_MASK, Operation
-from rlightning_aio.protocol.entries import entry as entry_of
+from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from rlightning_aio._core.group.state.requests import Ticket
 
@@ -303,6 +298,30 @@ def test_a_first_result_is_handed_out_once() -> None:
 # -- the debug mode
 
 
+def test_a_late_reply_has_no_effect() -> None:
+    """That of a request which another has taken the place of, after a death."""
+    table = CheckedRequests(HOST_OF, 2)
+    slots = np.array([SLOT])
+    (late,) = table.submit(slots, Operation.STEP, COLLECTOR, 1.0).tolist()
+    table.lose_host(1)
+    (entry,) = table.restart(1, slots).tolist()
+    assert table.end(1, late) is table.complete_one(1, late) is None
+    assert not len(table.complete([(1, np.array([late]))]))
+    assert table.state[SLOT] == State.BUSY
+    assert table.complete_one(1, entry) == SLOT
+
+
+def test_results_that_came_first_are_taken_first() -> None:
+    """Those that came together are in any order."""
+    table = CheckedRequests(HOST_OF, 2)
+    first, *others = table.submit(np.arange(3), Operation.STEP, COLLECTOR, 1.0).tolist()
+    assert table.complete([(1, np.array(others))]).tolist() == [1, 2]
+    assert table.complete_one(0, first) == 0
+    taken = [table.collector.take(1).item() for _ in range(3)]
+    assert sorted(taken[:2]) == [1, 2]
+    assert taken[2] == 0
+
+
 @pytest.mark.parametrize(
     ("state", "owner", "event"),
     [
@@ -353,407 +372,3 @@ def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bo
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, capture_output=True, check=True, text=True, env=variables)
     assert ended.stdout.split() == ["CheckedRequests" if checked else "Requests"]
-
-
-# -- everything at once, compared with a model
-
-
-@dataclass
-class Asked:
-    """The model's view of a slot.
-
-    Attributes:
-        came: counts the moments at which results came.
-        error: that it ended in.
-    """
-
-    op: Operation | None = None
-    state: State = State.IDLE
-    owner: Claim | None = None
-    nobodys: bool = False
-    entry: int = 0
-    came: int = 0
-    error: EnvFault | None = None
-
-
-@dataclass(eq=False)
-class Claim:
-    """The model's view of a call."""
-
-    ticket: Ticket
-    slots: list[int]
-    faults: list[EnvFault] = field(default_factory=list[EnvFault])
-
-
-class RequestsMachine(RuleBasedStateMachine):
-    """Each rule acts on the table and on the model; the invariant compares them."""
-
-    @initialize(counts=st.lists(st.integers(1, 3), min_size=1, max_size=4))
-    def begin(self, counts: list[int]) -> None:
-        self.host_of = np.repeat(np.arange(len(counts)), counts)
-        self.table = CheckedRequests(self.host_of, len(counts))
-        self.slots = [Asked() for _ in self.host_of]
-        self.claims: list[Claim] = []
-        self.late: list[int] = []
-        self.faults: list[EnvFault] = []
-        self.moment = 0
-
-    # -- drawing
-
-    def those(self, *states: State, host: int | None = None) -> list[int]:
-        return [
-            slot
-            for slot, asked in enumerate(self.slots)
-            if asked.state in states and host in (None, self.host_of[slot])
-        ]
-
-    def some(self, data: st.DataObject, slots: list[int]) -> list[int]:
-        return data.draw(st.lists(st.sampled_from(slots), min_size=1, unique=True))
-
-    def one_busy(self, data: st.DataObject) -> tuple[int, Asked]:
-        slot = data.draw(st.sampled_from(self.those(State.BUSY)))
-        return slot, self.slots[slot]
-
-    # -- requests
-
-    def ask(self, slots: list[int], op: Operation, claim: Claim | None) -> None:
-        asked = np.array(slots, np.intp)
-        owner = COLLECTOR if claim is None else claim.ticket.owner
-        by_auto_reset = op is Operation.RESET and claim is None
-        entries = self.table.submit(asked, Operation.STEP if by_auto_reset else op, owner, 1.0)
-        if by_auto_reset:
-            self.table.numbering.into_resets(asked, entries, np.ones(len(slots), np.bool_))
-        parts = list(self.table.by_host(asked))
-        given = [slot for _, part in parts for slot in asked[part].tolist()]
-        assert given == slots
-        assert all((self.host_of[asked[part]] == host).all() for host, part in parts)
-        for slot, entry in zip(slots, entries.tolist(), strict=True):
-            self.slots[slot] = Asked(op, State.BUSY, claim, entry=entry)
-
-    @precondition(lambda self: self.those(State.IDLE))
-    @rule(data=st.data(), reset=st.booleans())
-    def ask_for_the_collector(self, data: st.DataObject, reset: bool) -> None:
-        op = Operation.RESET if reset else Operation.STEP
-        self.ask(self.some(data, self.those(State.IDLE)), op, None)
-
-    @precondition(lambda self: self.those(State.IDLE))
-    @rule(data=st.data(), op=st.sampled_from((Operation.STEP, Operation.RESET, Operation.CALL)))
-    def ask_for_a_call(self, data: st.DataObject, op: Operation) -> None:
-        """Send requests of a call. A reset also gets the first results of new clients."""
-        slots = self.some(data, self.those(State.IDLE))
-        joined = self.joined() if op is Operation.RESET else []
-        taken = self.some(data, joined) if joined else []
-        everyone = np.array(slots + taken, np.intp)
-        method = "render" if op is Operation.CALL else ""
-        claim = Claim(self.table.tickets.open(everyone, method=method), slots + taken)
-        self.claims.append(claim)
-        if taken:
-            self.table.claim(np.array(taken), claim.ticket)
-            for slot in taken:
-                self.slots[slot].owner = claim
-        self.ask(slots, op, claim)
-
-    @rule(data=st.data(), method=st.sampled_from(("", "render")))
-    def refuse(self, data: st.DataObject, method: str) -> None:
-        """Make a call that is refused before it sends anything; the requests of others stay."""
-        slots = self.some(data, list(range(len(self.slots))))
-        self.table.give_up(self.table.tickets.open(np.array(slots), method=method))
-
-    @precondition(lambda self: self.those(State.IDLE))
-    @rule(data=st.data())
-    def join(self, data: st.DataObject) -> None:
-        slot = data.draw(st.sampled_from(self.those(State.IDLE)))
-        self.table.join(slot, 1.0)
-        self.moment += 1
-        entry = self.table.numbering.entry.item(slot)
-        self.slots[slot] = Asked(Operation.JOIN, State.READY, entry=entry, came=self.moment)
-
-    def joined(self) -> list[int]:
-        return [
-            slot
-            for slot in self.those(State.READY)
-            if self.slots[slot].op is Operation.JOIN and self.slots[slot].owner is None
-        ]
-
-    @precondition(lambda self: self.joined())
-    @rule(data=st.data())
-    def drop_first_results(self, data: st.DataObject) -> None:
-        slots = self.some(data, self.joined())
-        self.table.claim(np.array(slots), None)
-        for slot in slots:
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    # -- answers
-
-    def deliver(self, slots: list[int]) -> None:
-        self.moment += 1
-        for slot in slots:
-            self.slots[slot].state, self.slots[slot].came = State.READY, self.moment
-
-    @precondition(lambda self: self.those(State.BUSY))
-    @rule(data=st.data())
-    def report(self, data: st.DataObject) -> None:
-        """Results of one host, among them some that are late."""
-        host = int(self.host_of[self.one_busy(data)[0]])
-        busy = [
-            slot
-            for slot in self.those(State.BUSY, host=host)
-            if self.slots[slot].op is not Operation.CALL
-        ]
-        slots = data.draw(st.lists(st.sampled_from(busy), unique=True)) if busy else []
-        reported = [self.slots[slot].entry for slot in slots]
-        # A worker that writes where it should not may report an env that doesn't exist.
-        late = [*self.late, entry_of(1, SLOT_MASK, Operation.STEP)]
-        reported += data.draw(st.lists(st.sampled_from(late), max_size=2))
-        entries = np.array(data.draw(st.permutations(reported)), np.int64)
-        found = self.table.complete([(host, entries)]).tolist()
-        assert sorted(found) == sorted(slots)
-        self.deliver(found)
-
-    @precondition(lambda self: self.those(State.BUSY))
-    @rule(data=st.data())
-    def answer(self, data: st.DataObject) -> None:
-        """End one request with the kind of reply it was sent for."""
-        slot, asked = self.one_busy(data)
-        host = int(self.host_of[slot])
-        if asked.op is not Operation.CALL:
-            assert self.table.complete_one(host, asked.entry) == slot
-            self.deliver([slot])
-            return
-        assert self.table.end(host, asked.entry) == slot
-        self.table.set_value(slot, slot)
-        if asked.owner is not None:
-            assert asked.owner.ticket.values[slot] == slot
-        self.finish(slot)
-
-    def finish(self, slot: int) -> None:
-        """Record the end of a request without a result."""
-        asked = self.slots[slot]
-        if asked.owner is None:
-            self.slots[slot] = Asked(entry=asked.entry)
-        else:
-            asked.state = State.SPENT
-
-    def fail(self, slots: list[int]) -> None:
-        """End requests that are no longer in flight in one error for each owner."""
-        owners = self.table.owners(np.array(slots, np.intp))
-        assert sorted(slot for _, mine in owners for slot in mine.tolist()) == sorted(slots)
-        for owner, mine in owners:
-            error = fault()
-            self.table.fail(mine, owner, error)
-            first = self.slots[mine.item(0)]
-            if first.owner is not None:
-                first.owner.faults.append(error)
-            elif not first.nobodys:
-                self.faults.append(error)
-            for slot in mine.tolist():
-                if self.slots[slot].nobodys:
-                    self.finish(slot)
-                else:
-                    self.slots[slot].state, self.slots[slot].error = State.SPENT, error
-
-    @precondition(lambda self: self.those(State.BUSY))
-    @rule(data=st.data())
-    def raise_error(self, data: st.DataObject) -> None:
-        slot, asked = self.one_busy(data)
-        assert self.table.end(int(self.host_of[slot]), asked.entry) == slot
-        self.fail([slot])
-
-    @precondition(lambda self: self.those(State.BUSY))
-    @rule(data=st.data())
-    def withdraw(self, data: st.DataObject) -> None:
-        """Withdraw a request: a collect gets nothing for it, a call an error."""
-        slot, asked = self.one_busy(data)
-        assert self.table.end(int(self.host_of[slot]), asked.entry) == slot
-        if asked.owner is None and not asked.nobodys:
-            self.table.withdraw(slot)
-            self.finish(slot)
-        else:
-            self.fail([slot])
-
-    @precondition(lambda self: self.those(State.BUSY))
-    @rule(data=st.data(), how=st.sampled_from(("reported", "ended", "lost")))
-    def abort(self, data: st.DataObject, how: str) -> None:
-        """Whatever a host says of requests that were aborted, they end without a reply."""
-        host = int(self.host_of[self.one_busy(data)[0]])
-        slots = self.some(data, self.those(State.BUSY, host=host))
-        errors = {slot: fault() for slot in slots}
-        for slot in slots:
-            self.table.aborted.add(slot, errors[slot])
-        entries = [self.slots[slot].entry for slot in slots]
-        if how == "reported":
-            assert not len(self.table.complete([(host, np.array(entries))]))
-        elif how == "ended":
-            assert [self.table.end(host, entry) for entry in entries] == [None] * len(slots)
-        else:
-            self.die_with(host, aborted=slots)
-        assert not self.table.aborted.faults
-        for slot in slots:
-            claim = self.slots[slot].owner
-            if claim is not None:
-                claim.slots.remove(slot)
-                claim.faults.append(errors[slot])
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    @precondition(lambda self: self.late)
-    @rule(data=st.data())
-    def answer_late(self, data: st.DataObject) -> None:
-        """Send a late reply, which has no effect."""
-        entry = data.draw(st.sampled_from(self.late))
-        host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
-        assert self.table.end(host, entry) is None
-        assert self.table.complete_one(host, entry) is None
-
-    # -- deaths
-
-    @rule(data=st.data(), replaced=st.booleans())
-    def die(self, data: st.DataObject, replaced: bool) -> None:
-        """Let a host die: steps and resets are sent again to a replacement; all else ends in
-        errors.
-        """
-        self.die_with(data.draw(st.sampled_from(range(len(self.table.in_flight)))), replaced)
-
-    def die_with(self, host: int, replaced: bool = True, aborted: Sequence[int] = ()) -> None:
-        """Let a host die, for whose death there may be requests that were aborted."""
-        owed = self.those(State.BUSY, host=host)
-        self.table.lose_host(host)
-        others = self.table.end_aborted(np.array(owed, np.intp)).tolist()
-        assert others == [slot for slot in owed if slot not in aborted]
-        owed = others
-        again = [s for s in owed if replaced and self.slots[s].op is not Operation.CALL]
-        if failed := [slot for slot in owed if slot not in again]:
-            self.fail(failed)
-        if not again:
-            return
-        asked = np.array(again)
-        entries = self.table.restart(host, asked).tolist()
-        for slot, entry in zip(again, entries, strict=True):
-            self.late.append(self.slots[slot].entry)
-            self.slots[slot].entry, self.slots[slot].op = entry, Operation.RESET
-
-    # -- calls that end
-
-    @precondition(lambda self: self.claims)
-    @rule(data=st.data())
-    def settle_or_give_up(self, data: st.DataObject) -> None:
-        """Settle a call that has nothing left to wait for; cancel any other."""
-        claim = data.draw(st.sampled_from(self.claims))
-        self.claims.remove(claim)
-        if any(self.slots[slot].state is State.BUSY for slot in claim.slots):
-            self.give_up(claim)
-            return
-        self.table.settle(claim.ticket)
-        ready = [slot for slot in claim.slots if self.slots[slot].state is State.READY]
-        assert sorted(self.table.ready(claim.ticket.slots).tolist()) == sorted(ready)
-        self.table.hand_out(np.array(ready, np.intp))
-        for slot in claim.slots:
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    @precondition(lambda self: self.claims)
-    @rule(data=st.data())
-    def interrupt(self, data: st.DataObject) -> None:
-        """Cancel a call, possibly at the moment when it has all replies."""
-        claim = data.draw(st.sampled_from(self.claims))
-        self.claims.remove(claim)
-        self.give_up(claim)
-
-    def give_up(self, claim: Claim) -> None:
-        self.table.give_up(claim.ticket)
-        self.moment += 1
-        if not claim.ticket.calls:
-            self.faults += claim.faults
-        for slot in claim.slots:
-            asked = self.slots[slot]
-            asked.owner = None
-            if asked.state is State.SPENT and not claim.ticket.calls:
-                continue  # It is busy until the collector raises its error.
-            if asked.state is State.SPENT:
-                self.slots[slot] = Asked(entry=asked.entry)
-            elif claim.ticket.calls:
-                asked.nobodys = True
-            elif asked.state is State.READY:
-                asked.came = self.moment
-
-    # -- the collector
-
-    def collectable(self) -> list[int]:
-        return [slot for slot in self.those(State.READY) if not self.slots[slot].owner]
-
-    @precondition(collectable)
-    @rule(most=st.integers(1, 6))
-    def take(self, most: int) -> None:
-        """Collect: first come, first served; results that came together are in any order."""
-        here = self.collectable()
-        taken = self.table.collector.take(most).tolist()
-        assert len(taken) == len(set(taken)) == min(most, len(here))
-        assert set(taken) <= set(here)
-        assert taken == sorted(taken)
-        came = sorted(self.slots[slot].came for slot in taken)
-        assert came == sorted(self.slots[slot].came for slot in here)[:most]
-        self.table.hand_out(np.array(taken, np.intp))
-        for slot in taken:
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    def failed(self) -> list[int]:
-        return [slot for slot in self.those(State.SPENT) if self.slots[slot].owner is None]
-
-    @precondition(lambda self: self.faults)
-    @rule(data=st.data())
-    def raise_for_the_collector(self, data: st.DataObject) -> None:
-        """Raise an error; all envs whose requests it answers are free."""
-        error = self.faults.pop(data.draw(st.integers(0, len(self.faults) - 1)))
-        slots = [slot for slot in self.failed() if self.slots[slot].error is error]
-        assert sorted(self.table.collector.take_fault(error).tolist()) == slots
-        for slot in slots:
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    @precondition(lambda self: self.failed())
-    @rule(data=st.data())
-    def free_failed(self, data: st.DataObject) -> None:
-        """Free envs whose errors wait; the errors stay."""
-        slots = self.some(data, list(range(len(self.slots))))
-        free = [slot for slot in slots if slot in self.failed()]
-        assert self.table.collector.free(slots).tolist() == free
-        for slot in free:
-            self.slots[slot] = Asked(entry=self.slots[slot].entry)
-
-    # -- invariants
-
-    @invariant()
-    def the_table_is_the_model(self) -> None:
-        table, slots = self.table, self.slots
-        assert table.state.tolist() == [asked.state for asked in slots]
-        owners = [NOBODY if a.nobodys else a.owner.ticket.owner if a.owner else 0 for a in slots]
-        assert table.owner.tolist() == owners
-        assert table.numbering.entry[[a.state is not State.IDLE for a in slots]].tolist() == [
-            asked.entry for asked in slots if asked.state is not State.IDLE
-        ]
-        for slot, asked in enumerate(slots):
-            assert table.is_idle(slot) == (asked.state is State.IDLE)
-            assert asked.op in (None, table.numbering.op(slot))
-
-    @invariant()
-    def the_counts_are_the_models(self) -> None:
-        table, slots = self.table, self.slots
-        num_hosts = len(table.in_flight)
-        busy = self.those(State.BUSY)
-        assert table.in_flight == [len(self.those(State.BUSY, host=h)) for h in range(num_hosts)]
-        assert set(table.collector.faults) == set(self.faults)
-        assert len(table.collector.faults) == len(self.faults)
-        mine = [s for s in busy if slots[s].owner is None and not slots[s].nobodys]
-        ready = self.collectable()
-        assert (table.collector.num_ready, table.collector.num_awaited) == (len(ready), len(mine))
-        assert table.owed(np.arange(len(slots))).tolist() == busy
-        not_idle = [slot for slot, asked in enumerate(slots) if asked.state is not State.IDLE]
-        assert table.first_not_idle(np.arange(len(slots))) == (not_idle[0] if not_idle else None)
-
-    @invariant()
-    def tickets_know_what_is_outstanding(self) -> None:
-        for claim in self.claims:
-            busy = [slot for slot in claim.slots if self.slots[slot].state is State.BUSY]
-            assert claim.ticket.remaining == len(busy)
-            assert set(claim.ticket.faults) == set(claim.faults)
-
-
-TestRequests = RequestsMachine.TestCase
-TestRequests.settings = settings(stateful_step_count=30)

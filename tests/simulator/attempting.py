@@ -68,7 +68,6 @@ class Attempts(InContext):
 
     def begin(self) -> None:
         super().begin()
-        self.metas = {meta.env_id.rpartition("-")[0]: meta for meta in self.group.metas}
         self.has_ended = False
 
     def drawn_limit(self, rng: Random) -> float | None:
@@ -158,7 +157,7 @@ class Attempts(InContext):
         if self.has_ended:
             return
         self.op_seed, self.played, self.stubborn = rng.getrandbits(32), {}, set()
-        specs = self._specs(rng)
+        specs = self.specs(rng, 6)
         size, rules = rng.randint(1, 4), self._rules(rng)
         leave = self._leave(rng, len(specs))
         leaves = leave != (None, None)
@@ -179,14 +178,6 @@ class Attempts(InContext):
             require(keys == sorted(spec.key for spec in specs), "other groups", keys)
         if self.stubborn:
             await asyncio.wait(self.stubborn)
-
-    def _specs(self, rng: Random) -> list[EpisodeSpec]:
-        specs: list[EpisodeSpec] = []
-        for k in range(rng.randint(1, 6)):
-            name, options = rng.choice([*self.metas]), rng.choice([None, {"token": 1 + k}])
-            seed = 100 * k + rng.randrange(100)
-            specs.append(EpisodeSpec(self.metas[name].task, seed, options, name))
-        return specs
 
     def _rules(self, rng: Random) -> Rules:
         times = "timeouts" in self.features and rng.random() < 0.6
@@ -258,9 +249,13 @@ class Attempts(InContext):
 
     def _end(self, error: RLightningError) -> None:
         """Check that all envs are gone that could play something."""
-        given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
+        given_up = self.given_up()
         entries = {env.entry.name for env in self.envs if env.env_id not in given_up}
-        require(given_up and entries != {*self.metas}, "no env is left", repr(error))
+        require(
+            given_up and entries < {plan.name for plan in self.program.plans},
+            "no env is left",
+            repr(error),
+        )
         if isinstance(error, WorkerDied):
             self.lose(error)
         self.has_ended = True
@@ -377,8 +372,7 @@ class Attempts(InContext):
 
     async def finish(self) -> None:
         self.plain = True
-        given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
-        self.has_ended |= bool(given_up)
+        self.has_ended |= bool(self.given_up())
         await self.op_attempts(Random(1))
         await super().finish()
 

@@ -86,6 +86,22 @@ class InContext(Session):
     async def finish(self) -> None:
         self.context.__exit__(None, None, None)
 
+    def specs(self, rng: Random, most: int) -> list[EpisodeSpec]:
+        """Draw episodes of any entries."""
+        tasks = {meta.env_id.rpartition("-")[0]: meta.task for meta in self.group.metas}
+        specs: list[EpisodeSpec] = []
+        for k in range(rng.randint(1, most)):
+            name, options = rng.choice([*tasks]), rng.choice([None, {"token": 1 + k}])
+            specs.append(EpisodeSpec(tasks[name], 100 * k + rng.randrange(100), options, name))
+        return specs
+
+    def given_up(self) -> set[str]:
+        """Envs whose worker is not replaced, as the group says."""
+        return {env_id for worker in self.group.get_workers() for env_id in worker["given_up"]}
+
+    def any_gone(self) -> bool:
+        return any(env.gone for env in self.envs)
+
     def lose(self, fault: WorkerDied) -> None:
         """Note envs whose worker is not replaced."""
         for env_id in fault.env_ids:
@@ -230,9 +246,6 @@ class Training(InContext):
             await self.replay()
         await super().finish()
 
-    def any_gone(self) -> bool:
-        return any(env.gone for env in self.envs)
-
     async def replay(self) -> None:
         """Do the same with other envs in the recorded order: the rollouts are the same."""
         rollouts = [copies for _, copies in self.kept]
@@ -358,7 +371,7 @@ class Evaluations(InContext):
             self.lose(fault)
         except RLightningError as error:  # An evaluation before has heard of it.
             self.count(error)
-            given_up = {one for host in self.group.get_workers() for one in host["given_up"]}
+            given_up = self.given_up()
             require(given_up, "no env is left", repr(error))
             for env_id in given_up:
                 self.by_id[env_id].gone = True
@@ -372,9 +385,6 @@ class Evaluations(InContext):
                 self.lose(fault)
             except EnvRaised as fault:  # In an env of this process.
                 require(fault.exception_type == "KeyboardInterrupt", "an error", repr(fault))
-
-    def any_gone(self) -> bool:
-        return any(env.gone for env in self.envs)
 
     async def _number(self, rng: Random) -> None:
         """As many episodes of each env."""
@@ -394,12 +404,7 @@ class Evaluations(InContext):
 
     async def _queue(self, rng: Random) -> None:
         """A queue of episodes, for any env of their entries."""
-        metas = {meta.env_id.rpartition("-")[0]: meta for meta in self.group.metas}
-        specs: list[EpisodeSpec] = []
-        for k in range(rng.randint(1, 8)):
-            name, options = rng.choice([*metas]), rng.choice([None, {"token": 1 + k}])
-            seed = 100 * k + rng.randrange(100)
-            specs.append(EpisodeSpec(metas[name].task, seed, options, name))
+        specs = self.specs(rng, 8)
         found = await self.done(evaluate(self.group, self.policy, specs))
         keys = sorted(one.spec.key for one in found.attempts)
         require(keys == sorted(spec.key for spec in specs), "other episodes", keys)
