@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 MARKS = {"worker_restarted", "client_lost"}
 UNSHOWN = "unshown"
 """What an env does that can't show the state to which it was put back after a death."""
+AGAIN = " (in the reset after its env "
+"""So goes on what is raised in the reset of an awaitable env that hung before."""
 COLLECTOR = "collector"
 """Owner of the requests whose results a collect returns."""
 
@@ -601,6 +603,8 @@ class Model:
         acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
             acts += state.faults(Request("reset"))
+        if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
+            acts += env.fresh().faults(self._begun_again(env, request))
         found = [act for act in acts if act[0] in (*RAISING, "rubbish")]
         shows = request.kind == "step" and not request.due and env.may_be_lost
         if shows and any("bound" in info for state in env.saves for info in state.infos):
@@ -789,6 +793,12 @@ class Model:
                 self.counts["resumed, and not shown"] += 1
             if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
                 check_outcome(fault, request, effect, token)
+            if request.resets:  # An awaitable env that hangs after that is reset like this again.
+                env.state.begun = request.seed, request.options
+            elif AGAIN in fault.exception_text:
+                begun, env.state = env.state.begun, env.fresh()
+                env.state.begun, env.loose = begun, []
+                env.seen = min(env.seen + 1, env.deaths)
             self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
             require(is_rubbish and not request.resets, "an error of nobody", repr(fault), request)
@@ -829,7 +839,8 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
         "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
         UNSHOWN: (f"the result can't be pickled: {NOT_SHOWN}", "TypeError", TypeError),
     }[effect]
-    require(fault.exception_text == text, "another error", fault.exception_text, text)
+    found = fault.exception_text.partition(AGAIN)[0]
+    require(found == text, "another error", fault.exception_text, text)
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
     require(isinstance(fault, builtin), "another class", type(fault))
     require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")

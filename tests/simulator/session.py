@@ -131,12 +131,21 @@ class Session:
         """Close the group; what is said of envs that don't close must be true."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            await self.done(self.group.close())
+            try:
+                await self.done(self.close_group())
+            except KeyboardInterrupt:  # No call came after it that could raise it.
+                raised = self.counts["Ctrl-C in a wait"] + self.counts["Ctrl-C in a send"]
+                pressed = self.world and self.world.counts["interrupts"]
+                require(pressed and pressed > raised, "nobody has pressed Ctrl-C")
         texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
         self.counts["close raised"] += len(texts)
         for text in texts:
             own = any(f"'{env_id}'" in text for env_id in self.unclosable)
             require(own or "its worker" in text, "a warning", text)
+
+    def close_group(self) -> Any:
+        """Close what `build` or `start` has made."""
+        return self.group.close()
 
     async def play(self, number: int, op: Op) -> None:
         """Do an operation."""

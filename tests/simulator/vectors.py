@@ -76,7 +76,7 @@ class Vectors(Session):
             return mode
         return Random(self.program.seed).choice(["next_step", "same_step", "disabled"])
 
-    async def close(self) -> None:
+    def close_group(self) -> None:
         if hasattr(self, "rows"):
             self.rows.close()
 
