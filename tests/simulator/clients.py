@@ -188,10 +188,30 @@ class Client:
 
     def note_away(self, request: Request) -> None:
         """Check an error that says that it is not connected."""
+        self.is_known = True
         gone = self.is_out or (request.resets and self.may_be_lost)
         require(gone, "away, and its loss was not reported", self.env.env_id, request)
         self.withdrawn = None if self.withdrawn is None else request.sent
         self.is_in, self.is_out = False, True
+
+    def note_raised(self, request: Request) -> None:
+        """Note that its env has raised: in a reset perhaps in a session that shows nothing else."""
+        env, self.is_known = self.env, True
+        firsts = self._firsts()
+        if request.resets and not self.is_in:
+            require(firsts, "it has raised, and was not back", env.env_id, request)
+            env.adopt(firsts.pop(0))
+            self.session, self.last = self.session + 1, env.state.scripts.words
+            self.is_in, self.is_out, self.withdrawn = True, False, None
+        if request.resets:
+            env.loose += firsts
+
+    def _firsts(self) -> list[State]:
+        """The states that begin the sessions after the one that the trainer knows."""
+        firsts = [begun.before.copy() for begun in self.sessions[self.session + 1 :]]
+        for state in firsts:
+            state.play(Request("reset"))
+        return firsts
 
     def note_aborted(self) -> None:
         """Note that the trainer has dropped a result, or has ended the session."""
@@ -269,6 +289,7 @@ class Client:
         seen = [self.last, *(state.scripts.words for state in self.env.loose)]
         if request.resets or self.is_out:  # Which may have dropped a first result.
             seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
+            seen += [state.scripts.words for state in self._firsts()]
         require(row.words in seen, "not its last observation", seen)
         self.is_in, self.is_out, self.env.dirty, self.withdrawn = False, True, False, None
         model.counts["clients lost"] += 1

@@ -750,10 +750,10 @@ class Model:
             env.seen = max(env.seen + 1, request.deaths)
             return
         if env.client is not None:
-            env.client.is_known = True
             if isinstance(fault, EnvAway):
                 env.client.note_away(request)
                 return
+            env.client.note_raised(request)
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
         if request.kind != "call":
