@@ -109,8 +109,8 @@ class GroupClosed(RLightningError, RuntimeError):
 class SnapshotError(RLightningError, ValueError):
     """A snapshot can't be restored, because it is damaged or of other envs; nothing was changed.
 
-    Or it can't be taken, because envs are robots or clients, were never reset, or have lost their
-    episode in a restore that failed or in an abort.
+    Or it can't be taken, because envs are robots, were never reset, or have lost their episode in a
+    restore that failed or in an abort.
     """
 
 

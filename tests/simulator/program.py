@@ -334,8 +334,7 @@ def _with_clients(
         limit=rng.choice([None, 3]), placement="client", heartbeat=rng.choice([5.0, 30.0]),
         timeout=TIMEOUT if "hang" in features and rng.random() < 0.7 else None,
     )  # fmt: skip
-    features = features - {"snapshots"} | {CLIENTS}
-    return features, [*(plans if rng.random() < 0.6 else ()), robots]
+    return features | {CLIENTS}, [*(plans if rng.random() < 0.6 else ()), robots]
 
 
 def _restarted(rng: Random, plan: Plan) -> Plan:
