@@ -784,27 +784,33 @@ class Model:
             require(raising or is_rubbish, "an error of nobody", repr(fault), request)
             self._put_away(env, request)
         elif raising:
-            likely = [act for act in raising if str(act[1]) in fault.exception_text]
-            effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
-            check_raised(fault, effect, token)
-            if effect == UNSHOWN:
-                env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
-                env.torn = env.after_loss()
-                self.counts["resumed, and not shown"] += 1
-            if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
-                check_outcome(fault, request, effect, token)
-            if request.resets:  # An awaitable env that hangs after that is reset like this again.
-                env.state.begun = request.seed, request.options
-            elif AGAIN in fault.exception_text:
-                begun, env.state = env.state.begun, env.fresh()
-                env.state.begun, env.loose = begun, []
-                env.seen = min(env.seen + 1, env.deaths)
-            self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
+            self._judge_raising(env, request, fault, raising)
         else:
             require(is_rubbish and not request.resets, "an error of nobody", repr(fault), request)
             env.state.scripts.step(request.acts)
             env.state.infos = []
             env.dirty = True
+
+    def _judge_raising(
+        self, env: Env, request: Request, fault: EnvRaised, raising: list[Act]
+    ) -> None:
+        """Check an exception that is one of those that an env was to raise."""
+        likely = [act for act in raising if str(act[1]) in fault.exception_text]
+        effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
+        check_raised(fault, effect, token)
+        if effect == UNSHOWN:
+            env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
+            env.torn = env.after_loss()
+            self.counts["resumed, and not shown"] += 1
+        if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
+            check_outcome(fault, request, effect, token)
+        if request.resets:  # An awaitable env that hangs after that is reset like this again.
+            env.state.begun = request.seed, request.options
+        elif AGAIN in fault.exception_text:
+            begun, env.state = env.state.begun, env.fresh()
+            env.state.begun, env.loose = begun, []
+            env.seen = min(env.seen + 1, env.deaths)
+        self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
 
     def _most_errors(self, env: Env) -> int:
         """How often in a row an env may have raised, also in its request before its worker died."""
