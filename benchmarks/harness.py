@@ -260,16 +260,6 @@ def _switches(thread: Path) -> int:
     return sum(int(line.split()[1]) for line in lines if "ctxt_switches" in line)
 
 
-def shared_memory() -> set[str]:
-    """Return the mappings of memory that can be shared, with and without a name."""
-    found: set[str] = set()
-    for line in Path("/proc/self/maps").read_text().splitlines():
-        _, _, _, _, inode, *path = line.split(maxsplit=5)
-        if path and path[0].startswith(("/memfd:", "/dev/shm/")):
-            found.add(f"{path[0]}, inode {inode}")
-    return found
-
-
 class ContenderFailed(Exception):
     """A contender raised or died; the text has the reason."""
 

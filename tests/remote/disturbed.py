@@ -1,4 +1,4 @@
-"""A trainer with an honest client, disturbed by unauthenticated peers: for tests and figures."""
+"""A trainer with an honest client, disturbed by unauthenticated peers."""
 
 from __future__ import annotations
 
@@ -22,16 +22,12 @@ _TESTS = Path(__file__).parents[1]
 
 
 @contextmanager
-def disturbed(
-    *, curve: bool, messages: int, rate: int, seed: int = 0
-) -> Iterator[tuple[Any, Any, subprocess.Popen[str]]]:
+def disturbed(*, curve: bool, messages: int) -> Iterator[tuple[Any, Any, subprocess.Popen[str]]]:
     """Yield a group with one CartPole client, its listener, and the process of the peers.
 
     Args:
         curve: the env_server has keys, and the peers have none that it knows.
         messages: number of messages of the peers, which then end.
-        rate: upper limit of messages per second.
-        seed: of the messages.
     """
     with tempfile.TemporaryDirectory() as directory:
         kwargs: dict[str, Any] = {"connect_timeout": HANG, "heartbeat": 5.0}
@@ -45,10 +41,8 @@ def disturbed(
             client = _start("client_processes.py", address, "1", "CartPole-v1", *keys)
             try:
                 group.reset()
-                peers = _start(
-                    "unauthenticated_peers.py", address, str(messages), str(rate), str(seed),
-                    *(["curve"] if curve else []),
-                )  # fmt: skip
+                mode = ["curve"] if curve else []
+                peers = _start("unauthenticated_peers.py", address, str(messages), *mode)
                 try:
                     yield group, group["robots-0"]._server._listener, peers
                 finally:

@@ -1,7 +1,4 @@
-"""Corrupted messages for both ends, while requests between them must still be answered.
-
-The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs any number.
-"""
+"""Corrupted messages for both ends, while requests between them must still be answered."""
 
 from __future__ import annotations
 
