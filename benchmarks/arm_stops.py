@@ -111,7 +111,7 @@ def serve() -> None:
 
 def arms() -> tuple[Any, Any]:
     """Return the simulation, with which the SDK can be replaced."""
-    from rlightning_aio.piper import arm, sim
+    from rlightning_aio.plugins.piper import arm, sim
 
     class TimedArm(arm.SimulatedArm):
         """Has its own clock, and records its travel."""

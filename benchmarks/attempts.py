@@ -48,7 +48,7 @@ from waiting import IDLE, MEAN, Waits
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
 from rlightning_aio.attempts.rules import seed_of
-from rlightning_aio.serving import OpenEnvServer
+from rlightning_aio.plugins.openenv.server import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:

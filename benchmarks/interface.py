@@ -29,9 +29,10 @@ MODULES: Final = {
     "": "the package", "sync": "blocking", "vector": "vector", "sb3": "vector",
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
     "attempts": "attempts", "trl": "trainers", "tinker": "trainers",
-    "policies": "evaluation", "policy_servers": "evaluation", "export": "evaluation",
-    "metrics": "metrics", "remote": "remote", "serving": "remote", "errors": "errors",
-    "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
+    "policies": "evaluation", "plugins.policy_servers": "evaluation",
+    "plugins.lerobot": "evaluation", "plugins.export": "evaluation",
+    "metrics": "metrics", "remote": "remote", "plugins.openenv.server": "remote",
+    "errors": "errors", "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
     "registry": "envs", "legacy": "legacy",
 }  # fmt: skip
 """Modules that the documentation imports names from, each with its row of the table."""

@@ -29,9 +29,9 @@ from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import index
 from rlightning_aio.protocol.info import INFO_BYTES, PICKLED, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
+from rlightning_aio.trees import index
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 PENDULUMS, GRIDS = (

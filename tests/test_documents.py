@@ -21,12 +21,14 @@ PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
 INTERNAL = {"_core", "batch", "cli", "config", "envs", "protocol", "registry", "sharing"}
 INTERNAL |= {
+    "calling",
     "files",
     "json_text",
     "loop_thread",
     "outcomes",
-    "piper",
+    "plugins",
     "sealing",
+    "trees",
     "types",
     "video",
     "__init__",
@@ -44,6 +46,7 @@ WORDS = {
     "sealing",
     "sharing",
     "spaces",
+    "trees",
     "types",
 }
 
@@ -268,6 +271,28 @@ def test_every_public_name_is_in_the_reference() -> None:
     for module, public in names.items():
         missing = {name for name in public if f"{module}.{name}" not in described}
         assert module in described or not missing, (module, missing)
+
+
+def test_plug_ins_use_only_names_of_the_reference() -> None:
+    """By themselves or with their module; and each of them has a place there."""
+    pages = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
+    described = set(re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE))
+    described |= {f"rlightning_aio.{name}" for name in public_names()["rlightning_aio"]}
+    used: set[str] = set()
+    for path in (PACKAGE / "plugins").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PACKAGE.name):
+                module = node.module or ""
+                if not module.startswith("rlightning_aio.plugins") and module not in described:
+                    used |= {f"{module}.{name.name}" for name in node.names}
+    assert used - described == set()
+    for name in (
+        "openenv.server.OpenEnvServer",
+        "policy_servers.OpenPiPolicy",
+        "lerobot",
+        "export",
+    ):
+        assert any(f"rlightning_aio.plugins.{name}" in one for one in described), name
 
 
 def test_all_files_have_the_same_version() -> None:

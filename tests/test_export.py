@@ -12,8 +12,8 @@ import pytest
 
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
-from rlightning_aio.collecting.whole_episodes import whole_episodes
-from rlightning_aio.export import save_lerobot, save_minari
+from rlightning_aio.collecting.episodes import whole_episodes
+from rlightning_aio.plugins.export import save_lerobot, save_minari
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -14,7 +14,7 @@ from rlightning_aio import registry
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, MujocoEnv
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend, Registry
+from rlightning_aio.registry import BACKENDS, Backend, Registry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +38,7 @@ def announce(monkeypatch: pytest.MonkeyPatch) -> Announce:
         return EntryPoints(announced).select(group=group, **wanted)
 
     def announce(name: str, target: str) -> None:
-        announced.append(EntryPoint(name, target, ENTRY_POINT_GROUP))
+        announced.append(EntryPoint(name, target, "rlightning_aio.backends"))
 
     monkeypatch.setattr("importlib.metadata.entry_points", entry_points)
     monkeypatch.setattr(registry, "_plugged_in", cache(registry._plugged_in.__wrapped__))

@@ -21,8 +21,8 @@ from envs.test_openenv import on_asyncio
 from websockets.asyncio.client import connect
 
 import rlightning_aio as rl
-from rlightning_aio.envs.openenv.session import get_json, post_json
-from rlightning_aio.serving import OpenEnvServer
+from rlightning_aio.plugins.openenv.server import OpenEnvServer
+from rlightning_aio.plugins.openenv.session import get_json, post_json
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:

@@ -37,11 +37,11 @@ __all__ = [
     "is_of_simulator",
     "load",
     "placement_of",
+    "plugins",
 ]
 
 CALLABLE: Final = "callable"
 """Backend of envs that come from a callable."""
-ENTRY_POINT_GROUP = "rlightning_aio.backends"
 
 EnvClass = TypeVar("EnvClass", bound="type[Any]")
 
@@ -65,6 +65,8 @@ class Backend:
         install: the command that installs the simulator.
         preload: modules that are slow to import and safe to import before workers are forked:
             they start no thread and open no device.
+        described_by: ``module:function`` that takes a config entry and returns what the envs'
+            own server says of them, as JSON; ``check`` then starts none. Empty if nothing does.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Backend:
     hardware: bool = False
     install: str = "pip install rlightning-aio"
     preload: tuple[str, ...] = ()
+    described_by: str = ""
 
     def installed_version(self) -> str | None:
         """Return the simulator's version in this interpreter, or None if it isn't installed."""
@@ -143,9 +146,6 @@ BACKENDS: dict[str, Backend] = {
         Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha",
                 install=_of_extra("aloha"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.lerobot_tasks",)),
-        Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets",
-                install=_of_extra("websockets"), awaitable=True,
-                preload=("rlightning_aio.envs.openenv.env",)),
     )
 }
 # fmt: on
@@ -320,16 +320,21 @@ def load(target: str) -> Any:
     return getattr(importlib.import_module(module_name), name)
 
 
-def _entry_points() -> EntryPoints:
+def plugins(kind: Literal["backends", "policies", "servers"]) -> EntryPoints:
+    """Return the entry points of a kind.
+
+    Each names, for ``backends``, a `Backend`; for ``policies``, a class of policies that takes the
+    ``ws://`` address of a server; for ``servers``, a class like `OpenEnvServer`.
+    """
     from importlib.metadata import entry_points  # noqa: PLC0415  # See `Backend`.
 
-    return entry_points(group=ENTRY_POINT_GROUP)
+    return entry_points(group=f"rlightning_aio.{kind}")
 
 
 @cache
 def _plugged_in(name: str) -> Backend | None:
     """Return the row of a plug-in, or None. Its module imports no simulator."""
-    for point in _entry_points():
+    for point in plugins("backends"):
         if point.name == name:
             return point.load()
     return None
@@ -425,7 +430,7 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return the name of every backend that can be resolved, sorted."""
-        return sorted({*self._classes, *BACKENDS, *(point.name for point in _entry_points())})
+        return sorted({*self._classes, *BACKENDS, *plugins("backends").names})
 
     def resolve(self, name: str) -> type[Any]:
         """Import and return the class of backend `name`.

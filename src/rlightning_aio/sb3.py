@@ -17,15 +17,15 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.infos import listed
+from rlightning_aio.calling import collect_calls
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.envs.sub_envs.sub_envs import adapted
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import BadAction, ConfigError
-from rlightning_aio.protocol.columns import index
 from rlightning_aio.sync import EnvGroup, build_env_group
+from rlightning_aio.trees import index
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.deaths import cause_and_rest
 from rlightning_aio.vector.lazy_infos import LazyInfos

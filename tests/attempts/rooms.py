@@ -11,7 +11,7 @@ from attempts.room import AwaitedRoom, Room
 from group.conftest import ON_ACTORS
 
 import rlightning_aio as rl
-from rlightning_aio.serving import OpenEnvServer
+from rlightning_aio.plugins.openenv.server import OpenEnvServer
 
 __all__ = ["PLACES", "openenv", "rooms", "serving"]
 

@@ -15,9 +15,8 @@ from rlightning_aio.registry import BACKENDS, ENVS, Backend
 if TYPE_CHECKING:
     import pytest
 
-PIPER = ENVS.described("piper")
-assert PIPER is not None
-ROWS = [*BACKENDS.values(), PIPER]
+PLUGINS = [ENVS.described("openenv"), ENVS.described("piper")]
+ROWS = [*BACKENDS.values(), *(row for row in PLUGINS if row is not None)]
 
 
 def test_each_backend_has_a_line() -> None:

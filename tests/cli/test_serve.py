@@ -10,7 +10,7 @@ import pytest
 from cli.command import CARTPOLE, invoke, start, write_config
 from cli.test_interrupt import interrupt
 
-from rlightning_aio.envs.openenv.session import get_json
+from rlightning_aio.plugins.openenv.session import get_json
 
 if TYPE_CHECKING:
     from pathlib import Path

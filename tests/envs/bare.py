@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.trees import as_numpy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -16,9 +16,9 @@ from gymnasium import spaces
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio.envs.openenv.session import OpenEnvSession, ServerRefused
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.loop_thread import LoopThread
+from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerRefused
 
 ENVS = 4
 

@@ -27,8 +27,8 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio._core.hosts.awaiting import awaited_envs
-from rlightning_aio.envs.openenv import session as openenv_session
 from rlightning_aio.errors import EnvRaised
+from rlightning_aio.plugins.openenv import session as openenv_session
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

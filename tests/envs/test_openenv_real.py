@@ -25,7 +25,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio import attempts
 from rlightning_aio.attempts import EpisodeSpec, Rules
-from rlightning_aio.envs.openenv.session import get_json
+from rlightning_aio.plugins.openenv.session import get_json
 
 if TYPE_CHECKING:
     from collections.abc import Generator

@@ -29,9 +29,9 @@ pytest.importorskip("serial")
 
 from envs.watched_arm import WatchedArm
 
-from rlightning_aio.piper.arm import CanFrame
-from rlightning_aio.piper.env import PiperEnv
-from rlightning_aio.piper.sim import SlcanPort, running
+from rlightning_aio.plugins.piper.arm import CanFrame
+from rlightning_aio.plugins.piper.env import PiperEnv
+from rlightning_aio.plugins.piper.sim import SlcanPort, running
 
 pytestmark = [
     pytest.mark.simulators,
@@ -506,7 +506,7 @@ def test_one_channel_has_one_env(arm: WatchedArm, make: Any, port: SlcanPort) ->
 HOLDER = """
 import sys
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.piper.env import PiperEnv
+from rlightning_aio.plugins.piper.env import PiperEnv
 env_kwargs = {"can_interface": "slcan", "channel": sys.argv[1], "connect_timeout": 30}
 try:
     env = PiperEnv(EnvConfig(name="other", backend="piper", task="t", env_kwargs=env_kwargs))
@@ -599,8 +599,8 @@ def test_a_virtual_channel_makes_its_own_arm(make: Any) -> None:
 
 
 def test_the_arm_can_be_in_another_process(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`python -m rlightning_aio.piper.sim` prints a channel and ends at a signal."""
-    command = [sys.executable, "-m", "rlightning_aio.piper.sim", "--feedback-hz", "50"]
+    """`python -m rlightning_aio.plugins.piper.sim` prints a channel and ends at a signal."""
+    command = [sys.executable, "-m", "rlightning_aio.plugins.piper.sim", "--feedback-hz", "50"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         channel = process.stdout.readline().strip()

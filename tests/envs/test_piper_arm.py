@@ -14,8 +14,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 piper_sdk: Any = pytest.importorskip("piper_sdk")
 
-from rlightning_aio.piper import arm as arm_module  # noqa: E402 - needs the SDK
-from rlightning_aio.piper.arm import (  # noqa: E402
+from rlightning_aio.plugins.piper import arm as arm_module  # noqa: E402 - needs the SDK
+from rlightning_aio.plugins.piper.arm import (  # noqa: E402
     GRIPPER_RANGE,
     JOINT_LIMITS,
     JOINT_SPEED,
@@ -203,7 +203,7 @@ def test_questions_are_answered_and_answers_are_not() -> None:
 
 def test_the_sdk_states_the_same_limits() -> None:
     """The arm, the env and the vendor's SDK agree on every limit."""
-    from rlightning_aio.piper import options
+    from rlightning_aio.plugins.piper import options
 
     parameters = piper_sdk.C_PiperInterface_V2("limits", False, False)
     vendor = tuple(tuple(parameters.GetSDKJointLimitParam(f"j{i}")) for i in range(1, 7))

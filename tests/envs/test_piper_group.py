@@ -25,8 +25,8 @@ from remote.counting import ClientThread
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
 from rlightning_aio.errors import BadAction, EnvRaised
-from rlightning_aio.piper.env import PiperEnv
-from rlightning_aio.piper.sim import SlcanPort, running
+from rlightning_aio.plugins.piper.env import PiperEnv
+from rlightning_aio.plugins.piper.sim import SlcanPort, running
 
 pytestmark = [
     pytest.mark.simulators,

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.piper.guard import ArmGuard, CanFrame
+from rlightning_aio.plugins.piper.guard import ArmGuard, CanFrame
 
 ANY_COMMAND = CanFrame(0x155, struct.pack(">ii", 1000, 2000))
 EMERGENCY_STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.piper.options import (
+from rlightning_aio.plugins.piper.options import (
     HALF_UNIT,
     Limit,
     PiperOptions,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from patience import HANG
 
-from rlightning_aio.piper.arm import CanFrame, SimulatedArm
+from rlightning_aio.plugins.piper.arm import CanFrame, SimulatedArm
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,7 +24,7 @@ from run_python import output_of
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, Rules, play
-from rlightning_aio.serving import OpenEnvServer
+from rlightning_aio.plugins.openenv.server import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:

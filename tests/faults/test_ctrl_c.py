@@ -16,7 +16,7 @@ from faults.striking import hear_of_interrupt, interrupt, press, struck
 from patience import HANG
 
 import rlightning_aio.sync
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvBusy, GroupClosed
 from rlightning_aio.protocol import kernel
 from rlightning_aio.vector.leftovers import drop_outstanding

@@ -12,7 +12,7 @@ import pytest
 from faults.striking import hear_of_interrupt, struck
 
 import rlightning_aio.sync
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvRaised, NothingPending
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import pytest
 from group.sample_envs import Gate
 
 from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio._core.group.state.conditions import ABORTING, DEATH, LOST_EPISODE
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvRaised, EpisodeLost, GroupClosed
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from rlightning_aio import EnvConfig, EnvRaised, sync
-from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.trees import as_numpy
 
 BOX = spaces.Box(-99, 99, (2,), np.float64)
 

@@ -23,7 +23,7 @@ from rlightning_aio import (
     NothingPending,
     PolicyResponse,
 )
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import GroupClosed, RLightningError
 
 if TYPE_CHECKING:

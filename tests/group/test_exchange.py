@@ -24,7 +24,7 @@ from rlightning_aio import (
     build_env_group,
 )
 from rlightning_aio._core.group.state.slab_layout import check_actions
-from rlightning_aio.protocol.columns import stacked
+from rlightning_aio.trees import stacked
 
 # Values are made and read independently of the loop.
 pytestmark = pytest.mark.one_driver_for_each_place

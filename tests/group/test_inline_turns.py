@@ -13,7 +13,7 @@ from group.conftest import INLINE, INLINE_SYNC, Place
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
+from rlightning_aio.calling import collect_calls, send_calls
 
 
 def test_inline_entries_take_turns() -> None:

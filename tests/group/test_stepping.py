@@ -21,8 +21,8 @@ from rlightning_aio import (
     PolicyResponse,
     UnknownEnv,
 )
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.batch import joined
+from rlightning_aio.calling import collect_calls, send_calls
 
 # For decisions before any wait, and for handling results that have come.
 one_driver = pytest.mark.one_driver_for_each_place

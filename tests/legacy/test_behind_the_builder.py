@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 MODULES = {
     "__init__": "from . import env, types, utils",
     "types": """
-        from rlightning_aio.legacy import types as like
+        from rlightning_aio.plugins.legacy import types as like
 
         class EnvRet(like.EnvRet):
             __hash__ = like.EnvRet.__hash__
@@ -26,7 +26,7 @@ MODULES = {
         class BatchedData(like.BatchedData): ...
     """,
     "env/__init__": "from .base_env import BaseEnv\nfrom .env_group import EnvGroup",
-    "env/base_env": "from rlightning_aio.legacy.env import BaseEnv",
+    "env/base_env": "from rlightning_aio.plugins.legacy.env import BaseEnv",
     "env/env_group": """
         class EnvGroup:
             def __init__(self, env_cfg_list, preprocess_fn):
@@ -60,12 +60,12 @@ MODULES = {
     """,
     "utils/__init__": "",
     "utils/config": """
-        from rlightning_aio.legacy import config as like
+        from rlightning_aio.plugins.legacy import config as like
 
         class EnvConfig(like.EnvConfig): ...
     """,
     "utils/registry": """
-        from rlightning_aio.legacy.registry import Registry
+        from rlightning_aio.plugins.legacy.registry import Registry
 
         ENVS = Registry("environments")
     """,
@@ -108,8 +108,8 @@ class Mine(BaseEnv):
 
 group = build_env_group([EnvConfig(name="m", backend="mine", task="any", num_workers=2)])
 assert type(group) is rlightning.env.EnvGroup
-assert type(group).__module__ == "rlightning_aio.legacy.group"
-assert RemoteEnvClient.__module__ == "rlightning_aio.legacy.remote"
+assert type(group).__module__ == "rlightning_aio.plugins.legacy.group"
+assert RemoteEnvClient.__module__ == "rlightning_aio.plugins.legacy.remote"
 rets = Engine(group).rollout(5)
 assert [ret.observation[0] for ret in rets[::2]] == [0, 1, 2, 0, 1]
 assert [ret.info.get("seed", "none") for ret in rets[::2]] == [0, "none", "none", None, "none"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rlightning_aio.errors import EnvRaised, StartFailed
-from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, names_in_use
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

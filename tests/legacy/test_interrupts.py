@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from rlightning_aio.errors import BadAction, EnvRaised
-from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, names_in_use
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rlightning_aio.errors import EnvRaised
-from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, names_in_use
 
 if is_rlightning_installed():
     pytest.skip("RLightning itself is installed", allow_module_level=True)

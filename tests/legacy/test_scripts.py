@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from patience import HANG
 
-from rlightning_aio.legacy.names import is_rlightning_installed
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed
 
 pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is installed")
 

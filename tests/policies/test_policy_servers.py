@@ -18,9 +18,9 @@ from policies.servers import OpenPiServer, VlaEvalServer, packed, serving
 import rlightning_aio as rl
 from rlightning_aio.errors import PolicyServerError
 from rlightning_aio.evaluation import evaluate
+from rlightning_aio.plugins.policy_servers import OpenPiPolicy, VlaEvalPolicy, client
+from rlightning_aio.plugins.policy_servers.connection import Address, connected
 from rlightning_aio.policies import ActionChunks
-from rlightning_aio.policy_servers import OpenPiPolicy, VlaEvalPolicy, client
-from rlightning_aio.policy_servers.connection import Address, connected
 
 
 def evaluated(policy: Any, workers: int = 2, **fields: Any) -> Any:
@@ -308,7 +308,7 @@ def test_a_frame_that_is_no_answer_is_refused(frame: bytes, message: str) -> Non
 
 def test_a_frame_above_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The connection is closed before it is read."""
-    monkeypatch.setattr("rlightning_aio.policy_servers.connection.MAX_BYTES", 1000)
+    monkeypatch.setattr("rlightning_aio.plugins.policy_servers.connection.MAX_BYTES", 1000)
 
     class Server(OpenPiServer):
         def answer(self, connection: Any, observation: dict[str, Any]) -> None:

@@ -17,8 +17,8 @@ from policies.servers import serving
 
 from rlightning_aio.errors import PolicyServerError
 from rlightning_aio.evaluation import evaluate
+from rlightning_aio.plugins.policy_servers import OpenPiPolicy, VlaEvalPolicy
 from rlightning_aio.policies import ActionChunks
-from rlightning_aio.policy_servers import OpenPiPolicy, VlaEvalPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,15 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from remote.random_spaces import any_space, same, sampled
 
-from rlightning_aio.protocol.columns import (
-    Misfit,
-    gather,
-    index,
-    leaves,
-    mapped,
-    row_reader,
-    row_writer,
-)
+from rlightning_aio.protocol.columns import Misfit, gather, leaves, row_reader, row_writer
 from rlightning_aio.protocol.slab import (
     IS_RESET,
     OVER,
@@ -28,6 +20,7 @@ from rlightning_aio.protocol.slab import (
     RowLayout,
     Slab,
 )
+from rlightning_aio.trees import index, mapped
 
 fixed_space = any_space.filter(lambda space: leaves(space) is not None)
 HEADS = st.sampled_from([((), ()), ((3,), ()), ((2,), ("a", "b")), ((2, 3), ("a", "b"))])

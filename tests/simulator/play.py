@@ -34,7 +34,7 @@ from simulator.session import Session, action_of, stacked
 from simulator.world import Faults
 
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,

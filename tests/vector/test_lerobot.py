@@ -15,7 +15,7 @@ from patience import HANG
 
 from rlightning_aio import sync
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
-from rlightning_aio.policies import LeRobotPolicy
+from rlightning_aio.plugins.lerobot import LeRobotPolicy
 
 pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
 

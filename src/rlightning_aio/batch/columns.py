@@ -14,9 +14,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from rlightning_aio.batch.names import EnvNames
-from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
+from rlightning_aio.trees import Tree, index, mapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -28,7 +28,7 @@ from rlightning_aio.batch.rets import rets_of
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import index, mapped, paired
+from rlightning_aio.trees import index, mapped, paired
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.protocol.columns import Tree
+    from rlightning_aio.trees import Tree
 
 __all__ = ["joined"]
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
 from rlightning_aio.batch.stacking import differing, stacked_values
-from rlightning_aio.protocol.columns import is_dict, is_tuple, leaves
+from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.trees import is_dict, is_tuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

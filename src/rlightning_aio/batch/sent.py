@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 import numpy as np
 
 from rlightning_aio.batch.stacking import columns_where_possible, concatenated, form_of
-from rlightning_aio.protocol.columns import index, mapped
+from rlightning_aio.trees import index, mapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import as_array
+from rlightning_aio.trees import as_array
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

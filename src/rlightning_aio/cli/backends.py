@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 from dataclasses import asdict, dataclass
 from operator import attrgetter
 from typing import Annotated
@@ -19,7 +18,7 @@ from rlightning_aio.cli.terminal import (
     print_result,
     print_table,
 )
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend
+from rlightning_aio.registry import BACKENDS, Backend, plugins
 
 __all__ = ["backends"]
 
@@ -80,5 +79,5 @@ def _row(backend: Backend) -> _Row:
 
 
 def _plugged_in() -> list[Backend]:
-    points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
-    return [p.load() for p in sorted(points, key=attrgetter("name")) if p.name not in BACKENDS]
+    points = sorted(plugins("backends"), key=attrgetter("name"))
+    return [point.load() for point in points if point.name not in BACKENDS]

@@ -15,9 +15,8 @@ from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, respo
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
 from rlightning_aio.cli.trial import Trial, try_out
 from rlightning_aio.config import check_installed, load_config
-from rlightning_aio.errors import ConfigError
 from rlightning_aio.json_text import json_of
-from rlightning_aio.registry import ENVS
+from rlightning_aio.registry import ENVS, load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,7 +36,7 @@ class _Finding:
     Attributes:
         skipped: the reason why it was not started.
         steps: how many steps it made; none if only a policy can choose its actions.
-        offers: an OpenEnv server's own description and schemas.
+        offers: what the envs' own server says of them.
         trial: what whole episodes have shown.
     """
 
@@ -95,29 +94,13 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
         )
         if config.backend == "env_server":
             found.skipped = "its envs live with its clients"
-        elif config.backend == "openenv":
-            found.offers = await asyncio.to_thread(_offers, config)
+        elif (backend := ENVS.described(config.backend)) and backend.described_by:
+            found.offers = await asyncio.to_thread(load(backend.described_by), config)
         elif ENVS.is_hardware(config.backend):
             found.skipped = "it would move"
         else:
             await _try(config, found, steps)
         findings.append(found)
-
-
-def _offers(config: EnvConfig) -> dict[str, Any]:
-    """Return the description and schemas of an entry's first server."""
-    # Imported here because it needs an extra.
-    from rlightning_aio.envs.openenv.env import OpenEnvOptions  # noqa: PLC0415
-    from rlightning_aio.envs.openenv.session import get_json  # noqa: PLC0415
-    from rlightning_aio.envs.options import read_options  # noqa: PLC0415
-
-    headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers
-    try:
-        return {
-            path: get_json(config.task_name, f"/{path}", headers) for path in ("metadata", "schema")
-        }
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{config.name!r}: {config.task_name} can't be read: {error}") from error
 
 
 async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -12,6 +12,7 @@ from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.terminal import counted, out, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import plugins
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
@@ -51,14 +52,13 @@ def serve(
 
 
 async def _serve(config: EnvConfig, host: str, port: int, session_timeout: float) -> None:
-    # Not at the top: it needs an extra.
     try:
-        from rlightning_aio.serving import OpenEnvServer  # noqa: PLC0415
+        server_of: Any = plugins("servers")["openenv"].load()
     except ImportError as error:
         raise ConfigError(f"{error}: pip install 'rlightning-aio[websockets]'") from error
     async with (
         rlightning_aio.build_env_group(config) as group,
-        OpenEnvServer(group, host, port, session_timeout=session_timeout) as server,
+        server_of(group, host, port, session_timeout=session_timeout) as server,
     ):
         sessions = counted(len(group), "session")
         out().print(f"{config.name}: {sessions} at {server.url}", soft_wrap=True, markup=False)

@@ -15,7 +15,8 @@ from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.answers import answers_of
-from rlightning_aio.protocol.columns import gather, is_array, mapped, paired
+from rlightning_aio.protocol.columns import gather, is_array
+from rlightning_aio.trees import mapped, paired
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.newest import Newest
-    from rlightning_aio.protocol.columns import Tree
+    from rlightning_aio.trees import Tree
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["OWN_NAMES", "EnvKind", "Part"]

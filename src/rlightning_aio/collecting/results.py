@@ -10,7 +10,7 @@ import numpy as np
 from rlightning_aio.batch.contents import all_agents, ended_episodes, plain_columns
 from rlightning_aio.batch.infos import joined_infos, listed
 from rlightning_aio.collecting.trees import rows_of
-from rlightning_aio.protocol.columns import Tree, mapped
+from rlightning_aio.trees import Tree, mapped
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

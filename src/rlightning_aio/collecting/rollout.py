@@ -8,7 +8,8 @@ import numpy as np
 
 from rlightning_aio.collecting.advantages import Segments, gae, vtrace
 from rlightning_aio.collecting.trees import with_lists
-from rlightning_aio.protocol.columns import Tree, gather, mapped, paired
+from rlightning_aio.protocol.columns import gather
+from rlightning_aio.trees import Tree, mapped, paired
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

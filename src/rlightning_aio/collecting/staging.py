@@ -14,7 +14,8 @@ import numpy as np
 
 from rlightning_aio.batch.contents import has_ended
 from rlightning_aio.collecting.trees import allocated, check_alike, grown, scattered
-from rlightning_aio.protocol.columns import gather, mapped
+from rlightning_aio.protocol.columns import gather
+from rlightning_aio.trees import mapped
 
 if TYPE_CHECKING:
     from collections.abc import KeysView, Mapping, Sequence
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.collecting.results import Ended, ResultRows
-    from rlightning_aio.protocol.columns import Rows, Tree
+    from rlightning_aio.protocol.columns import Rows
+    from rlightning_aio.trees import Tree
 
 __all__ = ["Full", "Staging"]
 

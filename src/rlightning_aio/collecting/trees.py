@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import Tree, mapped
+from rlightning_aio.trees import Tree, mapped
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping

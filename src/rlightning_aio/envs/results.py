@@ -15,8 +15,7 @@ import numpy as np
 
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.protocol.columns import stacked
+from rlightning_aio.trees import as_numpy, stacked
 from rlightning_aio.types import (
     EnvRet,
     MultiAgentEnvRet,

@@ -8,19 +8,36 @@ whoever calls it awaits it.
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
+from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.contents import origin_of
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import is_dict
+from rlightning_aio.trees import is_dict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     import gymnasium as gym
 
-__all__ = ["answers_of"]
+__all__ = ["answers_of", "can_await"]
+
+
+def can_await(batch: BatchedData) -> bool:
+    """Return True if a policy's answer to `batch` may be awaitable.
+
+    Else no event loop is running, or the group is synchronous.
+    """
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    origin = origin_of(batch)
+    group = None if origin is None else origin.group
+    return not isinstance(group, Core) or group.shares_thread
 
 
 def answers_of(

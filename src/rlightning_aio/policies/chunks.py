@@ -13,7 +13,7 @@ import numpy as np
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.episodes import begins_of_envs
-from rlightning_aio.protocol.columns import as_array, index, mapped, stacked
+from rlightning_aio.trees import as_array, index, mapped, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

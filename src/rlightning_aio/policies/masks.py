@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.protocol.columns import is_dict
+from rlightning_aio.trees import is_dict
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
 if TYPE_CHECKING:

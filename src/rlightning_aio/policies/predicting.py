@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from rlightning_aio.policies.episodes import begins
-from rlightning_aio.protocol.columns import mapped
+from rlightning_aio.trees import mapped
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData

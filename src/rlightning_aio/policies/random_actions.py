@@ -12,7 +12,7 @@ import numpy as np
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
-from rlightning_aio.protocol.columns import index, stacked
+from rlightning_aio.trees import index, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf, is_dict, is_tuple
+from rlightning_aio.protocol.columns import Leaf
+from rlightning_aio.trees import is_dict, is_tuple
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

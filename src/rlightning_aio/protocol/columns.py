@@ -1,7 +1,8 @@
 """Spaces as columns: memory of fixed size for values, and functions that write and read them.
 
-A tree has the structure of its space: an array for Box, Discrete, MultiBinary and MultiDiscrete, a
-dict for Dict, a tuple for Tuple. The first axis of each array is that of rows.
+A tree (`rlightning_aio.trees`) has the structure of its space: an array for Box, Discrete,
+MultiBinary and MultiDiscrete, a dict for Dict, a tuple for Tuple. The first axis of each array is
+that of rows.
 Absent on purpose: Text, Sequence, Graph and other spaces without a fixed size; their values are
 pickled.
 """
@@ -15,42 +16,34 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rlightning_aio.trees import as_array, is_dict, is_tuple, mapped
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
     from numpy.typing import NDArray
+
+    from rlightning_aio.trees import Node, Tree
 
 __all__ = [
     "Fit",
     "Leaf",
     "Misfit",
     "Rows",
-    "Tree",
-    "array_of_tensor",
-    "as_array",
     "assemble",
     "check_keys",
     "fitted",
     "fitted_tree",
     "gather",
-    "index",
     "is_array",
-    "is_dict",
-    "is_tuple",
     "leaf_of",
     "leaves",
-    "mapped",
     "out_of_range",
-    "paired",
     "row_reader",
     "row_writer",
-    "stacked",
     "structure",
 ]
 
-Tree: TypeAlias = Any
-"""An array, or a dict or tuple of trees."""
-_Node: TypeAlias = "NDArray[Any] | dict[str, Tree] | tuple[Tree, ...]"
 Rows: TypeAlias = "slice | NDArray[np.intp]"
 """A selection of rows: a slice for a contiguous range, else an index array."""
 
@@ -107,16 +100,6 @@ def structure(space: gym.Space[Any], *, limits: bool = False) -> object:
     return space.shape, space.dtype
 
 
-def is_dict(space: object) -> TypeGuard[spaces.Dict[Any]]:
-    """Return True for a Dict; unlike `isinstance`, this keeps the types of its parts."""
-    return isinstance(space, spaces.Dict)
-
-
-def is_tuple(space: object) -> TypeGuard[spaces.Tuple[Any]]:
-    """Return True for a Tuple; unlike `isinstance`, this keeps the types of its parts."""
-    return isinstance(space, spaces.Tuple)
-
-
 def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
     """Return True if all values of `space` are arrays with the same shape and dtype."""
     return isinstance(space, _FIXED)
@@ -140,62 +123,15 @@ def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, ND
         yield leaf, array
 
 
-def mapped(function: Callable[[NDArray[Any]], Any], tree: _Node) -> Tree:
-    """Apply `function` to each array of `tree`."""
-    if isinstance(tree, dict):
-        return {key: mapped(function, inner) for key, inner in tree.items()}
-    if isinstance(tree, tuple):
-        return tuple(mapped(function, inner) for inner in tree)
-    return function(tree)
-
-
-def paired(function: Callable[[Any, Any], Any], one: _Node, other: Any) -> Tree:
-    """Apply `function` to each array of the tree `one`, and to what `other` has in its place."""
-    if isinstance(one, dict):
-        return {key: paired(function, inner, other[key]) for key, inner in one.items()}
-    if isinstance(one, tuple):
-        return tuple(paired(function, inner, other[k]) for k, inner in enumerate(one))
-    return function(one, other)
-
-
-def gather(tree: _Node, rows: Rows) -> Any:
+def gather(tree: Node, rows: Rows) -> Any:
     """Copy `rows` of each array."""
     if isinstance(tree, np.ndarray):
         return tree[rows].copy() if isinstance(rows, slice) else tree.take(rows, axis=0)
     return mapped(lambda array: gather(array, rows), tree)
 
 
-def stacked(trees: Sequence[_Node]) -> Tree:
-    """Stack trees with the same structure along a new first axis; a single one is not copied."""
-    first = trees[0]
-    if isinstance(first, dict):
-        return {key: stacked([cast("Any", tree)[key] for tree in trees]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(map(stacked, zip(*cast("Any", trees), strict=True)))
-    return first[None] if len(trees) == 1 else np.stack(cast("Any", trees))
-
-
-def index(tree: _Node, position: int) -> Tree:
-    """Row `position` of each array: a view, or a NumPy scalar if a row is one number."""
-    return tree[position] if isinstance(tree, np.ndarray) else mapped(lambda a: a[position], tree)
-
-
 class Misfit(ValueError):
     """A value doesn't fit its declared space."""
-
-
-def as_array(value: Any) -> NDArray[Any]:
-    """Convert `value` to NumPy; tensors are copied to the CPU."""
-    if type(value) is np.ndarray:
-        return value
-    return array_of_tensor(value) if hasattr(value, "detach") else np.asarray(value)
-
-
-def array_of_tensor(tensor: Any) -> NDArray[Any]:
-    """Convert a torch tensor to an array on the CPU; bfloat16, unknown to NumPy, to float32."""
-    # Conjugated and negated views are only marked as such, which NumPy can't represent.
-    tensor = tensor.detach().cpu().resolve_conj().resolve_neg()
-    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
 
 
 def out_of_range(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.bool_] | None:

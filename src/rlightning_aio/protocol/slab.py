@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaf_of, leaves, structure
+from rlightning_aio.protocol.columns import Leaf, assemble, leaf_of, leaves, structure
 from rlightning_aio.protocol.info import INFO_BYTES, INFO_BYTES_OF_SUB_ENV
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
+    from rlightning_aio.trees import Tree
     from rlightning_aio.types import EnvMeta
 
 __all__ = [

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import is_dict, is_tuple, paired
+from rlightning_aio.trees import is_dict, is_tuple, paired
 
 if TYPE_CHECKING:
     import gymnasium as gym

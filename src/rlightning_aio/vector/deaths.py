@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.batch.infos import listed, vector_infos
 from rlightning_aio.batch.joining import joined
-from rlightning_aio.protocol.columns import index, mapped
+from rlightning_aio.trees import index, mapped
 from rlightning_aio.vector.batching import merged, replaced
 
 if TYPE_CHECKING:

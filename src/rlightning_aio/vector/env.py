@@ -14,10 +14,10 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
-from rlightning_aio._core.group.api.calling import collect_calls
 from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.calling import collect_calls
 from rlightning_aio.envs.sub_envs.sub_envs import adapted
 from rlightning_aio.errors import BadAction, ConfigError, EnvFault
 from rlightning_aio.protocol.columns import leaves

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rlightning_aio._core.group.api.calling import collect_calls
+from rlightning_aio.calling import collect_calls
 from rlightning_aio.errors import EnvFault, NothingPending
 
 if TYPE_CHECKING:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio._core.group.api.calling import collect_calls, send_calls
 from rlightning_aio.batch.contents import reported_info_list, reported_infos, reported_sub_env_infos
 from rlightning_aio.batch.infos import listed
 from rlightning_aio.batch.stacking import stacked_values
+from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.envs.sub_envs.sub_envs import SEEDS
 from rlightning_aio.envs.wrappers import name_of
-from rlightning_aio.protocol.columns import leaves, mapped
+from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.trees import mapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.policies.answers import answers_of
+from rlightning_aio.registry import plugins
 
 if TYPE_CHECKING:
     import contextlib
@@ -34,8 +35,6 @@ __all__ = [
 Policy: TypeAlias = Callable[[BatchedData], Any]
 
 _PACKAGE: Final = str(Path(__file__).parents[2])
-_CLIENTS: Final = {"openpi": "OpenPiPolicy", "vla-eval": "VlaEvalPolicy"}
-"""Clients of policy servers, by the scheme of the address."""
 
 
 class PolicyRaised(RLightningError):
@@ -68,17 +67,18 @@ def load_policy(name: str) -> Policy:
 def served_policy(name: str, stack: contextlib.ExitStack) -> Policy:
     """Return a client of the policy server at an address, as ``openpi://localhost:8000``.
 
-    The client is closed by `stack`.
+    The scheme is the name of an entry point. The client is closed by `stack`.
 
     Raises:
         ConfigError: it is no such address, or a package is missing.
     """
     scheme, _, place = name.partition("://")
-    if scheme not in _CLIENTS:
-        raise ConfigError(f"--policy {name}: should begin with openpi:// or vla-eval://")
+    found = plugins("policies").select(name=scheme)
+    if not found:
+        known = " or ".join(f"{kind}://" for kind in sorted(plugins("policies").names))
+        raise ConfigError(f"--policy {name}: should begin with {known}")
     try:
-        clients: Any = importlib.import_module("rlightning_aio.policy_servers")
-        client = getattr(clients, _CLIENTS[scheme])(f"ws://{place}")
+        client = found[scheme].load()(f"ws://{place}")
     except (ImportError, ConfigError) as error:
         raise ConfigError(f"--policy {name}: {error}") from error
     return stack.enter_context(client)

@@ -22,9 +22,8 @@ from rlightning_aio.envs.fast_path import (
     FastPath,
 )
 from rlightning_aio.envs.results import has_preprocess_fn
-from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.protocol.columns import index, is_dict
+from rlightning_aio.trees import as_numpy, index, is_dict
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:

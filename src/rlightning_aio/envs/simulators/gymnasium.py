@@ -14,10 +14,10 @@ from gymnasium.vector import SyncVectorEnv
 from rlightning_aio.envs.background import Background
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.fast_path import BareReset, BareStep, BareStepAsync, BareStepWait, FastPath
-from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.sharing import check_threads, num_cores
+from rlightning_aio.trees import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:

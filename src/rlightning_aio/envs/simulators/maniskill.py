@@ -16,8 +16,8 @@ import numpy as np
 
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, sub_env_seeds
 from rlightning_aio.envs.simulators.vulkan import do_without_materials, render_device_is_usable
-from rlightning_aio.envs.tensors import as_numpy, is_tensor
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.trees import as_numpy, is_tensor
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn
-from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import did_you_mean
+from rlightning_aio.trees import as_numpy
 from rlightning_aio.types import MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:

@@ -15,8 +15,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.protocol.columns import Leaf, Misfit, as_array, check_keys, fitted
+from rlightning_aio.protocol.columns import Leaf, Misfit, check_keys, fitted
 from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
+from rlightning_aio.trees import as_array
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

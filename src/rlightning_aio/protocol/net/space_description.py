@@ -16,8 +16,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.protocol.columns import is_dict, is_tuple
 from rlightning_aio.protocol.net.wire import DTYPES, MAX_FRAME_BYTES, WireError
+from rlightning_aio.trees import is_dict, is_tuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable

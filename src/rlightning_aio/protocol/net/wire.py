@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from rlightning_aio.protocol.columns import as_array
+from rlightning_aio.trees import as_array
 from rlightning_aio.types import Autoreset
 
 if TYPE_CHECKING:

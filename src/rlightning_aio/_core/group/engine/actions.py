@@ -18,8 +18,9 @@ from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.batch.stacking import plain_numbers
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
+from rlightning_aio.protocol.columns import Leaf, Rows, out_of_range
 from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
+from rlightning_aio.trees import Tree, as_array, index
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.protocol.columns import index
+from rlightning_aio.trees import index
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

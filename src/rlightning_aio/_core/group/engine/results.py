@@ -12,9 +12,10 @@ from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import UNASKED, copied
 from rlightning_aio.outcomes import Outcome
 from rlightning_aio.protocol import kernel
-from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
+from rlightning_aio.protocol.columns import Rows, gather
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import TRUNCATED
+from rlightning_aio.trees import mapped, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -16,8 +16,8 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio._core.hosts.filming.video_file import VideoFile, find_ffmpeg
-from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.files import check_folder, file_name
+from rlightning_aio.trees import as_numpy
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -19,11 +19,11 @@ import numpy as np
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.episodes import EpisodeSums
 from rlightning_aio.envs.base import result_of
-from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import fitted, fitted_tree, row_reader, row_writer
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
+from rlightning_aio.trees import as_numpy, holds_tensor
 from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:

@@ -1,0 +1,57 @@
+"""What adapters to other interfaces need of a group: calls in two halves, several calls in one.
+
+Users have `group.call`, which sends and waits. Left out: which methods envs have.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rlightning_aio._core.group.api.facade import check_seconds
+from rlightning_aio._core.group.api.sync import driver_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rlightning_aio.sync import EnvGroup
+
+__all__ = ["collect_calls", "in_one_call", "send_calls"]
+
+T = TypeVar("T")
+
+
+def in_one_call(group: EnvGroup, function: Callable[[], T]) -> T:
+    """Call a function that calls methods of a synchronous group, as one call of the group.
+
+    Ctrl-C interrupts it only where it waits, so that it takes no result.
+    """
+    return driver_of(group).call(function)
+
+
+def send_calls(
+    group: Any, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+) -> None:
+    """Send what `group.call` sends, without waiting; errors are those before anything is sent."""
+    calls = group._core.calls  # noqa: SLF001
+    group._driver.call(calls.send_calls, time.monotonic(), env_ids, (name, args, kwargs))  # noqa: SLF001
+
+
+def collect_calls(group: Any, deadline: float | None = None) -> Any:
+    """Wait for the values of all calls that `send_calls` has sent.
+
+    Args:
+        group: of an asynchronous group, the answer is to be awaited.
+        deadline: limit in seconds, from now.
+
+    Returns the values in the order in which the calls were sent. Cancelled, it loses none.
+
+    Raises:
+        NothingPending: no call is outstanding.
+        TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
+        EnvRaised, WorkerDied, EnvHung, GroupClosed: as of `group.call`.
+        RLightningError: another call is collecting values.
+    """
+    check_seconds("deadline", deadline)
+    calls = group._core.calls  # noqa: SLF001
+    return group._driver.run(calls.collect_calls(time.monotonic(), deadline))  # noqa: SLF001

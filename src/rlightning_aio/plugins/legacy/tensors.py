@@ -1,0 +1,81 @@
+"""Moves arrays and tensors as RLightning does, with torch if it is installed."""
+
+from __future__ import annotations
+
+import contextlib
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.trees import as_numpy, holds_tensor, is_tensor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["on_cpu", "to_device", "to_numpy"]
+
+
+def _torch() -> Any:
+    with contextlib.suppress(ImportError):
+        return import_module("torch")
+    return None
+
+
+def _mapped(function: Callable[[Any], Any], data: Any) -> Any:
+    """Return `data` with `function` applied to all values in its containers."""
+    if isinstance(data, dict):
+        entries = cast("dict[Any, Any]", data).items()
+        return {key: _mapped(function, value) for key, value in entries}
+    if isinstance(data, tuple) and hasattr(cast("Any", data), "_make"):
+        return cast("Any", data)._make(_mapped(function, one) for one in cast("Any", data))
+    if isinstance(data, list | tuple):
+        members = cast("list[Any]", data)
+        return type(members)(_mapped(function, one) for one in members)
+    return function(data)
+
+
+def to_device(data: Any, device: Any) -> Any:
+    """Return `data` with its tensors and arrays as tensors on a torch device.
+
+    Without torch, arrays stay arrays, and the device must be ``cpu``. An array of uint16 is taken
+    for bfloat16, which NumPy lacks.
+    """
+    torch = _torch()
+    if torch is None:
+        if str(device) != "cpu":
+            raise ImportError(f"device {device!r} needs torch, which is not installed")
+        return data
+
+    def moved(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            array = cast("np.ndarray[Any, Any]", value)
+            if array.dtype.kind not in "biufc":
+                return array
+            # Torch takes no array that is read-only or has negative strides.
+            writable = np.require(array, requirements=("C", "W")).reshape(array.shape)
+            tensor = torch.from_numpy(writable)
+            tensor = tensor.view(torch.bfloat16) if array.dtype == np.uint16 else tensor
+            return tensor.to(device)
+        is_movable = is_tensor(value) or type(value).__name__ == "TensorDict"
+        return value.to(device) if is_movable else value
+
+    return _mapped(moved, data)
+
+
+def to_numpy(data: Any) -> Any:
+    """Return `data` with its tensors as arrays; bfloat16 becomes uint16, bit for bit."""
+
+    def converted(value: Any) -> Any:
+        if is_tensor(value) and str(value.dtype) == "torch.bfloat16":
+            return value.detach().cpu().view(_torch().uint16).numpy()
+        return as_numpy(value)
+
+    return _mapped(converted, data)
+
+
+def on_cpu(data: Any) -> Any:
+    """Return `data` with its tensors on the CPU, from where they can be pickled."""
+    if not holds_tensor(data):
+        return data
+    return _mapped(lambda value: value.detach().cpu() if is_tensor(value) else value, data)

@@ -1,0 +1,17 @@
+"""The description of the backend ``openenv``, which the trainer reads without aiohttp."""
+
+from __future__ import annotations
+
+from rlightning_aio.registry import Backend
+
+__all__ = ["BACKEND"]
+
+BACKEND = Backend(
+    "openenv",
+    "rlightning_aio.plugins.openenv.env:OpenEnv",
+    "websockets",
+    awaitable=True,
+    install="pip install 'rlightning-aio[websockets]'",
+    preload=("rlightning_aio.plugins.openenv.env",),
+    described_by="rlightning_aio.plugins.openenv.env:description",
+)

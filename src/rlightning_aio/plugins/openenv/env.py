@@ -1,0 +1,330 @@
+"""`openenv`: sessions of OpenEnv servers as awaitable envs.
+
+Each env is one session. A reset begins an episode in it, over a new connection if the old one is
+lost, and on another server if its own is gone. A step whose connection is lost ends the episode as
+truncated, for its action may have taken effect: no action is ever sent twice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+import uuid
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, Self, cast
+
+import numpy as np
+from gymnasium import spaces
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from rlightning_aio import Anything, BaseEnv, EnvRet, Outcome
+from rlightning_aio.envs.options import read_options
+from rlightning_aio.errors import BadAction, ConfigError
+from rlightning_aio.plugins.openenv.secret_headers import check_headers
+from rlightning_aio.plugins.openenv.session import (
+    OpenEnvSession,
+    ServerGone,
+    ServerRefused,
+    get_json,
+    pauses,
+)
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rlightning_aio import EnvConfig, PolicyResponse
+    from rlightning_aio.envs.base import PreprocessFn
+
+__all__ = ["OpenEnv", "OpenEnvOptions", "description"]
+
+
+class OpenEnvOptions(BaseModel):
+    """``env_kwargs`` of the backend."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+    urls: tuple[str, ...] = ()
+    """Further servers of the same environment; sessions are spread over all of them."""
+    columns: dict[str, Any] = Field(default_factory=dict)
+    """Fields of the observation that become columns: a Gymnasium space, a number n for
+    ``Discrete(n)``, or ``{shape: […], dtype: …, low: …, high: …}`` for a ``Box``."""
+    observation_field: str | None = None
+    """The only field of the observation that counts: its value is the observation."""
+    action_field: str | None = None
+    """The only field of an action: an action is its value."""
+    truncated_field: str | None = None
+    """Field of the metadata or the observation that says that a done episode was only cut."""
+    reset: dict[str, Any] = Field(default_factory=dict)
+    """Arguments that are sent with each reset."""
+    session: Literal["own", "keep"] = "own"
+    """``keep``: the session survives a lost socket."""
+    connect_timeout: float = Field(default=60.0, gt=0)
+    """Seconds that a reset waits for a server that can be reached."""
+    headers: dict[str, str] = Field(default_factory=dict, repr=False)
+    """Sent with each connection, such as ``Authorization``; they are never logged."""
+
+    @field_validator("headers")
+    @classmethod
+    def _check_headers(cls, headers: dict[str, str]) -> dict[str, str]:
+        check_headers(headers)
+        return headers
+
+    @model_validator(mode="after")
+    def _check_fields(self) -> Self:
+        if self.columns and self.observation_field is not None:
+            raise ValueError("columns and observation_field exclude each other")
+        return self
+
+
+def description(config: EnvConfig) -> dict[str, Any]:
+    """Return the description and schemas of an entry's first server.
+
+    Raises:
+        ConfigError: the server can't be read.
+    """
+    headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers
+    try:
+        return {
+            path: get_json(config.task_name, f"/{path}", headers) for path in ("metadata", "schema")
+        }
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{config.name!r}: {config.task_name} can't be read: {error}") from error
+
+
+class OpenEnv(BaseEnv):
+    """One session; see the module and docs/openenv.md.
+
+    An observation is a dict of the fields that the server sends. With ``columns`` it is a dict of
+    these, and of all other fields as ``rest``. An action is a dict of the action's fields. With
+    ``observation_field`` or ``action_field`` it is the value of that field.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        worker_index: int = 0,
+        preprocess_fn: PreprocessFn | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+        options = read_options(OpenEnvOptions, self.env_id, config.env_kwargs)
+        self._options = options
+        self._columns = {
+            name: _space_of(self.env_id, name, given) for name, given in options.columns.items()
+        }
+        keep = options.session == "keep"
+        self._servers = [
+            OpenEnvSession(url, keep=keep, headers=options.headers)
+            for url in (config.task_name, *options.urls)
+        ]
+        self._server = worker_index % len(self._servers)
+        self._last: Any = None
+        # Of this episode; steps that were answered, and whether the server counts them as well.
+        self._episode_id: Any = None
+        self._steps = 0
+        self._is_counted: bool | None = None
+
+    @property
+    def _session(self) -> OpenEnvSession:
+        return self._servers[self._server]
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        """A value for each row, or columns with the ``rest``."""
+        if not self._columns:
+            return Anything()
+        return spaces.Dict({**self._columns, "rest": Anything()})
+
+    def get_action_space(self) -> gym.Space[Any]:
+        """Dicts of an action's fields, or values of its only one."""
+        return Anything()
+
+    async def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        """Begin an episode.
+
+        Args:
+            seed: sent to the server.
+            options: further arguments of the server's reset; they replace those of the config.
+
+        Raises:
+            ServerGone: no server could be reached within ``connect_timeout``.
+            ServerRefused: the server's environment has raised.
+        """
+        arguments = {"episode_id": str(uuid.uuid4()), **self._options.reset, **(options or {})}
+        if seed is not None:
+            arguments["seed"] = seed
+        data = await self._first_reply({"type": "reset", "data": arguments})
+        self._episode_id, self._steps = arguments["episode_id"], 0
+        return self._result(self._read(data))
+
+    async def _first_reply(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Ask this server, or else the first that can be reached again."""
+        give_up_at = time.monotonic() + self._options.connect_timeout
+        pause, failures = pauses(), 0
+        while True:
+            try:
+                return await self._session.open(message)
+            except ServerGone:
+                failures += 1
+                if failures > 1:  # At first only the socket may be lost.
+                    self._server = (self._server + 1) % len(self._servers)
+                if time.monotonic() > give_up_at:
+                    raise
+            if failures > len(self._servers):
+                await asyncio.sleep(next(pause))
+
+    async def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        """Send an action, and wait for its observation.
+
+        Raises:
+            BadAction: the action is no dict.
+            ServerRefused: the server's environment has raised, or does not know the action.
+        """
+        action = self._preprocess_fn(policy_resp)
+        if self._options.action_field is not None:
+            action = {self._options.action_field: action}
+        if not isinstance(action, Mapping):
+            raise BadAction(
+                f"an action of env {self.env_id!r} is a dict of its fields, not {action!r}"
+            )
+        message = {"type": "step", "data": _plain(action)}
+        try:
+            data = await self._ask(message)
+        except ServerGone as gone:
+            repeated = await self._repeated(message)
+            if repeated is None:
+                away = Outcome("env_away", "infrastructure", str(gone), self.env_id)
+                info = {"session_lost": str(gone), "outcome": away}
+                return self._result(info, last_truncated=True)
+            data = repeated
+        self._steps += 1
+        if self._options.session == "keep" and self._is_counted is None:
+            self._is_counted = await self._has_executed(self._steps)
+        done = bool(data.get("done"))
+        info = self._read(data)
+        cut = done and self._is_cut(data, info)
+        return self._result(
+            info,
+            last_reward=float(data.get("reward") or 0.0),
+            last_terminated=done and not cut,
+            last_truncated=cut,
+        )
+
+    async def _ask(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Ask on the open socket, or on a new one of a kept session if that was lost before."""
+        try:
+            return await self._session.ask(message)
+        except ServerGone as gone:
+            if self._options.session != "keep" or not gone.is_unsent:
+                raise
+            return await self._session.open(message, may_create=False)
+
+    async def _repeated(self, message: dict[str, Any]) -> dict[str, Any] | None:
+        """Send an action again whose socket was lost, if the server says that it has not run."""
+        if self._options.session != "keep" or not self._is_counted:
+            return None
+        try:
+            if await self._has_executed(self._steps):
+                return await self._session.open(message, may_create=False)
+        except ServerGone:
+            pass
+        return None
+
+    async def _has_executed(self, steps: int) -> bool | None:
+        """Ask if the episode goes on and has had so many steps; None if the server is gone."""
+        try:
+            state = await self._session.open({"type": "state"}, may_create=False)
+        except ServerGone:
+            return None
+        except ServerRefused:
+            return False
+        is_same = state.get("episode_id") in (None, self._episode_id)
+        return is_same and state.get("step_count") == steps
+
+    def _read(self, data: dict[str, Any]) -> dict[str, Any]:
+        """Keep the observation; returns the info."""
+        fields: dict[str, Any] = dict(data.get("observation") or {})
+        inner = fields.pop("metadata", None)
+        info: dict[str, Any] = dict(data.get("metadata") or inner or {})
+        with contextlib.suppress(TypeError, ValueError, KeyError):  # Other servers' is no outcome.
+            info["outcome"] = replace(Outcome.from_json(info["outcome"]), env_id=self.env_id)
+        if self._columns:
+            columns = {
+                name: _value_in(space, fields.pop(name)) for name, space in self._columns.items()
+            }
+            self._last = {**columns, "rest": fields}
+        else:
+            field = self._options.observation_field
+            self._last = fields if field is None else fields[field]
+        return info
+
+    def _is_cut(self, data: dict[str, Any], info: dict[str, Any]) -> bool:
+        field = self._options.truncated_field
+        observation: dict[str, Any] = data.get("observation") or {}
+        return field is not None and bool(info.get(field, observation.get(field)))
+
+    def _result(self, info: dict[str, Any], **fields: Any) -> EnvRet:
+        return EnvRet(env_id=self.env_id, observation=self._last, info=info, **fields)
+
+    async def state(self) -> dict[str, Any]:
+        """The server's state of the session, such as ``step_count``."""
+        return await self._ask({"type": "state"})
+
+    async def mcp(self, method: str, params: dict[str, Any] | None = None) -> Any:
+        """Call a method of the environment's MCP server, such as ``tools/list``."""
+        request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params or {}}
+        return await self._ask({"type": "mcp", "data": request})
+
+    def save_state(self) -> Any:
+        """Refuse: a session is at its server, which can't copy it.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("a session of an OpenEnv server can't be saved")
+
+    async def close(self) -> None:
+        """Close the session, and give its slot at the server back."""
+        closing = (session.close() for session in self._servers)
+        for error in await asyncio.gather(*closing, return_exceptions=True):
+            if error is not None:
+                raise error
+
+
+def _space_of(env_id: str, name: str, given: Any) -> gym.Space[Any]:
+    if isinstance(given, spaces.Space):
+        return cast("gym.Space[Any]", given)
+    try:
+        if isinstance(given, int):
+            return spaces.Discrete(given)
+        box: dict[str, Any] = {"low": -np.inf, "high": np.inf, "dtype": "float32", **given}
+        dtype: Any = np.dtype(box.pop("dtype"))
+        if dtype.kind in "iu":  # An integer has no infinity.
+            limits = np.iinfo(dtype)
+            box["low"] = max(box["low"], limits.min)
+            box["high"] = min(box["high"], limits.max)
+        return spaces.Box(dtype=dtype.type, **box)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ConfigError(
+            f"{env_id}: env_kwargs: columns.{name}: {given!r} makes no space ({error}); give a "
+            "number for Discrete, or shape, dtype, low and high for a Box"
+        ) from None
+
+
+def _value_in(space: gym.Space[Any], value: Any) -> Any:
+    """A field as an array of its column's shape and dtype; pixels may come flattened."""
+    if space.shape is None or isinstance(space, Anything):
+        return value
+    return np.asarray(value, space.dtype).reshape(space.shape)
+
+
+def _plain(value: Any) -> Any:
+    """An action as JSON has it."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in cast("list[Any]", value)]
+    return value.tolist() if hasattr(value, "tolist") else value

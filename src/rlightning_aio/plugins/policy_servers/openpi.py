@@ -1,0 +1,87 @@
+"""`OpenPiPolicy`: the client of openpi's policy server.
+
+A connection begins with a map of metadata from the server. Then each observation, a map, is
+answered by a map with ``actions``, a chunk ``[horizon, *action]``. A text frame is a traceback.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+from rlightning_aio.plugins.policy_servers.arrays import Codec
+from rlightning_aio.plugins.policy_servers.client import PolicyClient, instruction
+from rlightning_aio.plugins.policy_servers.connection import Address
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from websockets.asyncio.client import ClientConnection
+
+__all__ = ["OpenPiPolicy"]
+
+
+class OpenPiPolicy(PolicyClient[bytes]):
+    """Asks openpi's policy server (``scripts/serve_policy.py``) for chunks of actions.
+
+    Play them with `ActionChunks`. The server keeps nothing about episodes, so a request whose
+    connection is lost is sent again over another one. Close it, or use it in a ``with`` statement.
+
+    Args:
+        url: ``ws://host:port`` or ``wss://…``.
+        observe: called with the observation of an env and the info of the reset that began its
+            episode; returns the map that the server's policy expects, such as
+            ``{"observation/image": …, "observation/state": …, "prompt": …}``. None sends a Dict
+            observation as it is, any other as ``observation/state``, and the ``task_description``
+            or ``task`` of the info as ``prompt``.
+        api_key: sent as the header ``Authorization: Api-Key …``.
+        timeout: seconds for an answer; the first may take a server minutes.
+        connect_timeout: seconds for a server that is not there yet.
+
+    Raises:
+        ConfigError: `url` or a time is wrong.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        observe: Callable[[Any, dict[str, Any]], dict[str, Any]] | None = None,
+        *,
+        api_key: str | None = None,
+        timeout: float = 300.0,
+        connect_timeout: float = 30.0,
+    ) -> None:
+        headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        address = Address(url, timeout, connect_timeout, headers)
+        super().__init__(address, Codec(str.encode), observe or _observed)
+
+    async def _greet(self, connection: ClientConnection) -> None:
+        # The metadata only describe the policy.
+        await self._received(connection)
+
+    def _request(self, observation: Any, begun: dict[str, Any] | None) -> bytes:
+        del begun
+        return self._codec.encode(observation)
+
+    def _may_repeat(self, request: bytes) -> bool:
+        del request
+        return True
+
+    async def _exchange(self, connection: ClientConnection, request: bytes) -> Any:
+        await connection.send(request)
+        return await self._received(connection)
+
+    async def _received(self, connection: ClientConnection) -> Any:
+        frame = await connection.recv()
+        if isinstance(frame, str):
+            raise self._raised(frame)
+        return self._decoded(frame)
+
+
+def _observed(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
+    prompt = instruction(info)
+    sent: dict[str, Any] = (
+        {**cast("dict[str, Any]", observation)}
+        if isinstance(observation, dict)
+        else {"observation/state": observation}
+    )
+    return sent if prompt is None else {**sent, "prompt": prompt}
