@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["on_cpu", "to_device", "to_numpy"]
 
 
+@cache  # A search for a module that is missing takes as long as a step.
 def _torch() -> Any:
     with contextlib.suppress(ImportError):
         return import_module("torch")

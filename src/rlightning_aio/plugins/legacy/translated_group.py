@@ -173,18 +173,28 @@ class TranslatedGroup:
 
     def rows_of(self, batch: BatchedData) -> list[ResultRow]:
         """Translate results of our group, and count them."""
-        rows: list[ResultRow] = []
-        for row, (core_id, ours) in enumerate(batch.items()):
-            batch_id = self._id_of[core_id]
-            if batch_id in self.server_ids:
-                rows.append(ResultRow(batch_id, *self._of_client(batch_id, ours)))
-                continue
-            one, ret = batch.take([row]), ours.observation
-            if one.restarted[0]:
-                info = {**ret.info, **ours.info}
-                ret = dataclasses.replace(ret, last_truncated=True, info=info)
-            rows.append(self._counted(ResultRow(batch_id, batch_id, ret, bool(one.is_reset[0]))))
-        return rows
+        ids = [self._id_of[core_id] for core_id in batch.ids()]
+        local = [row for row, batch_id in enumerate(ids) if batch_id not in self.server_ids]
+        if len(local) == len(ids):
+            return self._local_rows(ids, batch)
+        found = iter(self._local_rows([ids[row] for row in local], batch.take(local)))
+        return [
+            ResultRow(batch_id, *self._of_client(batch_id, ours))
+            if batch_id in self.server_ids
+            else next(found)
+            for batch_id, ours in zip(ids, batch.values(), strict=True)
+        ]
+
+    def _local_rows(self, ids: list[str], batch: BatchedData) -> list[ResultRow]:
+        """Return the results of local envs, whose observations are RLightning's results."""
+        if not ids:
+            return []
+        rets: list[Any] = list(batch.observation)
+        for row in batch.restarted.nonzero()[0].tolist():
+            info = {**rets[row].info, **batch.info()[row]}
+            rets[row] = dataclasses.replace(rets[row], last_truncated=True, info=info)
+        rows = zip(ids, ids, rets, batch.is_reset.tolist(), strict=True)
+        return [self._counted(ResultRow(*row)) for row in rows]
 
     def _of_client(self, server_id: str, ours: Any) -> tuple[str, Any]:
         """Return the id of a client, and its result as RLightning's."""
