@@ -1,10 +1,11 @@
-"""PPO on three workloads: how fast does it learn, and how much of the time is waiting for envs?
+"""PPO on four workloads: how fast does it learn, and how much of the time is waiting for envs?
 
     python benchmarks/training.py --json training.json --plot training.png
     python benchmarks/training.py --only cheetah --seeds 1 --steps 20000
 
-The baseline is CleanRL's loop on Gymnasium's vector environments (gymnasium_ppo.py); ours are
-`examples/ppo*.py`, with the same network, hyperparameters, seeds and number of transitions.
+The baseline is CleanRL's loop on Gymnasium's vector environments (gymnasium_ppo.py), and in one
+workload on `make_vec`'s and EnvPool's. Ours otherwise are `examples/ppo*.py`, with the same
+network, hyperparameters, seeds and number of transitions.
 Contenders take turns, seed by seed, each turn in its own process; a ratio is the median over seeds.
 *Outside* is wall-clock less the learner's own time. A finished turn is saved in the folder and
 isn't run again, so an interrupted run continues. All of it takes hours.
@@ -24,7 +25,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from harness import ONE_THREAD, machine_facts, machine_text, number_text, say
-from training_workloads import BASELINES, BETTER, SPREAD, WORKLOADS, Contender, Target, Workload
+from training_workloads import (
+    BASELINES,
+    BETTER,
+    SPREAD,
+    TOGETHER_WITH,
+    WORKLOADS,
+    Contender,
+    Target,
+    Workload,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -47,7 +57,7 @@ def turn(workload: Workload, contender: Contender, seed: int, steps: int, folder
     args: dict[str, Any] = {**workload.settings, "seed": seed, "folder": str(folder)}
     if steps:
         args["total_steps"] = steps
-    if contender.name in BASELINES:
+    if contender.name in (*BASELINES, *TOGETHER_WITH):
         ppo, baseline = importlib.import_module("ppo"), importlib.import_module("gymnasium_ppo")
         run, _ = baseline.train(getattr(ppo, workload.preset)(**args), contender.name)
     else:

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 ASYNC = "AsyncVectorEnv"
 SYNC = "SyncVectorEnv"
 BASELINES = (ASYNC, SYNC)
+TOGETHER_WITH = ("make_vec", "EnvPool")
+"""Vector environments that step all together, in the baselines' loop."""
 # References of a target other than contenders.
 BETTER = "the better baseline"
 SPREAD = "the baselines' spread"
@@ -20,7 +22,7 @@ SPREAD = "the baselines' spread"
 
 @dataclass(frozen=True)
 class Contender:
-    """One of `BASELINES`, or an example, with its changes to the preset."""
+    """One of `BASELINES` or `TOGETHER_WITH`, or an example, with its changes to the preset."""
 
     name: str
     example: str = ""
@@ -102,6 +104,22 @@ CHEETAH = Workload(
     ],
 )
 
+POOL = Workload(
+    "pool",
+    "HalfCheetah-v5, 16 envs, 100 k transitions, one loop",
+    "Args",
+    16,
+    {"total_steps": 100_000},
+    [Contender(ASYNC), *map(Contender, TOGETHER_WITH)],
+    [
+        Target("make_vec", "wall", "EnvPool", 1.0),
+        Target("make_vec", "outside", "EnvPool", 0.8),
+        Target("make_vec", "return", SPREAD, 0, at_most=False),
+        Target("make_vec", "wall", ASYNC, 0.6),
+        Target("make_vec", "outside", ASYNC, 0.35),
+    ],
+)
+
 CARTPOLE = Workload(
     "cartpole",
     "CartPole-v1, 4 envs, 500 k transitions",
@@ -140,4 +158,4 @@ UNEVEN_POLE = Workload(
     ],
 )
 
-WORKLOADS = (CHEETAH, CARTPOLE, UNEVEN_POLE)
+WORKLOADS = (CHEETAH, POOL, CARTPOLE, UNEVEN_POLE)

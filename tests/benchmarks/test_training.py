@@ -64,3 +64,17 @@ def test_turns_are_kept(tmp_path: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in kept.rglob("*")}
     assert output_of(*command, asyncio_debug=False) == printed
     assert {path: path.stat().st_mtime_ns for path in kept.rglob("*")} == before
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize("kind", ["make_vec", "EnvPool"])
+def test_envs_that_are_stepped_together_learn_in_the_baselines_loop(
+    kind: str, tmp_path: Path
+) -> None:
+    for module in ("torch", "envpool"):
+        pytest.importorskip(module)
+    report, asked = tmp_path / "report.json", ["--only", f"pool/{kind}", "--seeds", "1"]
+    kept = ["--folder", tmp_path / "turns", "--json", report]
+    output_of(BENCHMARKS / "training.py", *asked, "--steps", "1024", *kept, asyncio_debug=False)
+    (found,) = json.loads(report.read_text())["workloads"]["pool"]["results"][kind]
+    assert 0 < found["outside"] == found["wall"] - found["learner"]
