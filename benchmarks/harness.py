@@ -9,12 +9,10 @@ Left out on purpose: the work to measure, which is in the scripts, one question 
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import importlib.util
 import json
 import multiprocessing as mp
 import os
-import platform
 import statistics
 import sys
 import tempfile
@@ -22,20 +20,19 @@ import time
 import traceback
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
+from rlightning_aio.cli.machine import machine_facts
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from multiprocessing.connection import Connection
 
 # One math thread for each contender: none is faster with more, and some would
 # start one for each core in each of their processes.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Modules whose versions are reported, in addition to those of the peers that take part.
-ALWAYS_USED = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
 NAME_WIDTH = 34
 
 
@@ -397,43 +394,6 @@ def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
 def modules_of(contenders: Iterable[Contender]) -> set[str]:
     """Return the modules that any of them needs."""
     return {name for contender in contenders for name in contender.requires}
-
-
-def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
-    """Return facts on which the figures depend besides the code; `modules` are those that take
-    part.
-    """
-    versions: dict[str, str] = {}
-    distributions = _distributions()
-    for name in (*ALWAYS_USED, *sorted(set(modules) - set(ALWAYS_USED))):
-        try:
-            versions[name] = importlib.metadata.version(distributions.get(name, [name])[0])
-        except importlib.metadata.PackageNotFoundError:
-            continue  # Not installed, or a module in this folder.
-    return {
-        "cores": len(os.sched_getaffinity(0)),
-        "cpu": _cpu_model(),
-        "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30),
-        "system": platform.system(),
-        "python": platform.python_version(),
-        "versions": versions,
-        "date": time.strftime("%Y-%m-%d"),
-        # Other work on the machine when the run began.
-        "load_average": round(os.getloadavg()[0], 2),
-    }
-
-
-@cache
-def _distributions() -> Mapping[str, list[str]]:
-    """Return the distributions of each module. It reads the list of every installed file."""
-    return importlib.metadata.packages_distributions()
-
-
-def _cpu_model() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            return line.partition(":")[2].strip()
-    return platform.machine()
 
 
 # ---- reports

@@ -69,7 +69,16 @@ def test_bench_prints_a_table(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     done = invoke("bench", config, *QUICK)
     rows = [line for line in done.stdout.splitlines() if "async" in line or "step " in line]
-    assert [row.split("  ")[0] for row in rows] == ["1 worker process"] * 2 + ["inline"] * 2
+    assert [row.split("  ")[0] for row in rows[:4]] == ["1 worker process"] * 2 + ["inline"] * 2
+
+
+def test_the_last_line_of_the_table_is_a_verdict(tmp_path: Path) -> None:
+    """It has the fastest group, and compares it with the fastest baseline."""
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
+    *_, last = invoke("bench", config, *QUICK).stdout.splitlines()
+    assert re.fullmatch(r"Best: .+, .+: [\d,.]+ steps/s, [\d.e+]+ times as many as .+\.", last)
+    *_, last = invoke("bench", config, *QUICK, "--sweep", "num_workers=1").stdout.splitlines()
+    assert re.fullmatch(r"Best: .+, .+: [\d,.]+ steps/s\.", last)
 
 
 def test_bench_measures_entries_with_different_spaces_together(tmp_path: Path) -> None:

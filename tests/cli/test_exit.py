@@ -238,10 +238,31 @@ def test_the_largest_seed_is_taken(tmp_path: Path) -> None:
         assert done.exit_code == 0, done.stderr
 
 
+@pytest.mark.filterwarnings("ignore:close.. of env 'stuck-0' raised WorkerDied")
+def test_a_rollout_without_a_step_is_code_1(tmp_path: Path) -> None:
+    """The table says so, too."""
+    kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step", "steps": 0}
+    stuck = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
+    config = write_config(tmp_path, {**stuck, "close_timeout": 0.1})
+    done = invoke("rollout", config, "--seconds", 0.01)
+    assert done.exit_code == 1
+    assert done.stdout.startswith("0 steps in ")
+    assert "error: no step has ended in that time" in done.stderr
+
+
 @pytest.mark.parametrize(
-    "words", [("rollout", "--steps", "9"), ("rollout", "--steps", "9", "--json"), ("check",)]
+    "words",
+    [
+        ("rollout", "--steps", "9"),
+        ("rollout", "--steps", "9", "--json"),
+        ("eval", "--episodes", "1"),
+        ("bench", "--rounds", "1", "--seconds", "0.01"),
+        ("check",),
+        ("serve", "--port", "0"),
+    ],
 )
 def test_a_full_stdout_is_one_line_and_code_2(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """There is no result then, so no command exits with 0; a server nobody can find ends."""
     command, *options = words
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -254,17 +275,20 @@ def test_a_full_stdout_is_one_line_and_code_2(tmp_path: Path, words: tuple[str, 
             check=False,
         )
     assert done.returncode == 2
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("starting")]
+    lines = [line for line in done.stderr.splitlines() if line.startswith("error")]
     assert lines[-1:] == ["error: stdout: results can't be written: No space left on device"]
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
 
 
-def test_help_and_version_to_a_full_stdout_are_code_2() -> None:
-    for word in ("--version", "--help", "backends"):
+def test_results_without_envs_to_a_full_stdout_are_code_2(tmp_path: Path) -> None:
+    timeline = tmp_path / "run.json"
+    invoke("rollout", write_config(tmp_path, STUB), "--steps", 9, "--trace", timeline)
+    keys = ("keygen", str(tmp_path / "keys"), "arm")
+    for words in (("--version",), ("--help",), ("backends",), ("trace", str(timeline)), keys):
         with Path("/dev/full").open("w") as full:
             done = subprocess.run(
-                [*COMMAND, word], stdout=full, stderr=subprocess.PIPE, text=True, timeout=HANG,
+                [*COMMAND, *words], stdout=full, stderr=subprocess.PIPE, text=True, timeout=HANG,
                 check=False,
             )  # fmt: skip
         assert done.returncode == 2

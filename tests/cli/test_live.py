@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import deque
 from types import SimpleNamespace
 from typing import Any, cast
@@ -13,7 +12,7 @@ from rich.console import Console
 from rlightning_aio.cli.bench.contender_table import print_contenders
 from rlightning_aio.cli.bench.measuring import Contender, Costs, Round, Rule
 from rlightning_aio.cli.bench.settings import possible_settings
-from rlightning_aio.cli.playing import live
+from rlightning_aio.cli.live_line import fitting
 from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.config import EnvConfig
 
@@ -34,17 +33,15 @@ def numbers(steps: int, seconds: float) -> dict[str, float]:
 
 def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> Display:
     """The display of a rollout after 10 seconds, with a recent rate of 50 steps/s."""
-    group = SimpleNamespace(get_workers=lambda: workers)
+    group = SimpleNamespace(get_workers=lambda: workers, metrics=lambda: numbers(400, 3))
     statistics = SimpleNamespace(
         steps=steps,
         idle=lambda now: idle,
         elapsed=lambda now: 10.0,
-        recent_step_us=lambda: {"a-0": 20.0},
-        steps_by_env=dict,
     )
     shown = Display.__new__(Display)
     shown._group, shown._statistics = cast("Any", group), cast("Any", statistics)
-    shown._recent = deque([(0.0, numbers(300, 1)), (2.0, numbers(400, 3))])
+    shown._recent = deque([(8.0, numbers(300, 1))])
     shown._steps, shown._seconds, shown._doing, shown._since = 1000, None, "", 0.0
     return shown
 
@@ -60,7 +57,7 @@ def test_the_line_has_the_rate_and_the_time_left() -> None:
         "return of these 2.50",
         "envs: 75% in steps, 0% queued, 0% to be collected, 25% wait for actions",
     ]
-    assert live._fitting(parts, 32) == "50 steps/s  0:12 left  400 steps"
+    assert fitting(parts, 32) == "50 steps/s  0:12 left  400 steps"
 
 
 def test_without_results_the_line_names_the_envs_it_waits_for() -> None:
@@ -78,43 +75,6 @@ def test_during_the_start_the_line_names_missing_envs() -> None:
     starting = display([worker("a", ["a-0"], state="starting")], idle=0.0)
     starting._doing, starting._since = "starting 2 envs", 6.0
     assert starting._parts(10.0) == ["starting 2 envs", "waiting 4 s for a-0"]
-
-
-def test_each_worker_has_a_line() -> None:
-    """It shows the worker's state, its duration, and the number of restarts."""
-    workers = [worker("a", ["a-0"], restarts=2), worker("b", ["b-0"], state="down")]
-    shown = display(workers, idle=0.0)
-    table = live._WorkerTable(shown._group, shown._statistics)
-    lines = [re.split(r"  +", line.strip()) for line in table.drawn(10.0, 8, 100)]
-    assert lines[1] == ["here", "a", "1", "0", "20 µs", "-", "2", "a-0 for 5 s"]
-    assert lines[2][-2:] == ["0", "down"]
-
-
-@pytest.mark.parametrize("width", [40, 60, 100])
-def test_a_narrow_terminal_gets_fewer_columns_of_workers(width: int) -> None:
-    """Entries are left out first, states never; further workers are counted."""
-    workers = [worker("an entry", [f"a-{k}"]) for k in range(6)]
-    shown = display(workers, idle=0.0)
-    *lines, more = live._WorkerTable(shown._group, shown._statistics).drawn(10.0, 4, width)
-    assert {len(line) for line in lines} == {len(lines[0])}
-    assert len(lines[0]) <= width
-    assert [line.split()[-1] for line in lines] == ["state", *["s"] * 4]
-    assert ("entry" in lines[0]) == (width > 60)
-    assert more == "and 2 more"
-
-
-def test_the_memory_of_one_worker_is_read_in_each_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those that were never read come first, and then the one that was read longest ago."""
-    read: list[int] = []
-    monkeypatch.setattr(live, "memory_bytes", lambda pids: read.append(pids[0]) or 2**20)
-    workers = [worker("a", [f"a-{pid}"], pid=pid) for pid in (5, 6)]
-    shown = display(workers, idle=0.0)
-    table = live._WorkerTable(shown._group, shown._statistics)
-    texts = [table.drawn(float(turn), 8, 100) for turn in range(5)]
-    assert read == [5, 6, 5, 6, 5]
-    assert [text[2].count("1 MiB") for text in texts] == [0, 1, 1, 1, 1]
-    workers[1]["pid"] = 7  # It was replaced.
-    assert table.drawn(6.0, 8, 100)[2].count("1 MiB") == 1
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])

@@ -57,21 +57,23 @@ def test_stdout_is_one_json_document(tmp_path: Path) -> None:
 def test_a_rollout_can_have_a_time_limit(tmp_path: Path) -> None:
     """It ends then even if results are missing; --steps may end it earlier."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    document = invoke_json("rollout", config, "--seconds", 0.05, "--min-results", 1)
-    assert document["interrupted"] is False
+    done = invoke("rollout", config, "--seconds", 0.05, "--min-results", 1, "--json")
+    assert json.loads(done.stdout)["interrupted"] is False
     assert invoke_json("rollout", config, "--seconds", 1000, "--steps", 10)["steps"] == 10
     kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step", "steps": 0}
     stuck = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
     with pytest.warns(UserWarning, match="did not close in time"):
-        document = invoke_json("rollout", write_config(tmp_path, stuck), "--seconds", 0.05)
-    assert document["steps"] == 0
+        done = invoke("rollout", write_config(tmp_path, stuck), "--seconds", 0.05, "--json")
+    document = json.loads(done.stdout)
+    assert (document["steps"], done.exit_code) == (0, 1)
     assert document["seconds"] >= 0.05
 
 
 def test_a_rollout_without_results_prints_a_document(tmp_path: Path) -> None:
-    """The time limit may pass before the first result."""
+    """The time limit may pass before the first result; the exit code says that."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    assert "steps" in invoke_json("rollout", config, "--seconds", 0.001, "--min-results", 2)
+    done = invoke("rollout", config, "--seconds", 0.001, "--min-results", 2, "--json")
+    assert done.exit_code == (0 if json.loads(done.stdout)["steps"] else 1)
     assert " steps in " in invoke("rollout", config, "--seconds", 0.001).stdout
 
 

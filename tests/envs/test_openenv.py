@@ -159,7 +159,7 @@ async def test_a_refusal_is_read_even_if_the_socket_is_closed() -> None:
         session = OpenEnvSession(server.url, keep=False)
         await session._connect(may_create=True)
         assert session._socket is not None
-        await session._socket.wait_closed()
+        await session._socket._socket.wait_closed()
         with pytest.raises(ServerRefused, match="CAPACITY_REACHED"):
             await session.ask({"type": "state"})
 

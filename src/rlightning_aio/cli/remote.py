@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.live import Live
-from rich.spinner import Spinner
-from rich.text import Text
 
 from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio._core.hosts.running.build_env import build_env
+from rlightning_aio.cli.live_line import LiveLine
 from rlightning_aio.cli.terminal import (
     connections_logged,
     count,
     counted,
-    err,
     interruptible,
     out,
     print_json,
@@ -39,8 +36,6 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
 
 __all__ = ["client", "keygen"]
-
-_REFRESHES_A_SECOND: Final = 4
 
 
 def client(
@@ -152,25 +147,17 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
 @contextlib.contextmanager
 def _status(served: RemoteEnvClient, address: str) -> Generator[None]:
     """Show a live line on stderr, or a plain line for each change if it is no terminal."""
-    console = err()
-    if not console.is_terminal:
-        console.print(f"{served.name} connects to {address}", soft_wrap=True, markup=False)
-        with connections_logged():
+
+    def parts(_now: float) -> list[str]:
+        return [f"{served.name}: {served.state}", _figures(served)]
+
+    line = LiveLine(parts, by_thread=True)
+    if line.is_live:
+        with line:
             yield
         return
-    spinner = Spinner("dots")
-
-    def line() -> Spinner:
-        # Text, because Rich would take brackets in a name or address for markup.
-        spinner.update(text=Text(f"{served.name}: {served.state}  {_figures(served)}"))
-        return spinner
-
-    with Live(
-        console=console,
-        get_renderable=line,
-        refresh_per_second=_REFRESHES_A_SECOND,
-        transient=True,
-    ):
+    line.say(f"{served.name} connects to {address}")
+    with connections_logged():
         yield
 
 

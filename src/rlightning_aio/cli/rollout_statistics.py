@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["Course", "EntryFigures", "RolloutStatistics"]
 
 _NOTHING: Final = np.empty(0, np.int64)
-_RECENT_BATCHES: Final = 64
 _COURSE_SECONDS: Final = 0.25
 _COURSE_EPISODES: Final = 50_000
 """Number of episodes in a plot; of more, the last are kept."""
@@ -113,23 +112,6 @@ class RolloutStatistics:
     def idle(self, now: float) -> float:
         """Return the seconds since the last result, or since the first step was sent."""
         return now - self._ended if self._began else 0.0
-
-    def steps_by_env(self) -> dict[str, int]:
-        """Return the steps of each env; for a client, with those of earlier ones in its slot."""
-        names = () if self._names is None else self._names.env_ids
-        return dict(zip(names, self._counts.tolist(), strict=True))
-
-    def recent_step_us(self) -> dict[str, float]:
-        """Return the mean time of each env's own step over the last batches."""
-        recent = list(self._step_times)[-_RECENT_BATCHES:]
-        if self._names is None or not recent:
-            return {}
-        slots = np.concatenate([times.slots for times in recent])
-        busy_ns, size = np.concatenate([times.busy_ns for times in recent]), len(self._counts)
-        results = np.bincount(slots, minlength=size)
-        means = np.bincount(slots, busy_ns, size) / np.maximum(results, 1) / 1e3
-        columns = (self._names.env_ids, means.tolist(), results.tolist())
-        return {env_id: mean for env_id, mean, number in zip(*columns, strict=True) if number}
 
     def courses(self) -> list[Course]:
         """Return the course of each entry; empty unless it was recorded."""

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self, TypeAlias
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from rlightning_aio.cli.bench.apart import opened
 from rlightning_aio.cli.bench.baselines import Baseline, baselines_of
-from rlightning_aio.cli.bench.best import best_of, write_best
+from rlightning_aio.cli.bench.best import best_of, verdict, write_best
 from rlightning_aio.cli.bench.contender_table import print_contenders
 from rlightning_aio.cli.bench.measuring import Contender, Limits, Rule, take_turns
 from rlightning_aio.cli.bench.plots import check_plot, draw_contenders
 from rlightning_aio.cli.bench.settings import Setting, possible_settings, swept_settings
-from rlightning_aio.cli.bench.surroundings import surroundings
+from rlightning_aio.cli.live_line import LiveLine, time_left
+from rlightning_aio.cli.machine import machine_facts
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
     AsJson,
@@ -32,19 +33,20 @@ from rlightning_aio.cli.policies.policies import load_policy
 from rlightning_aio.cli.terminal import (
     count,
     counted,
-    err,
     out,
     print_json,
     run_interruptible,
 )
 from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio.cli.bench.measuring import Stands
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.registry import Backend
 
 __all__ = ["Watch", "bench"]
 
@@ -97,7 +99,7 @@ class _Output:
                 {
                     "config": str(self.config),
                     "interrupted": interrupted,
-                    **surroundings(configs),
+                    **machine_facts(backend.module for backend in _backends(configs)),
                     "contenders": [contender.as_json() for contender in contenders],
                     "best": None if best is None else best.as_json(),
                 }
@@ -105,6 +107,8 @@ class _Output:
         else:
             title = ("Interrupted: " if interrupted else "") + str(self.config)
             print_contenders(out(), title, contenders)
+            if best is not None:
+                out().print(verdict(best, contenders), soft_wrap=True, markup=False)
         if self.plot is not None:
             draw_contenders(str(self.config), contenders, self.plot)
         if self.best is not None and best is not None:
@@ -201,6 +205,11 @@ def bench(
             output.report(configs, order.contenders, interrupted=interrupted)
 
 
+def _backends(configs: Sequence[EnvConfig]) -> list[Backend]:
+    found = [ENVS.described(config.backend) for config in configs]
+    return [backend for backend in found if backend is not None]
+
+
 def _values(sweep: Sequence[str]) -> dict[str, list[str]]:
     """Return the values of each field that is swept."""
     found: dict[str, list[str]] = {}
@@ -250,7 +259,7 @@ async def _trace_fastest(order: _Bench, stands: Stands, path: Path) -> None:
 
 
 class Watch:
-    """The live line on stderr, or plain lines if it is no terminal.
+    """What `bench` says while it measures.
 
     Args:
         groups: number of groups to start first.
@@ -258,38 +267,35 @@ class Watch:
     """
 
     def __init__(self, groups: int, measurements: int) -> None:
-        self._console = err()
-        self._progress = Progress(
-            SpinnerColumn(),
-            BarColumn(bar_width=16),
-            TimeRemainingColumn(compact=True),
-            TextColumn("{task.description}"),
-            console=self._console,
-            auto_refresh=False,
-            transient=True,
-        )
-        self._task = self._progress.add_task("", total=measurements)
-        self._groups = groups
+        self._measurements = measurements
+        self._done = 0
+        self._began = time.monotonic()
+        self._words = f"starting {counted(groups, 'group')}"
+        self._line = LiveLine(self._parts, lambda _now: self._done / self._measurements)
 
     def __enter__(self) -> Self:
-        if self._console.is_terminal:
-            self._progress.start()
-        self.say(f"starting {counted(self._groups, 'group')}")
+        self._line.__enter__()
+        self.say(self._words)
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._console.is_terminal:
-            self._progress.stop()
+        self._line.stop()
 
-    def say(self, words: str, *, advance: int = 0) -> None:
+    def _parts(self, now: float) -> list[str]:
+        left = (now - self._began) * (self._measurements / self._done - 1) if self._done else None
+        return [self._words, *([] if left is None else [time_left(left)])]
+
+    def say(self, words: str) -> None:
         """Show the present activity."""
-        if self._console.is_terminal:
-            self._progress.update(self._task, description=words, advance=advance)
-            self._progress.refresh()
-        elif not advance:
-            self._console.print(words)
+        self._words, self._began = words, time.monotonic()
+        if self._line.is_live:
+            self._line.show()
+        else:
+            self._line.say(words)
 
     def measured(self, contender: Contender) -> None:
         """Count a finished measurement."""
+        self._done += 1
         words = f"{contender.setting.words}, {contender.rule.words}"
-        self.say(f"{words}: {count(contender.steps_per_second)} steps/s", advance=1)
+        self._words = f"{words}: {count(contender.steps_per_second)} steps/s"
+        self._line.show()

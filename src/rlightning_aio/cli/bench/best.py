@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.bench.measuring import Contender
 
-__all__ = ["best_of", "write_best"]
+__all__ = ["best_of", "verdict", "write_best"]
 
 _NOISE: Final = 0.03
 """Contenders within this share of the fastest count as equally fast."""
@@ -34,6 +34,17 @@ def best_of(contenders: Iterable[Contender]) -> Contender | None:
     fastest = max((contender.steps_per_second for contender in measured), default=0.0)
     as_fast = [c for c in measured if c.steps_per_second >= fastest * (1 - _NOISE)]
     return min(as_fast, key=lambda contender: contender.latency_us, default=None)
+
+
+def verdict(best: Contender, contenders: Iterable[Contender]) -> str:
+    """Return a sentence on the best setting, compared with the fastest that is no group of ours."""
+    words = f"Best: {best.setting.words}, {best.rule.words}: {count(best.steps_per_second)} steps/s"
+    others = [c for c in contenders if c.rounds and not isinstance(c.setting, Setting)]
+    if others:
+        other = max(others, key=lambda contender: contender.steps_per_second)
+        times = best.steps_per_second / other.steps_per_second
+        words += f", {times:.2g} times as many as {other.setting.words}"
+    return f"{words}."
 
 
 def write_best(path: Path, config: Path, best: Contender, *, interrupted: bool) -> None:

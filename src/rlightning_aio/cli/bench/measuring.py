@@ -22,13 +22,13 @@ import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
+from rlightning_aio.cli.machine import cpu_seconds, memory_bytes
 from rlightning_aio.cli.policies.collecting import (
     Roster,
     respond_to_all,
     responder,
     traced,
 )
-from rlightning_aio.cli.processes import cpu_seconds, memory_bytes
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 from rlightning_aio.cli.terminal import in_words
 from rlightning_aio.errors import RLightningError

@@ -6,17 +6,17 @@ import contextlib
 import json
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlias
 
 import typer
-from rich.live import Live
 
 from rlightning_aio._core.group.api.aio import EnvGroup
 from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.bench.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.figures import estimates, with_interval
+from rlightning_aio.cli.live_line import LiveLine, time_left
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.playing.films import (
@@ -43,7 +43,6 @@ from rlightning_aio.cli.policies.sb3_policies import SB3Policy, digest_of
 from rlightning_aio.cli.terminal import (
     count,
     counted,
-    err,
     named_columns,
     notes_on_returns,
     number,
@@ -281,7 +280,7 @@ def _play(order: _Order, files: _Files, results: ResultsFile | None) -> None:
             raise
         finally:
             # After an error, too: the episodes until then may be useful.
-            watch.stop()
+            watch.line.stop()
             if stopped or watch.found.attempts:
                 _report(order, files, watch.found, interrupted=interrupted)
     if watch.found.failed:
@@ -299,7 +298,7 @@ async def _evaluate(
     before = 0 if results is None else len(results.played)
     base: int | None = order.whose.facts["seed"]
     seed = None if base is None else base + before
-    async with playing(group, order.whose.policy, seed, trace, watch.draw) as policy:
+    async with playing(group, order.whose.policy, seed, trace, watch.line.show) as policy:
         await order.films.begin(group)
         try:
             evaluated = evaluate(
@@ -350,38 +349,28 @@ def _policy(
     return ActionChunks(policy, steps), f"{name}{played}"
 
 
-@dataclass
 class _Watch:
-    """The episodes so far, and the live table on stderr."""
+    """The episodes so far, and the live line on stderr."""
 
-    group: EnvGroup
-    order: _Order
-    found: Evaluation = field(default_factory=Evaluation)
-    _total: int = 0
-    _before: int = 0
-    _begun: float = 0.0
-    _recent: dict[str, None] = field(default_factory=dict[str, None])
-    """Lines of the table in the order of their last episodes."""
+    def __init__(self, group: EnvGroup, order: _Order) -> None:
+        self.found = Evaluation()
+        self._order = order
+        self._doing = f"starting {counted(len(group), 'env')}"
+        self._total = self._before = 0
+        self._begun = time.monotonic()
+        self.line = LiveLine(self._parts, self._share_done)
 
     def __enter__(self) -> Self:
-        self._console = err()
-        self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._console.print(f"starting {counted(len(self.group), 'env')}")
-        if self._console.is_terminal:
-            self._live.start()
+        self.line.__enter__()
+        self.line.say(self._doing)
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self.stop()
-
-    def stop(self) -> None:
-        """End the live table."""
-        if self._console.is_terminal:
-            self._live.stop()
+        self.line.stop()
 
     def ready(self, group: EnvGroup) -> None:
         """Show that all envs have started, with the number of episodes."""
-        episodes = self.order.episodes
+        episodes = self._order.episodes
         self._total = (
             sum(meta.num_envs for meta in group.metas) * episodes
             if isinstance(episodes, int)
@@ -389,28 +378,28 @@ class _Watch:
         )
         self._begun, self._before = time.monotonic(), len(self.found.attempts)
         before = f", {count(self._before)} of them played before" if self._before else ""
-        self._console.print(f"playing {counted(self._total, 'episode')}{before}")
+        self.line.say(f"playing {counted(self._total, 'episode')}{before}")
+        self._doing = ""
 
     def note(self, attempt: Attempt) -> None:
         """Count an episode."""
         self.found.attempts.append(attempt)
-        name = getattr(attempt.spec, self.order.by)
-        self._recent.pop(name, None)
-        self._recent[name] = None
 
-    def draw(self) -> None:
-        """Draw the live table, with the lines that had the last episodes if there are many."""
-        if not self._console.is_terminal:
-            return
-        done = len(self.found.attempts)
+    def _share_done(self, _now: float) -> float | None:
+        return None if self._doing else len(self.found.attempts) / max(1, self._total)
+
+    def _parts(self, now: float) -> list[str]:
+        if self._doing:
+            return [self._doing]
+        found, done = self.found, len(self.found.attempts)
         new = done - self._before
-        seconds = time.monotonic() - self._begun
-        left = f", {(self._total - done) * seconds / new:,.0f} s left" if new else ""
-        parts = parts_of(self.found, self.order.by)
-        rows = max(4, self._console.height - 6)
-        recent = {name: parts[name] for name in parts if name in [*self._recent][-rows:]}
-        title = f"{count(done)} of {counted(self._total, 'episode')}{left}"
-        self._live.update(_table(title, self.order.by, recent, self.found), refresh=True)
+        parts = [f"{count(done)} of {counted(self._total, 'episode')}"]
+        if new:
+            parts.append(time_left((self._total - done) * (now - self._begun) / new))
+        success, reward = found.success, found.total_reward
+        parts += [] if success is None else [f"success {success.mean:.0%}"]
+        parts += [] if reward is None else [f"mean return {number(reward.mean)}"]
+        return [*parts, *([f"{count(len(found.failed))} failed"] if found.failed else [])]
 
 
 # -- output ------------------------------------------------------------------------------

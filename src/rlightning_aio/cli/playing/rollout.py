@@ -48,7 +48,7 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import EnvConfig, load_config
-from rlightning_aio.errors import EnvFault
+from rlightning_aio.errors import EnvFault, RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
@@ -101,9 +101,6 @@ _MinResults: TypeAlias = Annotated[
         show_default="half of the envs",
     ),
 ]
-_Live: TypeAlias = Annotated[
-    bool, typer.Option("--live", help="On a terminal, show each worker process while it runs.")
-]
 
 
 def rollout(
@@ -114,7 +111,6 @@ def rollout(
     policy: PolicyName = None,
     seed: _Seed = None,
     min_results: _MinResults = None,
-    live: _Live = False,
     plot: PlotFile = None,
     video: Video = None,
     video_env: VideoEnvs = None,
@@ -135,7 +131,6 @@ def rollout(
         rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
         rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
         rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
-        rlightning-aio rollout configs/halfcheetah.yaml --seconds 60 --live
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
         rlightning-aio rollout configs/cartpole.yaml --video films --video-every 10
@@ -151,7 +146,7 @@ def rollout(
     group = EnvGroup(films.plan(configs))
     interrupted = completed = False
     try:
-        with Display(group, statistics, order.steps, seconds, workers=live) as display:
+        with Display(group, statistics, order.steps, seconds) as display:
             run_interruptible(_collect(group, configs, order, statistics, display))
         completed = True
     except KeyboardInterrupt:
@@ -161,6 +156,8 @@ def rollout(
         # After an error, too: the statistics until then may be useful.
         if completed or interrupted or statistics.steps:
             _report(config, group, statistics, plot, interrupted=interrupted, as_json=as_json)
+    if not statistics.steps:
+        raise RLightningError("no step has ended in that time; allow more with --seconds")
 
 
 async def _collect(
@@ -171,14 +168,14 @@ async def _collect(
     display: Display,
 ) -> None:
     async with (
-        display.ticking(),
+        display.line.ticking(),
         group,
         traced(group, order.trace),
         _workers_noted(group, statistics),
     ):
         roster = Roster(group)
         for server in roster.servers:
-            display.say(f"{server.env_id} listens at {server.address}")
+            display.line.say(f"{server.env_id} listens at {server.address}")
         await order.films.begin(group)
         display.resetting()
         batch, _ = await group.reset(seed=order.seed)
@@ -204,8 +201,8 @@ async def _collect(
                     break
                 statistics.add(batch)
                 await respond_to_all(group, respond, batch)
-                if display.due():
-                    display.show()
+                if display.line.due():
+                    display.line.show()
                     # If results are always ready, nothing else would let Ctrl-C take effect.
                     await asyncio.sleep(0)
 

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from rlightning_aio import Anything, BaseEnv, EnvRet, Outcome
 from rlightning_aio.envs.options import read_options
 from rlightning_aio.errors import BadAction, ConfigError
-from rlightning_aio.plugins.openenv.secret_headers import check_headers
+from rlightning_aio.plugins.one_frame import check_headers
 from rlightning_aio.plugins.openenv.session import (
     OpenEnvSession,
     ServerGone,

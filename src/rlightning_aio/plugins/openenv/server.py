@@ -25,7 +25,7 @@ from gymnasium import spaces
 from rlightning_aio import Anything, Outcome
 from rlightning_aio.errors import ConfigError, EnvFault, RLightningError
 from rlightning_aio.json_text import json_of
-from rlightning_aio.plugins.openenv.session import keep_alive_by_system
+from rlightning_aio.plugins.one_frame import keep_alive_by_system
 from rlightning_aio.trees import as_array, is_dict, is_tuple
 
 if TYPE_CHECKING:

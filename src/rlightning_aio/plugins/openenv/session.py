@@ -1,8 +1,6 @@
 """`OpenEnvSession`: one OpenEnv session, over one WebSocket at a time.
 
-OpenEnv's replies carry no numbers, so they are paired by order alone. Invariant: one frame is in
-flight on a socket. Whoever stops waiting for a reply closes the socket, so that a late reply can
-never answer another request.
+OpenEnv's replies carry no numbers, so one frame is in flight on a socket (`OneFrame`).
 Left out: what observations mean (see `openenv`).
 """
 
@@ -11,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket as sockets
 import urllib.request
 from contextvars import Context
 from http import HTTPStatus
@@ -20,23 +17,18 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import quote, urlsplit, urlunsplit
 
 from aiohttp import ClientError, ClientSession, ClientTimeout
-from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, WebSocketException
-from websockets.protocol import State
 
-from rlightning_aio.plugins.openenv.secret_headers import secretly
+from rlightning_aio.plugins.one_frame import OneFrame, keep_alive_by_system
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
-
-    from websockets.asyncio.client import ClientConnection
 
 __all__ = [
     "OpenEnvSession",
     "ServerGone",
     "ServerRefused",
     "get_json",
-    "keep_alive_by_system",
     "pauses",
     "post_json",
 ]
@@ -98,7 +90,7 @@ class OpenEnvSession:
         self.url = url
         self._keep = keep
         self._headers = headers
-        self._socket: ClientConnection | None = None
+        self._socket: OneFrame | None = None
         self._session_id: str | None = None
         self._creating: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
@@ -118,14 +110,12 @@ class OpenEnvSession:
         if socket is None:
             raise ServerGone(f"{self.url}: no session is open", is_unsent=True)
         self._stop_pings()
-        text, expected = json.dumps(message), _REPLIES[message["type"]]
-        is_unsent = socket.state is not State.OPEN
+        frames, expected = [json.dumps(message)], _REPLIES[message["type"]]
+        is_unsent = not socket.is_open
+        if is_unsent:  # A refusal may have come before the end.
+            frames, expected = [], "error"
         try:
-            if is_unsent:  # A refusal may have come before the end.
-                expected = "error"
-            else:
-                await socket.send(text)
-            reply = _parsed(await socket.recv(), expected)
+            reply = _parsed(await socket.ask(*frames), expected)
         except (OSError, WebSocketException, ValueError) as error:
             self._abandon()
             raise ServerGone(f"{self.url} was lost: {error}", is_unsent=is_unsent) from error
@@ -182,17 +172,12 @@ class OpenEnvSession:
                 await self._create()
             query = f"session_id={quote(str(self._session_id))}"
         try:
-            self._socket = await connect(
+            self._socket = await OneFrame.connected(
                 _address(self.url, "ws", "/ws", query),
+                self._headers,
                 open_timeout=_CONNECT_SECONDS,
                 close_timeout=0.3,
-                max_size=_MAX_BYTES,
-                # While a step is in flight there are none, see `ask`.
-                ping_interval=None,
-                # It costs more time, on both sides, than the bytes that it saves.
-                compression=None,
-                proxy=None,
-                **secretly(self._headers),
+                max_bytes=_MAX_BYTES,
             )
         except (OSError, InvalidHandshake, TimeoutError) as error:
             raise ServerGone(f"{self.url} can't be reached: {error}", is_unsent=True) from error
@@ -248,7 +233,7 @@ class OpenEnvSession:
         socket, self._socket = self._socket, None
         self._stop_pings()
         if socket is not None:
-            socket.transport.abort()
+            socket.abort()
 
     async def close(self) -> None:
         """Close the socket and the session.
@@ -287,7 +272,7 @@ def pauses() -> Iterator[float]:
         pause = min(2 * pause, longest)
 
 
-async def _keep_alive(socket: ClientConnection) -> None:
+async def _keep_alive(socket: OneFrame) -> None:
     """Keep an idle connection from being cut; a lost one is found by the next request."""
     try:
         while True:
@@ -295,15 +280,6 @@ async def _keep_alive(socket: ClientConnection) -> None:
             await socket.ping()
     except WebSocketException:
         return
-
-
-def keep_alive_by_system(transport: asyncio.Transport) -> None:
-    """Let the system find a far end that has vanished, also while a step is in flight."""
-    socket = transport.get_extra_info("socket")
-    socket.setsockopt(sockets.SOL_SOCKET, sockets.SO_KEEPALIVE, 1)
-    for name, value in (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 6)):
-        if hasattr(sockets, name):
-            socket.setsockopt(sockets.IPPROTO_TCP, getattr(sockets, name), value)
 
 
 def _parsed(frame: str | bytes, expected: str) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """`PolicyClient`: asks a policy server for the action of each env of a batch.
 
-Rule: an env has one connection, with at most one request in flight. Whoever stops waiting for an
-answer closes the connection, so that a late answer can't be taken for another one. What a protocol
+Rule: an env has one connection, with at most one request in flight (`OneFrame`). What a protocol
 says is left to its subclass.
 """
 
@@ -27,9 +26,9 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from numpy.typing import NDArray
-    from websockets.asyncio.client import ClientConnection
 
     from rlightning_aio import BatchedData
+    from rlightning_aio.plugins.one_frame import OneFrame
     from rlightning_aio.plugins.policy_servers.arrays import Codec
     from rlightning_aio.plugins.policy_servers.connection import Address
 
@@ -61,13 +60,13 @@ class PolicyClient(abc.ABC, Generic[R]):
         self._thread = LoopThread(f"policy server {address.url}")
         self._infos: dict[str, dict[str, Any]] = {}
         """Infos of the resets of envs."""
-        self._connections: dict[str, ClientConnection] = {}
+        self._connections: dict[str, OneFrame] = {}
         self._is_asking = False
 
     # -- what a protocol says ---------------------------------------------------------
 
     @abc.abstractmethod
-    async def _greet(self, connection: ClientConnection) -> None:
+    async def _greet(self, connection: OneFrame) -> None:
         """Exchange the first frames of a connection."""
 
     @abc.abstractmethod
@@ -75,7 +74,7 @@ class PolicyClient(abc.ABC, Generic[R]):
         """Return a request; `begun` is the info of the reset if an episode begins."""
 
     @abc.abstractmethod
-    async def _exchange(self, connection: ClientConnection, request: R) -> Any:
+    async def _exchange(self, connection: OneFrame, request: R) -> Any:
         """Send a request, and return the map that answers it."""
 
     @abc.abstractmethod
@@ -176,21 +175,16 @@ class PolicyClient(abc.ABC, Generic[R]):
             async with asyncio.timeout(self._address.timeout):
                 answer = await self._exchange(connection, request)
         except TimeoutError:
-            self._abort(connection)
             raise self._error(
                 f"has not answered {env_id} in {self._address.timeout:g} s; see its output, or "
                 "allow more with timeout="
             ) from None
         except BaseException:
-            self._abort(connection)
+            if connection is not None:  # What it has answered can't be understood.
+                connection.abort()
             raise
         self._connections[env_id] = connection
         return answer
-
-    def _abort(self, connection: ClientConnection | None) -> None:
-        """Close a connection at once, because a late answer must not be read."""
-        if connection is not None:
-            connection.transport.abort()
 
     def _actions_in(self, answer: Any) -> NDArray[Any]:
         """Return the actions of an answer."""
@@ -235,7 +229,7 @@ class PolicyClient(abc.ABC, Generic[R]):
         self.close()
 
 
-async def _close(connections: list[ClientConnection]) -> None:
+async def _close(connections: list[OneFrame]) -> None:
     with contextlib.suppress(ConnectionClosed):
         await asyncio.gather(*(connection.close() for connection in connections))
 

@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
-from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, InvalidStatus
 
 from rlightning_aio.errors import ConfigError, PolicyServerError
-from rlightning_aio.plugins.openenv.secret_headers import check_headers, secretly
+from rlightning_aio.plugins.one_frame import OneFrame, check_headers
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from websockets.asyncio.client import ClientConnection
 
 __all__ = ["MAX_BYTES", "Address", "connected"]
 
@@ -63,7 +60,7 @@ class Address:
             raise ConfigError(f"{self.url}: {error}") from None
 
 
-async def connected(address: Address) -> ClientConnection:
+async def connected(address: Address) -> OneFrame:
     """Connect, again and again while nothing listens there.
 
     Raises:
@@ -72,16 +69,13 @@ async def connected(address: Address) -> ClientConnection:
     until = time.monotonic() + address.connect_timeout
     while True:
         try:
-            return await connect(
+            return await OneFrame.connected(
                 address.url,
+                address.headers,
                 # A server may compute for a while before it looks at its connections.
                 open_timeout=address.timeout,
-                ping_interval=None,
                 close_timeout=_CLOSE_SECONDS,
-                max_size=MAX_BYTES,
-                compression=None,
-                proxy=None,
-                **secretly(address.headers),
+                max_bytes=MAX_BYTES,
             )
         except (OSError, InvalidHandshake, EOFError) as error:
             may_start = not isinstance(error, InvalidStatus) or error.response.status_code >= 500

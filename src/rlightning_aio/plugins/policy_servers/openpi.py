@@ -15,7 +15,7 @@ from rlightning_aio.plugins.policy_servers.connection import Address
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from websockets.asyncio.client import ClientConnection
+    from rlightning_aio.plugins.one_frame import OneFrame
 
 __all__ = ["OpenPiPolicy"]
 
@@ -54,9 +54,9 @@ class OpenPiPolicy(PolicyClient[bytes]):
         address = Address(url, timeout, connect_timeout, headers)
         super().__init__(address, Codec(str.encode), observe or _observed)
 
-    async def _greet(self, connection: ClientConnection) -> None:
+    async def _greet(self, connection: OneFrame) -> None:
         # The metadata only describe the policy.
-        await self._received(connection)
+        self._read(await connection.ask())
 
     def _request(self, observation: Any, begun: dict[str, Any] | None) -> bytes:
         del begun
@@ -66,12 +66,10 @@ class OpenPiPolicy(PolicyClient[bytes]):
         del request
         return True
 
-    async def _exchange(self, connection: ClientConnection, request: bytes) -> Any:
-        await connection.send(request)
-        return await self._received(connection)
+    async def _exchange(self, connection: OneFrame, request: bytes) -> Any:
+        return self._read(await connection.ask(request))
 
-    async def _received(self, connection: ClientConnection) -> Any:
-        frame = await connection.recv()
+    def _read(self, frame: str | bytes) -> Any:
         if isinstance(frame, str):
             raise self._raised(frame)
         return self._decoded(frame)

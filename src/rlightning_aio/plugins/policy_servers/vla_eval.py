@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from weakref import WeakSet
 
 import numpy as np
-from websockets.asyncio.client import ClientConnection
 
+from rlightning_aio.plugins.one_frame import OneFrame
 from rlightning_aio.plugins.policy_servers.arrays import Codec
 from rlightning_aio.plugins.policy_servers.client import PolicyClient, instruction
 from rlightning_aio.plugins.policy_servers.connection import Address
@@ -66,13 +66,13 @@ class VlaEvalPolicy(PolicyClient[_Asked]):
         address = Address(url, timeout, connect_timeout, {})
         super().__init__(address, Codec(str), observe or _observed)
         self._seqs = itertools.count()
-        self._in_episode = WeakSet[ClientConnection]()
+        self._in_episode = WeakSet[OneFrame]()
 
-    async def _greet(self, connection: ClientConnection) -> None:
+    async def _greet(self, connection: OneFrame) -> None:
         hello = {"harness_version": "rlightning_aio", "protocol_version": _PROTOCOL}
         seq = next(self._seqs)
-        await connection.send(self._message("hello", hello, seq))
-        payload = await self._received(connection, "hello", seq)
+        frame = await connection.ask(self._message("hello", hello, seq))
+        payload = self._read(frame, "hello", seq)
         version = payload.get("protocol_version")
         if version != _PROTOCOL:
             raise self._error(f"speaks version {version} of vla-eval's protocol, not {_PROTOCOL}")
@@ -93,19 +93,19 @@ class VlaEvalPolicy(PolicyClient[_Asked]):
         """A server knows what happened in an episode, so only its beginning can be repeated."""
         return request.start is not None
 
-    async def _exchange(self, connection: ClientConnection, request: _Asked) -> Any:
+    async def _exchange(self, connection: OneFrame, request: _Asked) -> Any:
+        before: list[bytes] = []
         if request.start is not None:
             if connection in self._in_episode:
-                await connection.send(self._message("episode_end", {}, next(self._seqs)))
-            await connection.send(request.start)
+                before.append(self._message("episode_end", {}, next(self._seqs)))
+            before.append(request.start)
             self._in_episode.add(connection)
-        await connection.send(request.observation)
-        return await self._received(connection, "action", request.seq)
+        frame = await connection.ask(*before, request.observation)
+        return self._read(frame, "action", request.seq)
 
-    async def _received(self, connection: ClientConnection, kind: str, seq: int) -> dict[str, Any]:
+    def _read(self, frame: str | bytes, kind: str, seq: int) -> dict[str, Any]:
         """Return the payload of the frame that answers the one with `seq`."""
-        frame = await connection.recv(decode=False)
-        message = self._decoded(frame)
+        message = self._decoded(frame if isinstance(frame, bytes) else frame.encode())
         fields = cast("dict[str, Any]", message) if isinstance(message, dict) else {}
         found, payload = fields.get("type"), fields.get("payload")
         if not isinstance(payload, dict):
