@@ -488,14 +488,14 @@ class FakeGroup:
             for host in self.hosts:
                 if host.rung:
                     host.on_readable()
-                    self.core.drain()
+                    self.core.apply_completions()
                     self.wake()
             woken = [r for r in self.running if r.is_due(self.now)]
             if not woken:
                 self.running = [running for running in self.running if not running.done]
                 return
             for running in reversed(woken) if newest_first else woken:
-                self.core.drain()
+                self.core.apply_completions()
                 running.resume(self.now)
         raise AssertionError("the core loops instead of waiting")
 

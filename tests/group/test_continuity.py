@@ -51,7 +51,7 @@ EVENTS: dict[LossEvent, Callable[[Continuity], object]] = {
     LossEvent.RESET_SENT: lambda c: c.note_resets([0]),
     LossEvent.SHOW_SENT: lambda c: c.note_shows([0], [Position(3, is_cut=False)]),
     LossEvent.ANSWERED: lambda c: c.take_answers(SLOT),
-    LossEvent.RAISED: lambda c: c.raised(0),
+    LossEvent.RAISED: lambda c: c.ended_without_result(0),
     LossEvent.GIVEN_UP: lambda c: c.give_up([0]),
 }
 """A call that makes each event happen to slot 0, which has a checkpoint."""
@@ -168,7 +168,7 @@ def test_an_env_that_is_put_back_after_a_death_knows_how_many_steps_it_has_lost(
 def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: LossPhase) -> None:
     """The reset after that begins at 0, whatever position was to be shown."""
     continuity = in_phase(shown)
-    continuity.raised(0)
+    continuity.ended_without_result(0)
     continuity.note_resets([0])
     assert continuity.take_answers(SLOT) == []
     first = part_of([0], [True], [False])

@@ -142,7 +142,7 @@ def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup
     host.finish()
     host.finish()
     host.on_readable()
-    group.core.drain()
+    group.core.apply_completions()
     group.cancel(running)
     assert ids_of(collect(group)) == ["fake-0", "fake-1"]
 
@@ -497,7 +497,7 @@ def test_requests_have_a_worker_replaced_in_which_only_a_cancelled_call_still_ru
 
 def die(group: FakeGroup, slot: int) -> None:
     group.host_of(slot).die()
-    group.core.drain()
+    group.core.apply_completions()
     group.wake()
     group.turn()
 

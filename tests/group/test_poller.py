@@ -87,7 +87,7 @@ class Scene:
         self.workers = [WorkerBell(memory, count, k) for k in range(count)]
         self.counts = [0] * count
         self.requests = Requests(np.repeat(np.arange(count), in_flight), count)
-        self.requests.submit(np.arange(sum(in_flight)), Operation.STEP, COLLECTOR, 0.0)
+        self.requests.issue(np.arange(sum(in_flight)), Operation.STEP, COLLECTOR, 0.0)
         self.requests.in_flight[:] = in_flight
         self.orders: list[tuple[int, bool]] = []
         arm = self.bell.arm

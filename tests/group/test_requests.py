@@ -68,7 +68,7 @@ class Driven:
             Event.VALUE: lambda: self.table.set_value(self._end(), "value"),
             Event.FAULT: self._fail,
             Event.WITHDRAWN: lambda: self.table.withdraw(self._end()),
-            Event.RESTARTED: self._restart,
+            Event.ASKED_AGAIN: self._restart,
             Event.HANDED_OUT: lambda: self.table.hand_out(self.table.collector.take(1)),
             Event.SETTLED: self._settle,
             Event.GIVEN_UP: self._give_up,
@@ -88,7 +88,7 @@ class Driven:
 
     def _ask(self, slots: list[int], op: int, owner: int) -> None:
         asked = np.array(slots)
-        self.table.submit(asked, op, owner, 1.0)
+        self.table.issue(asked, op, owner, 1.0)
         for _ in self.table.by_host(asked):
             pass
 
@@ -128,7 +128,7 @@ class Driven:
     def _restart(self) -> None:
         owed = self.table.owed(np.arange(3))
         self.table.lose_host(1)
-        self.table.restart(1, owed)
+        self.table.ask_again(1, owed)
 
     def _settle(self) -> None:
         assert self.ticket is not None
@@ -184,7 +184,7 @@ NOT_EXPRESSIBLE: dict[Combination, str] = {
     (State.BUSY, Owner.TICKET, Event.WITHDRAWN): "a call learns by an error that its env is away",
     (State.BUSY, Owner.NOBODY, Event.RESULT): "what was given up for nobody is a method",
     (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "no method of a client's env can be called",
-    (State.BUSY, Owner.NOBODY, Event.RESTARTED): "a method fails with its worker",
+    (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN): "a method fails with its worker",
     (State.READY, Owner.TICKET, Event.METHOD_GIVEN_UP): "methods have values, not results",
 }
 REACHABLE = {*STEPS, *METHODS}
@@ -241,7 +241,7 @@ def test_any_other_event_is_refused_or_has_no_effect(
         # A reply without a request, like a late one.
         assert table.end(1, driven.entry()) is None
         assert table.complete_one(1, driven.entry()) is None
-    elif event in (Event.RESTARTED, Event.ABORTED):
+    elif event in (Event.ASKED_AGAIN, Event.ABORTED):
         assert table.owed(slots).size == 0
     elif event in (Event.CLAIMED, Event.DROPPED):
         assert not table.joined(slots).any()
@@ -302,9 +302,9 @@ def test_a_late_reply_has_no_effect() -> None:
     """That of a request which another has taken the place of, after a death."""
     table = CheckedRequests(HOST_OF, 2)
     slots = np.array([SLOT])
-    (late,) = table.submit(slots, Operation.STEP, COLLECTOR, 1.0).tolist()
+    (late,) = table.issue(slots, Operation.STEP, COLLECTOR, 1.0).tolist()
     table.lose_host(1)
-    (entry,) = table.restart(1, slots).tolist()
+    (entry,) = table.ask_again(1, slots).tolist()
     assert table.end(1, late) is table.complete_one(1, late) is None
     assert not len(table.complete([(1, np.array([late]))]))
     assert table.state[SLOT] == State.BUSY
@@ -314,7 +314,7 @@ def test_a_late_reply_has_no_effect() -> None:
 def test_results_that_came_first_are_taken_first() -> None:
     """Those that came together are in any order."""
     table = CheckedRequests(HOST_OF, 2)
-    first, *others = table.submit(np.arange(3), Operation.STEP, COLLECTOR, 1.0).tolist()
+    first, *others = table.issue(np.arange(3), Operation.STEP, COLLECTOR, 1.0).tolist()
     assert table.complete([(1, np.array(others))]).tolist() == [1, 2]
     assert table.complete_one(0, first) == 0
     taken = [table.collector.take(1).item() for _ in range(3)]
@@ -329,7 +329,7 @@ def test_results_that_came_first_are_taken_first() -> None:
         (State.BUSY, Owner.COLLECTOR, Event.SENT),
         (State.READY, Owner.COLLECTOR, Event.JOINED),
         (State.SPENT, Owner.TICKET, Event.RESULT),
-        (State.BUSY, Owner.NOBODY, Event.RESTARTED),
+        (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN),
     ],
     ids=named,
 )
@@ -339,10 +339,10 @@ def test_the_debug_mode_refuses_an_illegal_event(state: State, owner: Owner, eve
     slots = table.alone(SLOT)
     bring_about: dict[Event, Callable[[], object]] = {
         Event.HANDED_OUT: lambda: table.hand_out(slots),
-        Event.SENT: lambda: table.submit(slots, Operation.STEP, COLLECTOR, 1.0),
+        Event.SENT: lambda: table.issue(slots, Operation.STEP, COLLECTOR, 1.0),
         Event.JOINED: lambda: table.join(SLOT, 1.0),
         Event.RESULT: lambda: table.deliver(slots),
-        Event.RESTARTED: lambda: table.restart(1, slots),
+        Event.ASKED_AGAIN: lambda: table.ask_again(1, slots),
     }
     message = f"{event.name} can't happen to slot {SLOT}, which is {state.name} for {owner.name}"
     with pytest.raises(RuntimeError, match=message):

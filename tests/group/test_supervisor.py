@@ -251,7 +251,7 @@ class Fleet:
             self.requests.fail(loss.owed, COLLECTOR, loss.error(loss.owed))
             return
         self.supervisor.replace(loss.host_id)
-        entries = self.requests.restart(loss.host_id, loss.owed)
+        entries = self.requests.ask_again(loss.host_id, loss.owed)
         if len(entries):
             self.supervisor.submit(loss.host_id, entries, None)
 
@@ -265,7 +265,7 @@ class Fleet:
     def ask(self, *slots: int) -> list[int]:
         """Send steps; return their entries."""
         asked = np.array(slots)
-        entries = self.requests.submit(asked, Operation.STEP, COLLECTOR, self.now)
+        entries = self.requests.issue(asked, Operation.STEP, COLLECTOR, self.now)
         self._hand_over(asked, entries)
         return entries.tolist()
 
@@ -622,7 +622,7 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
         if ours is limited:
             assert ours.requests.end(0, entry) == 0
             ours.requests.withdraw(0)
-            ours.requests.submit(np.array([0]), Operation.RESET, COLLECTOR, ours.now)
+            ours.requests.issue(np.array([0]), Operation.RESET, COLLECTOR, ours.now)
             assert list(ours.requests.by_host(np.array([0])))
             entry = ours.requests.numbering.entry.item(0)
         ours.hosts[0].current = (entry, int(ours.now * 1e9))

@@ -15,10 +15,10 @@ def policy(max_restarts: int | str) -> RestartPolicy:
 
 
 def test_a_number_counts_losses_in_a_row() -> None:
-    judge = policy(2).judge
-    assert judge(1, 0.0) == (True, "restart 1 of 2 in a row")
-    assert judge(2, 0.0) == (True, "restart 2 of 2 in a row, in 0.1 s")
-    is_borne, then = judge(3, 0.0)
+    count = policy(2).count
+    assert count(1, 0.0) == (True, "restart 1 of 2 in a row")
+    assert count(2, 0.0) == (True, "restart 2 of 2 in a row, in 0.1 s")
+    is_borne, then = count(3, 0.0)
     assert (is_borne, then) == (
         False, "it is not replaced after 2 restarts in a row (max_restarts)",
     )  # fmt: skip
@@ -26,16 +26,16 @@ def test_a_number_counts_losses_in_a_row() -> None:
 
 def test_a_rate_counts_restarts_within_a_time() -> None:
     """However many steps came in between; a loss that was raised counts for nothing."""
-    judge = policy("2/hour").judge
-    assert judge(1, 0.0) == (True, "restart 1 of 2 within the last hour")
-    assert judge(1, 60.0) == (True, "restart 2 of 2 within the last hour")
+    count = policy("2/hour").count
+    assert count(1, 0.0) == (True, "restart 1 of 2 within the last hour")
+    assert count(1, 60.0) == (True, "restart 2 of 2 within the last hour")
     for now in (120.0, 3599.0):
-        assert judge(1, now) == (
+        assert count(1, now) == (
             False, "it is not replaced after 2 restarts within the last hour (max_restarts)",
         )  # fmt: skip
-    assert judge(1, 3600.0)[0]
-    assert not judge(1, 3601.0)[0]
-    assert judge(1, 3661.0)[0]
+    assert count(1, 3600.0)[0]
+    assert not count(1, 3601.0)[0]
+    assert count(1, 3661.0)[0]
 
 
 @pytest.mark.parametrize("rate", ["10", "10/week", "-1/hour", "/hour", "1.5/hour"])

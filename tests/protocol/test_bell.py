@@ -171,8 +171,6 @@ class BellMachine(RuleBasedStateMachine):
             return
         unread = self.unread()
         assert self.trainer.unread() == sum(unread)
-        reached = self.order is not None and sum(w.count for w in self.workers) >= self.order[1]
-        assert self.trainer.reached() == reached
         assert self.trainer.with_news() == [k for k, count in enumerate(unread) if count]
         assert list(self.trainer.counters) == [w.count for w in self.workers]
 

@@ -28,7 +28,6 @@ from rlightning_aio.protocol.exchange import (
     FRAMES_SEEN,
     FRAMES_TO_TRAINER,
     FRAMES_TO_WORKER,
-    GOAL_MASK,
     GOAL_SHIFT,
     IN_ORDER,
     LINE,
@@ -351,15 +350,11 @@ class TrainerBell:
             goal: see `goal`.
             at_last: only workers without further work need to check.
 
-        Returns True if the goal is reached already; see `reached`.
+        Returns True if the goal is reached already, so no ring needs to be awaited.
         """
         armed = (self._epoch << _EPOCH_SHIFT) | (goal << GOAL_SHIFT) | (AT_LAST if at_last else 0)
         self._armed = armed | 1
         return kernel.arm(self._words, self._armed, self._fence)
-
-    def reached(self) -> bool:
-        """Return True if the goal of the armed bell is reached, so no ring needs to be awaited."""
-        return self._armed != 0 and sum(self.counters) >= (self._armed >> GOAL_SHIFT & GOAL_MASK)
 
     def disarm(self) -> None:
         """Prevent rings while the trainer is awake."""

@@ -3,5 +3,6 @@
 Imports run down: `api` (the two public groups), `setup` (what is started), `timeline`, `engine`
 (send, wait, apply, hand out), `supervision` (deaths, hangs, restarts), `tables` (what all parts
 share), `episodes` (step limits, losses, snapshots), `state`, `drivers` (how a procedure waits).
-No module here does I/O or reads a clock, but for the drivers; none knows where an env runs.
+Decisions get the time as an argument, or from `Tables.clock`; only drivers, `api` and what measures
+(`stats`, `hint`, `timeline`) read a clock, and none knows where an env runs.
 """

@@ -71,7 +71,7 @@ class RestartPolicy:
         self._done = done
         self.times: deque[float] = deque() if times is None else times
 
-    def judge(self, losses: int, now: float, *, pauses: bool = True) -> tuple[bool, str]:
+    def count(self, losses: int, now: float, *, pauses: bool = True) -> tuple[bool, str]:
         """Return True if a restart follows a loss, and say in a clause what follows.
 
         Args:

@@ -3,7 +3,7 @@
 Orders go to hosts, completions come back. Each completion reports the outcome of one request, or
 an event of a host. Hosts append them in order to the one queue of their group. Data of a request or
 a result that has no place in a row travels *out of band*.
-Left out on purpose: transport (see `link`), and the effects of messages (see `group.intake`).
+Left out on purpose: transport (see `link`), and the effects of messages (see `engine.intake`).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ __all__ = [
     "Death",
     "Died",
     "EnvStarted",
+    "EnvState",
     "ErrorText",
     "Failed",
     "FilmOrder",
@@ -53,6 +54,7 @@ __all__ = [
     "OutOfBand",
     "Raised",
     "Reported",
+    "RestoreOrder",
     "Result",
     "Saved",
     "StartOrder",
@@ -82,6 +84,31 @@ OutOfBand: TypeAlias = dict[str, Any]
 
 
 # -- orders -----------------------------------------------------------------------
+
+
+class EnvState(NamedTuple):
+    """The value of a request for a snapshot.
+
+    Attributes:
+        versions: of the libraries that the state is of.
+        has_result: the env has been reset, so a restore can show a result.
+        checkpoint: the state.
+    """
+
+    versions: dict[str, str]
+    has_result: bool
+    checkpoint: bytes
+
+
+class RestoreOrder(NamedTuple):
+    """The arguments of a request to go back to a state.
+
+    Attributes:
+        checkpoint: the state; show: the next reset `AS_RESTORED` shows it.
+    """
+
+    checkpoint: bytes
+    show: bool
 
 
 @dataclass(frozen=True)

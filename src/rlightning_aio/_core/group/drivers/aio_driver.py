@@ -46,7 +46,7 @@ class AioDriver:
     def __init__(self) -> None:
         # The queue of completions, and the function that applies them; set by the group.
         self.completions: Sized = ()
-        self.drain: Callable[[], None]
+        self.apply_completions: Callable[[], None]
         self.call_time = CallTime()
         self._num_calls = 0
         # The future of each waiting call, until it is woken.
@@ -193,7 +193,7 @@ class AioDriver:
         try:
             source.on_readable()
             if self.completions:
-                self.drain()
+                self.apply_completions()
         except BaseException as error:
             self._keep(error)
         self.wake()
@@ -239,7 +239,7 @@ class AioDriver:
                         await asyncio.sleep(0)  # Let the loop read the source again.
                         self._raise_kept()
                     if self.completions:
-                        self.drain()
+                        self.apply_completions()
                 except BaseException as error:
                     # Thrown, as a closed generator couldn't wait while cleaning up.
                     wait = procedure.throw(error)

@@ -46,7 +46,7 @@ class SyncDriver:
         # The queue of completions, the function that applies them, and the one that names the envs
         # for which a call waits; set by the group.
         self.completions: Sized = ()
-        self.drain: Callable[[], None]
+        self.apply_completions: Callable[[], None]
         self.awaited: Callable[[float], str]
         self.call_time = CallTime()
         self._epoll: select.epoll | None = None
@@ -136,7 +136,7 @@ class SyncDriver:
                     if wait is not TURN:  # No other procedure can run.
                         self._block(wait.until)
                         if self.completions:
-                            self.drain()
+                            self.apply_completions()
                     self.check_interrupt()
                 except BaseException as error:
                     if isinstance(error, KeyboardInterrupt):

@@ -40,7 +40,8 @@ T = TypeVar("T")
 class Wait:
     """A request to block until a source is readable, or until `until` (monotonic seconds).
 
-    If `until` has passed, the driver polls all sources once without blocking.
+    If `until` has passed, the driver polls all sources once without blocking; an
+    event loop may read what has just become readable only after that.
     """
 
     until: float | None = None
@@ -79,7 +80,7 @@ where no other call can wait.
 Procedure: TypeAlias = Generator[Wait, float, T]
 """A generator that yields waits, receives the time after each, and returns its result.
 
-The driver calls `Core.drain` before it resumes a procedure.
+The driver calls `Core.apply_completions` before it resumes a procedure.
 """
 
 
@@ -112,12 +113,12 @@ class Driver(Watcher, Protocol):
     Attributes:
         call_time: how long calls have waited; those that wait at the same time count once.
         completions: queue of the outcomes that sources posted.
-        drain: applies them; the driver calls it whenever the queue isn't empty.
+        apply_completions: applies them; the driver calls it whenever the queue isn't empty.
     """
 
     completions: Sized
 
-    drain: Callable[[], None]
+    apply_completions: Callable[[], None]
 
     call_time: CallTime
 

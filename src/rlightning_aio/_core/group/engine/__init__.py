@@ -1,6 +1,8 @@
 """The engine: it sends requests, waits for hosts, applies what they report, hands out results.
 
-`core` answers the calls of a group; `steps` is its short way for ordinary steps. `dispatch` sends,
-`waiting` and `poller` wait, `intake` applies reports, `results` makes batches. An operation is a
-generator, so the same code serves both public groups. Deaths are decided in `supervision`.
+`core` puts it together. `steps` (with `actions`), `resets`, `calls`, `snapshots`, `aborts` and
+`agent_steps` are the operations; `dispatch` sends, `waiting` waits, `intake` (with `arrivals`)
+applies reports, `results` makes batches, `metrics` and `newest` only read. An operation is a
+generator, so the same code serves both public groups. What a death means is decided in
+`supervision`; what is in flight is in `state`.
 """

@@ -32,7 +32,7 @@ class Arrivals:
     Attributes:
         held_back: by slot, envs that came back before the result that reports their loss was
             collected; see `admit`.
-        asked: slots of the last batch of responses; back: those of them that `without_gone` has
+        asked: slots of the last batch of responses; back: those of them that `drop_gone` has
             dropped, because their first results answer them.
     """
 
@@ -90,7 +90,7 @@ class Arrivals:
         self._requests.withdraw(slot)
         self._withdrawn.add(slot)
 
-    def without_gone(
+    def drop_gone(
         self, batch: BatchedData, slots: NDArray[np.intp]
     ) -> tuple[BatchedData, NDArray[np.intp]]:
         """Drop the responses to envs that have left since `batch` was returned.

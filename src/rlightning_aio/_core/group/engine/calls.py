@@ -97,14 +97,14 @@ class Calls:
             what: describes the arguments in messages.
             ticket: of the call, with the name of the operation as its method.
         """
-        self._intake.drain()
+        self._intake.apply_completions()
         self._dispatch.check_local(slots, f"call {ticket.method} of")
         self._dispatch.check_sendable(now, slots, f"call {ticket.method} of")
         packed = [
             self._dispatch.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
-        entries = self._requests.submit(slots, op, ticket.owner, now)
+        entries = self._requests.issue(slots, op, ticket.owner, now)
         self._requests.numbering.num_values[slots] += 1
         self._dispatch.hand_over(slots, entries, packed)
 

@@ -2,8 +2,8 @@
 
 It connects the parts of a group, none of which calls it back. Its procedures are generators that
 yield a `Wait` when they need a reply; the driver blocks until a source is readable or the time has
-come, calls `drain`, and sends the time in. Both kinds of group run through it.
-Rule: no I/O beyond passing bytes to hosts, no clock, no event loop.
+come, calls `apply_completions`, and sends the time in. Both kinds of group run through it.
+Rule: no I/O beyond passing bytes to hosts, no waiting, no event loop.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Core:
         )
         self._arrivals = arrivals = Arrivals(tables, results, stats)
         self.intake = intake = Intake(tables, supervisor, results, arrivals, stats)
-        self.drain = intake.drain
+        self.apply_completions = intake.apply_completions
         self.waiting = waiting = Waiting(
             tables, supervisor, poller, intake, parts.watcher, shares_thread=shares_thread
         )
@@ -225,7 +225,7 @@ class Core:
         Not `unasked`: without clients whose first result answers no request.
         """
         self.lifetime.check_open()
-        self.intake.drain()
+        self.intake.apply_completions()
         state, owner = self.requests.state, self.requests.owner
         slots = np.flatnonzero((state != State.IDLE) & (owner != NOBODY))
         return self.envs.names.ids(slots if unasked else slots[~self.requests.joined(slots)])

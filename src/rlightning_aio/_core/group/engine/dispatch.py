@@ -60,7 +60,10 @@ class Dispatch:
         return slots
 
     def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
-        """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
+        """Raise an error if the group is closed, or an env of `slots` is busy or gone.
+
+        A cancelled call that still runs in an env is ended before, inline by executing it.
+        """
         self._lifetime.check_open()
         while (slot := self._requests.first_not_idle(slots)) is not None:
             if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
@@ -95,9 +98,9 @@ class Dispatch:
         False if it has not ended.
         """
         self._watcher.read()
-        self._intake.drain()
+        self._intake.apply_completions()
         while not self._requests.is_idle(slot) and self._poller.execute(1, None):
-            self._intake.drain()
+            self._intake.apply_completions()
         if not self._requests.is_idle(slot):  # Perhaps nobody waits who would replace its worker.
             self._waiting.check(now)
         return self._requests.is_idle(slot)

@@ -92,7 +92,7 @@ class Intake:
             **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
         }
 
-    def drain(self) -> None:
+    def apply_completions(self) -> None:
         """Apply queued completions."""
         completions, handlers = self._completions, self._handlers
         while completions:
@@ -129,26 +129,28 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
-        fault = self.raised(slot, completion.error)
+        fault = self.apply_error(slot, completion.error)
         if fault is not None:
             self._fail(self._requests.alone(slot), lambda _: fault)
             return
-        self._requests.has_news = True  # What is in flight has changed, and nobody gets a reply.
+        self._requests.anything_ended = (
+            True  # What is in flight has changed, and nobody gets a reply.
+        )
         self._send_again(completion.host_id, self._requests.alone(slot))
 
-    def raised(self, slot: int, error: ErrorText) -> EnvRaised | None:
+    def apply_error(self, slot: int, error: ErrorText) -> EnvRaised | None:
         """Return the error that the current request of `slot` ends in, as its env raised `error`.
 
         None if the env is restarted instead: its episode is lost, which its next result reports.
         """
-        lost = self._continuity.raised(slot)
+        lost = self._continuity.ended_without_result(slot)
         fault = self._fault_of(slot, error, lost)
         if not self._supervisor.env_errors.ends_env(slot, error):
             return fault
         kind, blame = fault.outcome.kind, fault.outcome.blame
         why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
         self._continuity.abandon([slot], why)
-        return None if self._supervisor.env_errors.restarts(slot, error, fault) else fault
+        return None if self._supervisor.env_errors.count_restart(slot, error, fault) else fault
 
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
         """Make the error; `lost`: the loss that the result would have reported."""
@@ -187,7 +189,7 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
-        self._continuity.raised(slot)
+        self._continuity.ended_without_result(slot)
         if completion.for_good:
             self._supervisor.note_lost_env(completion.host_id, slot)
         self._fail(self._requests.alone(slot), lambda _: completion.fault)
@@ -196,7 +198,7 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
-        self._continuity.raised(slot)
+        self._continuity.ended_without_result(slot)
         if self._requests.owner[slot] == COLLECTOR:
             self._arrivals.withdraw(slot)
             return
@@ -269,7 +271,7 @@ class Intake:
             return
         is_step = self._requests.numbering.ops(slots) == int(Operation.STEP)
         _, seeds = self._continuity.report_losses(slots, is_step)
-        entries = self._requests.restart(host_id, slots)
+        entries = self._requests.ask_again(host_id, slots)
         self._layout.write_seeds(slots, seeds)
         self._supervisor.submit(host_id, entries, None)
 

@@ -157,7 +157,7 @@ class Resets:
     def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
         """Apply completions, and return the seeds of resets that are about to be sent."""
         self._intake.now = now
-        self._intake.drain()
+        self._intake.apply_completions()
         if self._members.possible:
             self._members.rank()
         return seeds_for(self._envs, seed, slots)
@@ -198,7 +198,7 @@ class Resets:
         owner: int,
         now: float,
     ) -> None:
-        entries = self._requests.submit(slots, Operation.RESET, owner, now)
+        entries = self._requests.issue(slots, Operation.RESET, owner, now)
         self._results.note_unasked(slots)
         seeded = seeds >= 0
         self._envs.last_seed[slots[seeded]] = seeds[seeded]

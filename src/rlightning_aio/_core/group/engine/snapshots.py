@@ -7,7 +7,7 @@ be undone. `Continuity` records what the next results then report; `snapshot_for
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from rlightning_aio._core.group.episodes.snapshot_format import (
     pack,
     unpack,
 )
+from rlightning_aio._core.hosts.messages import RestoreOrder
 from rlightning_aio.errors import EnvFault, SnapshotError, WorkerDied
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.hosts.messages import EnvState
 
 __all__ = ["Snapshots"]
 
@@ -107,7 +109,8 @@ class Snapshots:
         ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, str]] = []
-        for slot, (num_steps, is_cut), loss, (versions, was_reset, state) in replies:
+        for slot, (num_steps, is_cut), loss, reply in replies:
+            versions, was_reset, state = cast("EnvState", reply)
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
             env_id = self._envs.env_ids[slot]
             why_not = "" if was_reset else "has no state yet"
@@ -127,11 +130,11 @@ class Snapshots:
         slots = self._slots_for(snapshots, env_ids)
         self._check_restorable(slots)
         deaths = self._supervisor.last_losses(slots)
-        before, now = yield from self._take(now, slots)
-        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
+        own_snapshots, now = yield from self._take(now, slots)
+        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, own_snapshots, strict=True):
             check_same(snapshot, own.identity, self._envs.describe(slot))
         try:
-            states = [own.state for own, _ in before]
+            states = [own.state for own, _ in own_snapshots]
             now = yield from self._restore(now, slots, snapshots, states, deaths)
         except EnvFault:
             raise
@@ -172,7 +175,7 @@ class Snapshots:
         The envs of a worker that has died since `deaths` were its last can't go back. Returns the
         time.
         """
-        states = [(snapshot.state, True) for snapshot in snapshots]
+        states = [RestoreOrder(snapshot.state, show=True) for snapshot in snapshots]
         try:
             self._check_alive(slots, deaths)  # A replacement must not go on where it never was.
             ticket, now = yield from self._load(now, slots, states)
@@ -200,7 +203,8 @@ class Snapshots:
     ) -> Procedure[list[str]]:
         """Load the states from `before` again; return the ids of envs that can't go back."""
         try:
-            ticket, _ = yield from self._load(now, slots, [(state, False) for state in before])
+            own = [RestoreOrder(state, show=False) for state in before]
+            ticket, _ = yield from self._load(now, slots, own)
             values_of([ticket])
         except EnvFault as fault:
             # What a death means for its envs is settled.
@@ -211,8 +215,8 @@ class Snapshots:
         return []
 
     def _load(
-        self, now: float, slots: NDArray[np.intp], states: Sequence[tuple[bytes, bool]]
+        self, now: float, slots: NDArray[np.intp], states: Sequence[RestoreOrder]
     ) -> Procedure[tuple[Ticket, float]]:
-        """Have envs load states; each comes with whether the env is to show it afterwards."""
+        """Have envs load states."""
         send = partial(self._calls.send, now, slots, Operation.RESTORE, states, "its snapshot")
         return self._waiting.ask(now, slots, send, "restore")

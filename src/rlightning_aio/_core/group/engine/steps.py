@@ -206,7 +206,7 @@ class Steps:
             self.collecting = True
             try:
                 if now >= self._supervisor.look_by:
-                    now = yield from waiting.look()
+                    now = yield from waiting.check_now()
                 while True:
                     waiting.poll()
                     ready = collector.num_ready
@@ -217,7 +217,7 @@ class Steps:
                     need = most if rules.wait_all else min(rules.min_results, most)
                     wanted, until = (need or 1) - ready, None
                     if limits is not None:
-                        wanted, until = limits.wait(now, ready, most, need or 1)
+                        wanted, until = limits.num_wanted(now, ready, most, need or 1)
                     if wanted <= 0:
                         break
                     now = yield from waiting.turn(wanted, until)
@@ -276,7 +276,7 @@ class Steps:
             RLightningError: something is wrong with the batch or its envs; nothing was sent.
         """
         if self._completions:
-            self._intake.drain()
+            self._intake.apply_completions()
         answer = None if self._conditions.unusual else answer_of(batch, self._group)
         if answer is None:
             return self._write_any(batch, now)
@@ -301,7 +301,7 @@ class Steps:
         slots = self._slots_of(batch)
         self._intake.now = now
         if self._supervisor.members.possible:
-            batch, slots = self._arrivals.without_gone(batch, slots)
+            batch, slots = self._arrivals.drop_gone(batch, slots)
         self._dispatch.check_sendable(now, slots, "step")
         if self._conditions.unusual & PAST_END:
             self._continuity.warn_of_ended(slots)
@@ -337,7 +337,7 @@ class Steps:
             reports, seeds = self._continuity.report_losses(slots, ~resets)
             self._layout.write_seeds(slots[reports], seeds[reports])
             resets = resets | reports
-        entries = requests.submit(slots, _STEP, owner, now)
+        entries = requests.issue(slots, _STEP, owner, now)
         if b"\1" in resets.tobytes():
             requests.numbering.into_resets(slots, entries, resets)
         if packed is None:
@@ -345,7 +345,7 @@ class Steps:
         else:
             self._dispatch.hand_over_steps(slots, entries, packed, resets)
         if self._supervisor.members.possible:
-            self._intake.drain()  # Requests to absent envs are withdrawn immediately.
+            self._intake.apply_completions()  # Requests to absent envs are withdrawn immediately.
 
     def _step_at_once(self, now: float) -> bool:
         """Step the only env here and now: there is nobody to wait for.
@@ -359,7 +359,7 @@ class Steps:
             out_of_band = self._alone.step_now()
         except BaseException as error:
             requests.numbering.renew(slots, _STEP)
-            fault = self._intake.raised(0, ErrorText.of(error))
+            fault = self._intake.apply_error(0, ErrorText.of(error))
             if fault is None:
                 return False
             self._stats.note_failures(slots, fault.outcome.kind)
@@ -372,7 +372,7 @@ class Steps:
         requests.join(0, now, _STEP)
         requests.collector.take(1)
         if self._completions:
-            self._intake.drain()  # An info has come in a new form.
+            self._intake.apply_completions()  # An info has come in a new form.
         return True
 
     # -- hand out ---------------------------------------------------------------------
@@ -481,7 +481,7 @@ class _Limits:
         self._end = None if rules.deadline is None else now + rules.deadline
         self._window: float | None = None
 
-    def wait(self, now: float, ready: int, most: int, need: int) -> tuple[int, float | None]:
+    def num_wanted(self, now: float, ready: int, most: int, need: int) -> tuple[int, float | None]:
         """Return for how many more results to wait, and until when; 0 if there are enough.
 
         With a timeout, the first result opens a window in which further ones may come.

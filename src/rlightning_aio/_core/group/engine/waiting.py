@@ -88,15 +88,15 @@ class Waiting:
         is applied, also if another call applies it here.
         """
         if self._completions:
-            self.intake.drain()
+            self.intake.apply_completions()
         requests, bell = self._requests, self._bell
         if self._conditions.unusual or (
             bell.counters != bell.read_by_worker and not requests.read(bell)
         ):
             self._poller.poll()
-            self.intake.drain()
-        if requests.has_news:
-            requests.has_news = False
+            self.intake.apply_completions()
+        if requests.anything_ended:
+            requests.anything_ended = False
             if self.wanted:
                 self.wake()
 
@@ -112,7 +112,7 @@ class Waiting:
         if self.wanted:
             self._watcher.wake()
 
-    def look(self) -> Procedure[float]:
+    def check_now(self) -> Procedure[float]:
         """Check all hosts; return the time. It must be called by `Supervisor.look_by`.
 
         A caller that always finds enough results ready never waits, so it would miss dead and hung
@@ -131,7 +131,10 @@ class Waiting:
         self.poll()
 
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
-        """Wait once for `wanted` more replies, and return the time after it; the caller loops."""
+        """Wait once for `wanted` more replies, and return the time after it; the caller loops.
+
+        Requests to inline envs are executed in that time.
+        """
         poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
         self.wanted[wanted] = self.wanted.get(wanted, 0) + 1
         try:

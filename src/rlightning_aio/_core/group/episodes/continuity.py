@@ -389,7 +389,7 @@ class Continuity:
             self._move(slot, LossEvent.ANSWERED)
         return reports
 
-    def raised(self, slot: int) -> Loss | None:
+    def ended_without_result(self, slot: int) -> Loss | None:
         """Record that the request of `slot` ended without a result; return the loss that it would
         have reported.
         """

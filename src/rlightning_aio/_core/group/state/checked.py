@@ -132,10 +132,10 @@ class CheckedRequests(Requests):
                 f"{_named(expected.item(slot))}"
             )
 
-    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
+    def issue(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
         event = Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL
         with self.changes((event, slots)):
-            return super().submit(slots, op, owner, now)
+            return super().issue(slots, op, owner, now)
 
     def publish(
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
@@ -144,9 +144,9 @@ class CheckedRequests(Requests):
         with self.changes((event, slots)):
             return super().publish(slots, resets, owner, now)
 
-    def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        with self.changes((Event.RESTARTED, slots)):
-            return super().restart(host_id, slots)
+    def ask_again(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        with self.changes((Event.ASKED_AGAIN, slots)):
+            return super().ask_again(host_id, slots)
 
     def join(self, slot: int, now: float, op: int = Operation.JOIN) -> None:
         with self.changes((Event.JOINED, self.alone(slot))):

@@ -47,7 +47,7 @@ class Event(Enum):
     WITHDRAWN = auto()
     ABORTED = auto()
     """It has ended, and nobody gets what it led to."""
-    RESTARTED = auto()
+    ASKED_AGAIN = auto()
     KEPT = auto()
     """Its error could not be raised at once: it waits for the collector."""
     FREED = auto()
@@ -74,7 +74,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),
     (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
     (_BUSY, _C, Event.ABORTED): (_IDLE, _C),
-    (_BUSY, _C, Event.RESTARTED): (_BUSY, _C),
+    (_BUSY, _C, Event.ASKED_AGAIN): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
     (_READY, _C, Event.CLAIMED): (_READY, _T),
     (_READY, _C, Event.DROPPED): (_IDLE, _C),
@@ -83,7 +83,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _T, Event.VALUE): (_SPENT, _T),
     (_BUSY, _T, Event.FAULT): (_SPENT, _T),
     (_BUSY, _T, Event.ABORTED): (_IDLE, _C),
-    (_BUSY, _T, Event.RESTARTED): (_BUSY, _T),
+    (_BUSY, _T, Event.ASKED_AGAIN): (_BUSY, _T),
     (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
     (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
     (_READY, _T, Event.GIVEN_UP): (_READY, _C),

@@ -221,7 +221,7 @@ class Requests:
         rings: of each host, if it is a live worker of this machine; kept up by the hosts.
         in_rings: all hosts had rings when the group started.
         aborted: requests that end without a reply.
-        has_news: something has ended since this was set to False.
+        anything_ended: something has ended since this was set to False.
     """
 
     def __init__(
@@ -242,7 +242,7 @@ class Requests:
         self.rings: list[exchange.Ring | None] = [None] * num_hosts
         self.in_rings = False
         self._fence = exchange.new_fence()
-        self.has_news = False
+        self.anything_ended = False
 
     # -- what is known ------------------------------------------------------------
 
@@ -266,7 +266,7 @@ class Requests:
 
     # -- asking -------------------------------------------------------------------
 
-    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
+    def issue(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
         """Number the next request of each of `slots`, all idle; return their entries."""
         entries = self.numbering.renew(slots, op)
         self.sent_ns[slots] = int(now * 1e9)
@@ -332,7 +332,7 @@ class Requests:
             start = end
         return parts
 
-    def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+    def ask_again(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
         """Number outstanding steps and resets of a host again, as resets; return their entries.
 
         They are in flight again.
@@ -423,7 +423,7 @@ class Requests:
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
             self._forget(mine)
-            self.has_news = True
+            self.anything_ended = True
         return slots[~aborted]
 
     def join(self, slot: int, now: float, op: int = _JOIN) -> None:
@@ -434,13 +434,13 @@ class Requests:
         self.state[slot] = _READY_CODE
         self.collector.ready.append(slots)
         self.collector.num_ready += 1
-        self.has_news = True
+        self.anything_ended = True
 
     def deliver(self, slots: NDArray[np.intp]) -> None:
         """Deliver the results of `slots`, which are no longer in flight, to their owners."""
         if not len(slots):
             return
-        self.has_news = True
+        self.anything_ended = True
         self.state[slots] = _READY_CODE
         collector, tickets = self.collector, self.tickets.waiting
         if not tickets:  # As `CollectorQueue.append`, without a call.
@@ -463,7 +463,7 @@ class Requests:
 
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
-        self.has_news = True
+        self.anything_ended = True
         owner = int(self.owner[slot])
         if owner == NOBODY:
             self._forget(self.alone(slot))
@@ -487,7 +487,7 @@ class Requests:
 
     def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
         """End requests of one owner that are no longer in flight, in one error."""
-        self.has_news = True
+        self.anything_ended = True
         if owner > 0:
             ticket = self.tickets.note_ended(owner, len(slots))
             ticket.errors |= dict.fromkeys(slots.tolist(), fault)

@@ -44,7 +44,7 @@ class EnvErrors:
         op = self._group.requests.numbering.op(slot)
         return not self._record(slot).error_policy.raises and error.ends_env(op)
 
-    def restarts(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
+    def count_restart(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
         """Count an exception that has ended an env; True if an episode begins at once for it.
 
         Args:
@@ -57,7 +57,7 @@ class EnvErrors:
         count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
         self._on_count()
         now = group.clock()
-        is_borne, then = policy.judge(count, now, pauses=False)
+        is_borne, then = policy.count(count, now, pauses=False)
         if not is_borne:
             fault.add_note(then)
             return False

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["HangDetector", "has_news"]
+__all__ = ["HangDetector", "read_news"]
 
 _ABORT_SECONDS: Final = 0.2
 """Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
@@ -98,7 +98,7 @@ class HangDetector:
         aborted = [slot for slot in self._requests.aborted.faults if slot in record.slots]
         if not aborted or record.dying:
             record.abort_by = None
-        elif self._now >= by and not has_news(record):
+        elif self._now >= by and not read_news(record):
             record.abort_by, record.aborted_slot = None, aborted[0]
             self.kill(record, dump=False)
 
@@ -144,7 +144,7 @@ class HangDetector:
                 record.idle, record.idle_since = progress, self._now
                 return
         expiry = self._expiry(record)
-        if expiry is None or self._now < expiry or has_news(record):
+        if expiry is None or self._now < expiry or read_news(record):
             return
         record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
@@ -163,12 +163,12 @@ class HangDetector:
             if record.die_by is None:
                 # The trainer may have been stopped until it was killed.
                 record.die_by = self._group.clock() + _OBEY_SECONDS
-            elif self._now >= record.die_by and not has_news(record):
+            elif self._now >= record.die_by and not read_news(record):
                 assert record.killable is not None
                 record.die_by = None
                 record.killable.destroy()
 
 
-def has_news(record: HostRecord) -> bool:
+def read_news(record: HostRecord) -> bool:
     """Read what a host has sent, and return True if there was anything."""
     return record.killable is not None and record.killable.catch_up()

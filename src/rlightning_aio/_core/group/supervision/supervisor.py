@@ -29,7 +29,7 @@ from rlightning_aio._core.group.supervision.fault_messages import (
     start_fault,
     without_terminal,
 )
-from rlightning_aio._core.group.supervision.hang_detector import HangDetector, has_news
+from rlightning_aio._core.group.supervision.hang_detector import HangDetector, read_news
 from rlightning_aio._core.group.supervision.hint import Hints
 from rlightning_aio._core.group.supervision.members import Members
 from rlightning_aio._core.group.supervision.overdue import Overdue
@@ -191,7 +191,7 @@ class Supervisor:
         for record in self.records:
             if record.start_by is None or self._now < record.start_by:
                 continue
-            if has_news(record) or record.note_traffic():
+            if read_news(record) or record.note_traffic():
                 if not record.late:
                     record.give_time(self._clock())
             elif not record.late:
@@ -347,7 +347,7 @@ class Supervisor:
 
         Returns None where it means nothing for requests: while the group starts or closes, and if
         the worker was a replacement that never came up. Requests wait for the next one then, which
-        is started here.
+        is started here. Checkpoints that can't be used any more are dropped.
         """
         record, death = self.records[exited.host_id], exited.death
         record.dying, record.die_by, record.abort_by = False, None, None
@@ -440,7 +440,7 @@ class Supervisor:
         self._note_deaths(True)
         replaced, then = True, "it is replaced"
         if is_fault:
-            replaced, then = record.restart_policy.judge(deaths, self._clock())
+            replaced, then = record.restart_policy.count(deaths, self._clock())
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))

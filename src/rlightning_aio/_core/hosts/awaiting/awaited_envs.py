@@ -70,7 +70,7 @@ class _EnvRecord:
         losses: how often the env was replaced since it last completed a step.
         lost: why there is no env.
         leaving: the task that puts the env before away.
-        restoring: the task that makes another env.
+        rebuilding: the task that makes another env.
         fault: why there will be no other env, if so.
     """
 
@@ -84,7 +84,7 @@ class _EnvRecord:
         self.losses = 0
         self.lost = _CANCELLED
         self.leaving: asyncio.Task[None] | None = None
-        self.restoring: asyncio.Task[None] | None = None
+        self.rebuilding: asyncio.Task[None] | None = None
         self.fault: WorkerDied | None = None
 
     @property
@@ -275,7 +275,7 @@ class AwaitedEnvs:
             self.num_busy += 1
             record.entry, record.arguments = entry, arguments
             if record.env is None:
-                self._restore(record)
+                self._rebuild(record)
             else:
                 self._give(record, record.env)
 
@@ -293,11 +293,8 @@ class AwaitedEnvs:
         if error is None and op_of(entry) == Operation.STEP:
             record.losses = 0
         completion = completion_of(self._host_id, env.runner, entry, outcome, error)
-        if self._renews and isinstance(completion, Raised):
-            raised = completion.error
-            if raised.ends_env(op_of(entry)):
-                why = Loss(f"raised {raised.summary}", "env_raised", "either", record.name)
-                self._put_away(record, env, why)
+        if self._renews and (why := _end_of(record, op_of(entry), completion)):
+            self._put_away(record, env, why)
         self._finish(record, completion)
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self._inline and isinstance(error, KeyboardInterrupt):
@@ -333,8 +330,8 @@ class AwaitedEnvs:
         record = self._records[slot_of(entry) - self._first_slot]
         aborted = Raised(self._host_id, entry, ErrorText.of(asyncio.CancelledError("aborted")))
         if record.entry == entry:
-            if record.restoring is not None:
-                record.restoring.cancel()
+            if record.rebuilding is not None:
+                record.rebuilding.cancel()
             if record.env is not None:
                 self._put_away(record, record.env, _ABORTED)
             self._finish(record, aborted)
@@ -360,7 +357,7 @@ class AwaitedEnvs:
         if waits_in:
             message += f" while it waited in {waits_in}"
         self._put_away(record, env, hung(f"hung in a {doing} and was cancelled", op, record.name))
-        self._restore(record, message)
+        self._rebuild(record, message)
 
     def waits_in(self, slot: int) -> str:
         """Name the calls in which an env waits, from the outermost in; empty if it doesn't."""
@@ -387,7 +384,7 @@ class AwaitedEnvs:
         # No task of ours waits for that: perhaps the event loop ends.
         env.task.add_done_callback(closed)
         if record.entry:  # It has come at the same time.
-            self._restore(record)
+            self._rebuild(record)
 
     def _put_away(self, record: _EnvRecord, env: AwaitedEnv, why: Loss) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
@@ -424,11 +421,11 @@ class AwaitedEnvs:
         task.add_done_callback(self._tasks.discard)
         return task
 
-    def _restore(self, record: _EnvRecord, message: str = "") -> None:
-        """Make another env, which answers the request; see `_restored`."""
-        record.restoring = self._spawn(self._restored(record, message))
+    def _rebuild(self, record: _EnvRecord, message: str = "") -> None:
+        """Make another env, which answers the request; see `_rebuilt`."""
+        record.rebuilding = self._spawn(self._rebuilt(record, message))
 
-    async def _restored(self, record: _EnvRecord, message: str) -> None:
+    async def _rebuilt(self, record: _EnvRecord, message: str) -> None:
         """Build another env. A step, and what the env before was lost in, is answered by its reset.
 
         Args:
@@ -455,6 +452,8 @@ class AwaitedEnvs:
                 return
             outcome = await self._reset(record, env)
             if outcome is not None:
+                if self._renews and (why := _end_of(record, Operation.RESET, outcome)):
+                    self._put_away(record, env, why)
                 self._finish(record, outcome)
                 return
             kind, message = EnvHung, f"env {record.name!r} took too long for the reset after that"
@@ -484,7 +483,7 @@ class AwaitedEnvs:
     def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Failed | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         record.losses += 1
-        is_borne, then = self._restarts.judge(record.losses, self._loop.time())
+        is_borne, then = self._restarts.count(record.losses, self._loop.time())
         if is_borne:
             log.warning("%s; %s", message, then)
             return None
@@ -513,3 +512,10 @@ def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int
 
 def _reraise(error: BaseException) -> NoReturn:
     raise error
+
+
+def _end_of(record: _EnvRecord, op: int, completion: Completion | None) -> Loss | None:
+    """Return how an env has ended by what it has raised in an operation; None if it has not."""
+    if not isinstance(completion, Raised) or not completion.error.ends_env(op):
+        return None
+    return Loss(f"raised {completion.error.summary}", "env_raised", "either", record.name)

@@ -3,7 +3,7 @@
 Rule: neither end waits for the other to read; messages wait here until the socket has room. A fork
 server imports this module before it knows if its interpreter has the packages of a worker, so it
 imports only the standard library.
-Left out on purpose: the effects of the messages (see `fork_server` and `process`).
+Left out on purpose: the effects of the messages (see `fork_server` and `host`).
 """
 
 from __future__ import annotations

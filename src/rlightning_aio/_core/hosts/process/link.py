@@ -1,7 +1,7 @@
 """`Link`: the trainer's end of the rings and the channel that it shares with one worker.
 
 Requests go into the shared rings, larger data into the channel (a socket pair).
-Left out on purpose: the life of the worker (see `process`), and the effects of messages.
+Left out on purpose: the life of the worker (see `host`), and the effects of messages.
 """
 
 from __future__ import annotations

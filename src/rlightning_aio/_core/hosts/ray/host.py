@@ -3,7 +3,7 @@
 One remote call carries a batch of requests, with one array for each column, and its reply has the
 same form. Threads of Ray put outcomes into an `Inbox`, whose descriptor wakes the trainer. A node
 that dies is a worker that dies, and its replacement is another actor.
-Left out on purpose: calls to Ray (see `ray`), and the execution of requests (see `actor`).
+Left out on purpose: calls to Ray (see `cluster`), and the execution of requests (see `actor`).
 """
 
 from __future__ import annotations

@@ -8,10 +8,13 @@ from __future__ import annotations
 import inspect
 import pickle
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.protocol.entries import answers_with_value
+
+if TYPE_CHECKING:
+    from rlightning_aio._core.hosts.messages import EnvState
 
 __all__ = ["Abandoned", "AwaitedRunner"]
 
@@ -55,9 +58,9 @@ class AwaitedRunner(EnvRunner):
             raise Abandoned
         return finish(returned, time.monotonic_ns() - began)
 
-    def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
-        versions, has_result, state = super()._snapshot()
-        return versions, has_result, pickle.dumps((self.reset_with, state))
+    def _snapshot(self) -> EnvState:
+        state = super()._snapshot()
+        return state._replace(checkpoint=pickle.dumps((self.reset_with, state.checkpoint)))
 
     def _restore(self, checkpoint: bytes, show: bool) -> None:
         reset_with, state = loaded(checkpoint)

@@ -3,7 +3,7 @@
 A checkpoint is one pickle. Shown again, its result is no transition: no reward, no end, `is_reset`.
 Observation, info and the sums of its episodes are as before, so the env continues as it would
 have. `Saver` sends checkpoints to the trainer, which keeps the last one for a replacement of the
-worker; `group.continuity` decides when it is used.
+worker; `group.episodes.continuity` decides when it is used.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Checkpoints:
         """Drop a restored result that was not shown: the env is about to be reset."""
         self._restored = None
 
-    def must_show(self) -> bool:
+    def accept_show(self) -> bool:
         """Return True if the reset in the row asks for the restored result; forget it otherwise."""
         if self._restored is not None and self._slab.take_as_restored(self._row):
             return True

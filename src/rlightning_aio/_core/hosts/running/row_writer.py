@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio._core.hosts.running.copied import copied
-from rlightning_aio._core.hosts.running.episodes import EpisodeSums
+from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
 from rlightning_aio.envs.base import result_of
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import fitted, fitted_tree, row_reader, row_writer

@@ -24,6 +24,7 @@ from rlightning_aio._core.hosts.messages import (
     STEP_IN_ROW,
     Attached,
     EnvStarted,
+    EnvState,
     ErrorText,
     NewSchema,
     OutOfBand,
@@ -258,8 +259,9 @@ class EnvRunner:
             return self._noted_casts, _outcome
         return partial(call_env, self.env, *arguments), _outcome
 
-    def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
-        return versions_of(self.env), self.checkpoints.has_result, self.checkpoints.take()
+    def _snapshot(self) -> EnvState:
+        checkpoints = self.checkpoints
+        return EnvState(versions_of(self.env), checkpoints.has_result, checkpoints.take())
 
     def _restore(self, checkpoint: bytes, show: bool) -> None:
         self.checkpoints.load(checkpoint, show=show)
@@ -399,7 +401,7 @@ class EnvRunner:
 
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
         """Start a new episode, or show the restored result if the reset in the row asks for it."""
-        if arguments is None and self.checkpoints.must_show():
+        if arguments is None and self.checkpoints.accept_show():
             return _no_call, self._finish_shown
         if self._saver is not None:
             self._saver.before_reset()
