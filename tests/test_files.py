@@ -52,22 +52,6 @@ def test_a_new_file_has_the_requested_mode(tmp_path: Path) -> None:
     assert modes["public"] == modes["ordinary"]
 
 
-@pytest.mark.parametrize("mode", [0o600, 0o664, 0o640])
-def test_a_replaced_file_keeps_its_mode_and_owner(tmp_path: Path, mode: int) -> None:
-    path = tmp_path / "file"
-    path.write_bytes(BEFORE)
-    if os.geteuid() == 0:
-        os.chown(path, 12345, 23456)
-    path.chmod(mode)
-    before = path.stat()
-    write_file(path, AFTER)
-    after = path.stat()
-    assert path.read_bytes() == AFTER
-    assert (after.st_mode, after.st_uid, after.st_gid) == (
-        before.st_mode, before.st_uid, before.st_gid,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("dangling", [False, True])
 def test_links_are_followed(tmp_path: Path, *, dangling: bool) -> None:
     """Also a link to a link in another folder, relative to that folder."""
@@ -107,23 +91,17 @@ def _loop(path: Path) -> None:
     path.symlink_to(path)
 
 
-def _read_only(path: Path) -> None:
-    path.write_bytes(BEFORE)
-    path.chmod(0o444)
-
-
 def _below_a_file(path: Path) -> None:
     path.parent.rmdir()
     path.parent.write_bytes(BEFORE)
 
 
 IN_THE_WAY: dict[str, tuple[Callable[[Path], None], str]] = {
-    "folder": (Path.mkdir, "it is a folder, not a regular file"),
-    "FIFO": (_fifo, "it is a FIFO, not a regular file"),
-    "socket": (_socket, "it is a socket, not a regular file"),
-    "device": (_device, "it is a character device, not a regular file"),
-    "loop": (_loop, "symbolic links"),
-    "read-only": (_read_only, "it is read-only"),
+    "folder": (Path.mkdir, "it is no regular file"),
+    "FIFO": (_fifo, "it is no regular file"),
+    "socket": (_socket, "it is no regular file"),
+    "device": (_device, "it is no regular file"),
+    "loop": (_loop, "it is no regular file"),
     "no folder": (lambda path: path.parent.rmdir(), "there is no folder"),
     "below a file": (_below_a_file, "Not a directory"),
 }
@@ -131,7 +109,7 @@ IN_THE_WAY: dict[str, tuple[Callable[[Path], None], str]] = {
 
 @pytest.mark.parametrize("behind_a_link", [False, True])
 @pytest.mark.parametrize("case", IN_THE_WAY)
-def test_anything_but_a_writable_regular_file_is_refused(
+def test_anything_but_a_regular_file_is_refused(
     tmp_path: Path, case: str, *, behind_a_link: bool
 ) -> None:
     """By the early check and by the write; neither waits for a reader of a FIFO."""
@@ -253,4 +231,4 @@ def test_an_unwritable_folder_is_detected_early() -> None:
             text=True,
         )
         Path(name).chmod(0o755)
-    assert f"PermissionError: [Errno 13] folder {name}: Permission denied" in done.stderr
+    assert f"PermissionError: [Errno 13] Permission denied: '{name}/file'" in done.stderr

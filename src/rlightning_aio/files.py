@@ -1,9 +1,8 @@
-"""Writes result files atomically.
+"""Writes result files: completely, or not at all.
 
 Rule: each file that the library saves for a user is written by `write_file`, or renamed by
-`finish_file` if another program writes it. Links are followed; anything but a regular file is
-refused, and so is a read-only file, even for root. A replaced file keeps its mode and owner. Each
-`OSError` raised here names the user's path.
+`finish_file` if another program writes it. Links are followed, and anything but a regular file is
+refused. Each `OSError` raised here names the user's path.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import errno
 import os
 import re
 import secrets
-import stat
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
@@ -32,13 +30,6 @@ __all__ = [
 
 _PROBE: Final = bytes(4096)
 """One block, because an empty file fits even a full disk."""
-_KINDS: Final = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a FIFO",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a character device",
-    stat.S_IFBLK: "a block device",
-}
 
 
 def file_name(text: str) -> str:
@@ -80,7 +71,7 @@ def write_file(
     Args:
         path: a link is followed, and its target replaced.
         content: the bytes, or parts of them in order.
-        mode: of a new file, before the umask.
+        mode: of the file, before the umask.
 
     Raises:
         OSError: it can't be written; an existing file is unchanged.
@@ -99,43 +90,22 @@ def finish_file(partial: Path, path: str | os.PathLike[str]) -> None:
     """
     target = check_regular(path)
     with _naming(path):
-        descriptor = os.open(partial, os.O_RDONLY)
-        try:
-            with contextlib.suppress(FileNotFoundError):
-                _take_after(descriptor, target.stat())
-            # Some file systems report a full disk only here.
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        with partial.open("rb") as file:
+            os.fsync(file.fileno())  # Some file systems report a full disk only here.
         partial.replace(target)
-
-
-def _take_after(descriptor: int, before: os.stat_result) -> None:
-    """Give a new file the owner and the mode of the one that it replaces."""
-    with contextlib.suppress(PermissionError):  # Only root may give files away.
-        os.fchown(descriptor, before.st_uid, before.st_gid)
-    os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
 
 
 def check_regular(path: str | os.PathLike[str]) -> Path:
     """Resolve `path` to that of a regular file, which may be missing.
 
     Raises:
-        OSError: it is something else, or read-only.
+        OSError: it is something else.
     """
-    target = Path(os.path.realpath(path))
     with _naming(path):
-        try:
-            mode = target.stat().st_mode
-        except FileNotFoundError:
-            return target
-        if not stat.S_ISREG(mode):
-            number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EEXIST
-            kind = _KINDS.get(stat.S_IFMT(mode), "something else")
-            raise OSError(number, f"it is {kind}, not a regular file")
-        # Root could write it, but the mode says to keep it.
-        if not mode & 0o222 or not os.access(target, os.W_OK):
-            raise PermissionError(errno.EACCES, "it is read-only")
+        target = Path(os.path.realpath(path))
+        if os.path.lexists(target) and (target.is_symlink() or not target.is_file()):
+            number = errno.ELOOP if target.is_symlink() else errno.EEXIST
+            raise OSError(number, "it is no regular file")
     return target
 
 
@@ -143,13 +113,10 @@ def check_regular(path: str | os.PathLike[str]) -> Path:
 def _partial_file(folder: Path, mode: int = 0o666) -> Generator[BinaryIO]:
     """Open a new file in `folder`, which is removed at the end unless it was renamed."""
     partial = folder / f".rlightning-aio-{secrets.token_hex(8)}.part"
-    try:
-        # Only an opener can set the mode before a secret is written.
-        file = open(partial, "xb", opener=lambda path, flags: os.open(path, flags, mode))  # noqa: SIM115
-    except FileNotFoundError as error:
-        raise FileNotFoundError(errno.ENOENT, f"there is no folder {folder}") from error
-    except OSError as error:
-        raise OSError(error.errno, f"folder {folder}: {error.strerror}") from error
+    if not folder.exists():
+        raise FileNotFoundError(errno.ENOENT, f"there is no folder {folder}")
+    # Only an opener can set the mode before a secret is written.
+    file = open(partial, "xb", opener=lambda path, flags: os.open(path, flags, mode))  # noqa: SIM115
     try:
         with file:
             yield file

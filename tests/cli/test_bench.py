@@ -310,7 +310,7 @@ def test_a_plot_that_cannot_be_written_is_refused_at_once(
     (tmp_path / "taken.png").mkdir()
     for name, why in (
         ("no/plot.png", "there is no folder"),
-        ("taken.png", "it is a folder"),
+        ("taken.png", "it is no regular file"),
         ("plot.txt", "should end in"),
     ):
         done = invoke("bench", config, "--plot", tmp_path / name)

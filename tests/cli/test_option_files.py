@@ -45,7 +45,7 @@ def test_a_fifo_is_refused_and_left_alone(
     os.mkfifo(path)
     line = refused(*words)
     assert path.name in line
-    assert ("File exists" if option == "--video" else "it is a FIFO, not a regular file") in line
+    assert ("File exists" if option == "--video" else "it is no regular file") in line
     assert path.is_fifo()
 
 

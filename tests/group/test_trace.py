@@ -118,7 +118,7 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(group: Any, tmp_path: 
     """The message has the file and the reason."""
     with pytest.raises(FileNotFoundError, match=r"there is no folder .*missing"):
         group.trace(tmp_path / "missing" / "run.json")
-    with pytest.raises(IsADirectoryError, match="it is a folder, not a regular file"):
+    with pytest.raises(FileExistsError, match="it is no regular file"):
         group.trace(tmp_path)
     with (
         group.trace(tmp_path / "run.json"),
