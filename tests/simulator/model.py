@@ -815,8 +815,10 @@ class Model:
     def _most_errors(self, env: Env) -> int:
         """How often in a row an env may have raised, also in its request before its worker died."""
         request = env.request if env.entry.on_error == "restart" else None
-        may_raise = request is not None and bool(self._raising(env, request))
-        return env.errors[1] + may_raise
+        if request is None or not self._raising(env, request):
+            return env.errors[1]
+        is_retried = env.entry.form == "awaitable" and request.resets
+        return env.errors[1] + (env.entry.max_restarts if is_retried else 1)
 
     def gone(self, env: Env, fault: WorkerDied) -> None:
         """Check an error that says that an env's worker has ended for good, or during a call."""
