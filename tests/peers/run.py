@@ -294,6 +294,8 @@ def run_part(peer: Peer, part: Part, more: list[str]) -> bool:
 
 def run_peer(peer: Peer, source: Path, more: list[str]) -> int:
     """Run all parts of a peer in this process, and return its exit code."""
+    if "DISPLAY" not in os.environ:
+        os.environ.setdefault("MUJOCO_GL", "egl")
     try:
         peer.prepare(source)
     except ModuleNotFoundError as missing:
@@ -302,6 +304,8 @@ def run_peer(peer: Peer, source: Path, more: list[str]) -> int:
     # Away from the sources, or they would be imported in place of what is installed.
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(source / "tests", Path(folder, "tests"))
+        if (source / "examples").is_dir():  # RLightning's tests read configs there.
+            Path(folder, "examples").symlink_to(source / "examples")
         Path(folder, "pytest.ini").write_text("[pytest]\n")
         for adapted in peer.adapted:
             adapted.rewrite(Path(folder, "tests"))
