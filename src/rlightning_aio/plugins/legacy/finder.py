@@ -59,6 +59,7 @@ ALIASED: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "rlightning.utils.logger": {"profiler": ("get_logger", "log_metric")},
     "rlightning.utils.profiler": {},
     "rlightning.utils.profiler.profiler": {"profiler": _PROFILER},
+    "rlightning.utils.ray": {"tensors": ("resolve_object",)},
     "rlightning.utils.registry": _REGISTRY,
     "rlightning.utils.registry.registry": {"registry": ("Registry",)},
     "rlightning.utils.utils": {
@@ -80,6 +81,7 @@ _ABSENT: Final = {
     "rlightning.env": ("LiberoEnv",),
     "rlightning.utils.config": _SECTIONS,
     "rlightning.utils.config.config": _SECTIONS,
+    "rlightning.utils.ray": ("RayActorMixin", "TaskSubmitter"),
     "rlightning.utils.registry": ("BUFFERS", "ENGINE", "POLICIES", "WEIGHTS"),
 }  # fmt: skip
 """Names that programs often import and that only RLightning itself has."""

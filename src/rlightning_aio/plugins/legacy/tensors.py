@@ -14,7 +14,7 @@ from rlightning_aio.trees import as_numpy, holds_tensor, is_tensor
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["on_cpu", "to_device", "to_numpy"]
+__all__ = ["on_cpu", "resolve_object", "to_device", "to_numpy"]
 
 
 @cache  # A search for a module that is missing takes as long as a step.
@@ -81,3 +81,8 @@ def on_cpu(data: Any) -> Any:
     if not holds_tensor(data):
         return data
     return _mapped(lambda value: value.detach().cpu() if is_tensor(value) else value, data)
+
+
+def resolve_object(obj: Any) -> Any:
+    """Return `obj`: results are values here, never references of Ray."""
+    return obj
