@@ -511,13 +511,13 @@ class FakeGroup:
         self.turn()
 
     def read(self) -> None:
-        """See `hosts.base.Watcher`: there is nothing to read."""
+        """See `hosts.base.Driver`: there is nothing to read."""
 
     def check_interrupt(self) -> None:
-        """See `hosts.base.Watcher`: nobody interrupts it."""
+        """See `hosts.base.Driver`: nobody interrupts it."""
 
     def wake(self) -> None:
-        """See `hosts.base.Watcher.wake`."""
+        """See `hosts.base.Driver.wake`."""
         for running in self.running:
             running.woken |= not running.is_parked
 

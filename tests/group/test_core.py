@@ -11,7 +11,7 @@ from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio._core.group.drivers.wait import CollectRules
 from rlightning_aio._core.group.state.conditions import CLOSED, UNLIKE_ENVS
-from rlightning_aio._core.hosts.messages import Failed, Withdrawn
+from rlightning_aio._core.hosts.messages import Faulted, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     BadAction,
@@ -411,7 +411,7 @@ def test_requests_that_show_a_restored_state_are_as_old_as_they_are(new_group: N
     restoring.result()
 
 
-@pytest.mark.parametrize("kind", [Failed, Withdrawn])
+@pytest.mark.parametrize("kind", [Faulted, Withdrawn])
 def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
     new_group: NewGroup, kind: type[Any]
 ) -> None:
@@ -423,7 +423,7 @@ def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
     host, entry = group.hosts[0], group.core.requests.numbering.entry.item(0)
     host.waiting.clear()
     fault = EnvHung("it hangs", env_id="fake-0")
-    host.answer(Failed(0, entry, fault) if kind is Failed else Withdrawn(0, entry))
+    host.answer(Faulted(0, entry, fault) if kind is Faulted else Withdrawn(0, entry))
     group.turn()
     with pytest.raises(EnvFault):
         stepping.result()

@@ -69,7 +69,7 @@ class Driven:
             Event.FAULT: self._fail,
             Event.WITHDRAWN: lambda: self.table.withdraw(self._end()),
             Event.ASKED_AGAIN: self._restart,
-            Event.HANDED_OUT: lambda: self.table.hand_out(self.table.collector.take(1)),
+            Event.HANDED_OUT: lambda: self.table.hand_out(self.table.collector.pop_ready(1)),
             Event.SETTLED: self._settle,
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
@@ -317,7 +317,7 @@ def test_results_that_came_first_are_taken_first() -> None:
     first, *others = table.issue(np.arange(3), Operation.STEP, COLLECTOR, 1.0).tolist()
     assert table.complete([(1, np.array(others))]).tolist() == [1, 2]
     assert table.complete_one(0, first) == 0
-    taken = [table.collector.take(1).item() for _ in range(3)]
+    taken = [table.collector.pop_ready(1).item() for _ in range(3)]
     assert sorted(taken[:2]) == [1, 2]
     assert taken[2] == 0
 

@@ -295,7 +295,7 @@ class Fleet:
         """Complete a step and collect it."""
         host_id = self.requests.hosts.item(slot)
         assert self.requests.complete_one(host_id, self.requests.numbering.entry.item(slot)) == slot
-        self.requests.hand_out(self.requests.collector.take(1))
+        self.requests.hand_out(self.requests.collector.pop_ready(1))
         self.supervisor.note_step(slot)
 
     def close(self) -> Running:
@@ -688,7 +688,7 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
             ours.wait()
         # A reset of the replacement proves nothing yet.
         assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(slot)) == slot
-        ours.requests.hand_out(ours.requests.collector.take(1))
+        ours.requests.hand_out(ours.requests.collector.pop_ready(1))
     ours.ask(0)
     ours.reply(0)
     (entry,) = ours.ask(0)
@@ -734,7 +734,7 @@ def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None
         for slot in (0, 1):  # Resets, which prove nothing.
             entry = ours.requests.numbering.entry.item(slot)
             assert ours.requests.complete_one(0, entry) == slot
-            ours.requests.hand_out(ours.requests.collector.take(1))
+            ours.requests.hand_out(ours.requests.collector.pop_ready(1))
     ours.ask(0)
     ours.reply(0)
     ours.ask(0)
@@ -1052,7 +1052,7 @@ def test_a_worker_that_crashes_again_and_again_does_not_fill_the_log(
         while ours.supervisor.next_check() is not None:
             ours.wait()
         assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(0)) == 0
-        ours.requests.hand_out(ours.requests.collector.take(1))
+        ours.requests.hand_out(ours.requests.collector.pop_ready(1))
         ours.now += 10 - ours.now % 10
         ours.check()
     lines = [record.getMessage() for record in caplog.records]

@@ -13,7 +13,7 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
-    Failed,
+    Faulted,
     NewSchema,
     NotBuilt,
     Raised,
@@ -81,8 +81,8 @@ def test_what_is_out_of_band_stays_pickled(restarted: Loss | None) -> None:
 
 def test_an_error_of_the_package_arrives_as_its_class() -> None:
     """It says which env hung, and if it is for good."""
-    arrived = sent(Failed(5, STEP, FAULT, for_good=True))
-    assert isinstance(arrived, Failed)
+    arrived = sent(Faulted(5, STEP, FAULT, for_good=True))
+    assert isinstance(arrived, Faulted)
     assert isinstance(arrived.fault, EnvHung)
     assert (arrived.host_id, arrived.entry, arrived.for_good) == (5, STEP, True)
     assert arrived.fault.env_id == "one-0"

@@ -82,7 +82,7 @@ class StandIn(ForkServerHandle):
 
 
 class Scene:
-    """A host of two envs, its watcher, and the worker's ends of rings and channel."""
+    """A host of two envs, its driver, and the worker's ends of rings and channel."""
 
     def __init__(self) -> None:
         self.completions: Any = deque()
@@ -95,7 +95,7 @@ class Scene:
         self.writable: set[Any] = set()
         wiring = Wiring(
             completions=self.completions,
-            watcher=self,
+            driver=self,
             arena=self.arena,
             bell=self.bell,
             bell_offset=self.bell_offset,
@@ -110,7 +110,7 @@ class Scene:
         self.host = ProcessHost(0, 0, order, wiring)
         self.rung = 0
 
-    # -- a watcher
+    # -- a driver
 
     def watch(self, source: Any) -> None:
         self.watched.append(source)

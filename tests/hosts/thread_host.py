@@ -81,7 +81,7 @@ class ThreadHost(Host):
             # The group expects an OSError from a start that fails.
             raise OSError(str(error)) from error
         self._thread = thread
-        self._wiring.watcher.watch(self)
+        self._wiring.driver.watch(self)
         thread.tasks.put(partial(thread.build, self._order))
 
     def attach(self, order: AttachOrder) -> None:
@@ -102,7 +102,7 @@ class ThreadHost(Host):
         """End the thread; this may be called at any time, more than once."""
         thread, self._thread = self._thread, None
         if thread is not None:
-            self._wiring.watcher.unwatch(self)  # Before the thread closes the descriptor.
+            self._wiring.driver.unwatch(self)  # Before the thread closes the descriptor.
             thread.closing = True
             thread.tasks.put(None)
             thread.join(JOIN_SECONDS)

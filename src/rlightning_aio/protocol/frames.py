@@ -35,7 +35,7 @@ class FrameKind(IntEnum):
     CLOSED = 12  # worker: errors of close(), by env
     SAVED = 13  # worker; index of an env, and a flag for "before its request": its checkpoint
     RESTARTED = 14  # worker; the request's entry: why its env was rebuilt, and as for RESULT
-    FAILED = 15  # worker; the request's entry: an error of this package, and if it is for good
+    FAULTED = 15  # worker; the request's entry: an error of this package, and if it is for good
     ABORT = 16  # trainer; the request's entry
 
 

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = [
+    "Driver",
     "Executing",
     "Host",
     "HostFactory",
     "Killable",
     "Membership",
     "Source",
-    "Watcher",
     "Wiring",
 ]
 
@@ -57,7 +57,7 @@ class Source(Protocol):
         ...
 
 
-class Watcher(Protocol):
+class Driver(Protocol):
     """The part of a driver that watches sources."""
 
     def watch(self, source: Source) -> None:
@@ -141,7 +141,7 @@ class Host(Protocol):
             arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
                 reset, (name, args, kwargs) of a call. None: they are in the rows.
 
-        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Failed` or
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Faulted` or
         `Withdrawn`, with the same entry; or the host's `Died` for all.
         """
         ...
@@ -309,7 +309,7 @@ class Wiring:
 
     Attributes:
         completions: the queue.
-        watcher: the driver.
+        driver: of the group.
         arena: the shared memory.
         bell, bell_offset: workers wake the trainer by it; its offset in the arena.
         rings: by host, those of live workers.
@@ -323,7 +323,7 @@ class Wiring:
     """
 
     completions: Completions
-    watcher: Watcher
+    driver: Driver
     arena: Arena
     bell: TrainerBell
     bell_offset: int

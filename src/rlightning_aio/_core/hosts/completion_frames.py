@@ -16,7 +16,7 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
-    Failed,
+    Faulted,
     NewSchema,
     NotBuilt,
     Raised,
@@ -86,7 +86,7 @@ _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
     Result: _encoded_result,
     Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
     Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
-    Failed: lambda it: (FrameKind.FAILED, it.entry, pickle.dumps((it.fault, it.for_good))),
+    Faulted: lambda it: (FrameKind.FAULTED, it.entry, pickle.dumps((it.fault, it.for_good))),
     Closed: lambda it: (FrameKind.CLOSED, 0, pickle.dumps(it.errors)),
 }
 """By the class of a completion: kind, number and payload of its frame."""
@@ -107,7 +107,7 @@ _DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
     FrameKind.RESTARTED: _decoded_restart,
     FrameKind.VALUE: lambda host, entry, payload: Value(host, entry, pickle.loads(payload)),
     FrameKind.ERROR: lambda host, entry, payload: Raised(host, entry, pickle.loads(payload)),
-    FrameKind.FAILED: lambda host, entry, payload: Failed(host, entry, *pickle.loads(payload)),
+    FrameKind.FAULTED: lambda host, entry, payload: Faulted(host, entry, *pickle.loads(payload)),
     FrameKind.CLOSED: lambda host, _, payload: Closed(host, pickle.loads(payload)),
 }
 """By the kind of a frame: its completion, of a host, a number and a payload."""

@@ -35,7 +35,7 @@ class Inbox:
                     self._wake_up.set()
                 self._tasks.append(task)
 
-    def take(self) -> list[Callable[[], None]]:
+    def pop_all(self) -> list[Callable[[], None]]:
         """Remove and return all tasks, oldest first."""
         with self._lock:
             if not self._tasks:

@@ -46,7 +46,7 @@ __all__ = [
     "EnvStarted",
     "EnvState",
     "ErrorText",
-    "Failed",
+    "Faulted",
     "FilmOrder",
     "Joined",
     "NewSchema",
@@ -333,7 +333,7 @@ class Raised(NamedTuple):
     error: ErrorText
 
 
-class Failed(NamedTuple):
+class Faulted(NamedTuple):
     """A request ended in an error of ours, not of the env.
 
     Attributes:
@@ -373,7 +373,7 @@ class Joined(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Saved | Reported | Result | Value | Raised | Failed | Withdrawn | Joined
+    | Saved | Reported | Result | Value | Raised | Faulted | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-    from rlightning_aio._core.group.drivers.wait import Driver, Procedure
+    from rlightning_aio._core.group.drivers.wait import GroupDriver, Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
 
@@ -138,7 +138,7 @@ class Facade:
     _shares_thread = False
     """True if other tasks may use the group while a call waits."""
 
-    def _new_driver(self) -> Driver:
+    def _new_driver(self) -> GroupDriver:
         raise NotImplementedError
 
     # -- envs ---------------------------------------------------------------------

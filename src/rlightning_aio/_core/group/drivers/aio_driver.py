@@ -74,7 +74,7 @@ class AioDriver:
         self.check_caller()
 
     def check_caller(self) -> None:
-        """Check the loop as `Driver` says; plain code may call while the loop is stopped."""
+        """Check the loop as `GroupDriver` says; plain code may call while the loop is stopped."""
         if this_process[0] != self._pid:
             raise forked_from(self._pid)
         ours = self._loop

@@ -59,7 +59,7 @@ class SyncDriver:
         self._is_interruptible = self._is_interrupted = self._was_interrupted = False
 
     def check_caller(self) -> None:
-        """Check the thread as `Driver` says; signal handlers of the waiting thread pass."""
+        """Check the thread as `GroupDriver` says; signal handlers of the waiting thread pass."""
         if this_process[0] != self._pid or self._thread not in (0, threading.get_ident()):
             raise self._refusal()
 

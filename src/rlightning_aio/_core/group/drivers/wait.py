@@ -1,7 +1,7 @@
 """`Wait` and `Procedure`: how the core, which never waits, asks its driver to wait.
 
-`Driver` is what a group asks of whoever waits for it, and `CollectRules` says for which results a
-collect waits.
+`GroupDriver` is what a group asks of whoever waits for it, and `CollectRules` says for which
+results a collect waits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
 
 import msgspec
 
-from rlightning_aio._core.hosts.base import Watcher
+from rlightning_aio._core.hosts.base import Driver
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ __all__ = [
     "TURN",
     "CallTime",
     "CollectRules",
-    "Driver",
+    "GroupDriver",
     "Parked",
     "Patient",
     "Procedure",
@@ -107,7 +107,7 @@ class CallTime:
         return waited, (now - self._began if self._began else 0.0) - waited
 
 
-class Driver(Watcher, Protocol):
+class GroupDriver(Driver, Protocol):
     """Waits for the sources of a group.
 
     Attributes:

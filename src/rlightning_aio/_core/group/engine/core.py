@@ -75,9 +75,9 @@ class Core:
         self.intake = intake = Intake(tables, supervisor, results, arrivals, stats)
         self.apply_completions = intake.apply_completions
         self.waiting = waiting = Waiting(
-            tables, supervisor, poller, intake, parts.watcher, shares_thread=shares_thread
+            tables, supervisor, poller, intake, parts.driver, shares_thread=shares_thread
         )
-        dispatch = Dispatch(tables, supervisor, poller, waiting, parts.watcher)
+        dispatch = Dispatch(tables, supervisor, poller, waiting, parts.driver)
         self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)
         self.newest = self.steps.newest
         self.calls = Calls(tables, dispatch, intake, waiting)
@@ -193,7 +193,7 @@ class Core:
         collector.note_faults(self.calls.drop())
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
-            slots = collector.take(collector.num_ready)
+            slots = collector.pop_ready(collector.num_ready)
             results = self.steps.hand_out(slots, synchronous=False)
         if collector.faults:
             faults = [*collector.faults]

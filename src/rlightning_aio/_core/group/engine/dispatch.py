@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.waiting import Poller, Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Host, Membership, Watcher
+    from rlightning_aio._core.hosts.base import Driver, Host, Membership
 
 __all__ = ["Dispatch", "Packed"]
 
@@ -40,7 +40,7 @@ class Dispatch:
         supervisor: Supervisor,
         poller: Poller,
         waiting: Waiting,
-        watcher: Watcher,
+        driver: Driver,
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
@@ -49,7 +49,7 @@ class Dispatch:
         self._poller = poller
         self._intake = waiting.intake
         self._waiting = waiting
-        self._watcher = watcher
+        self._driver = driver
 
     def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
         """The slots of `env_ids`; `EnvBusy` if an id appears twice."""
@@ -97,7 +97,7 @@ class Dispatch:
         In this process, it is executed now, after the requests that were sent before it. Returns
         False if it has not ended.
         """
-        self._watcher.read()
+        self._driver.read()
         self._intake.apply_completions()
         while not self._requests.is_idle(slot) and self._poller.execute(1, None):
             self._intake.apply_completions()

@@ -21,7 +21,7 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Died,
     ErrorText,
-    Failed,
+    Faulted,
     Joined,
     NewSchema,
     NotBuilt,
@@ -83,7 +83,7 @@ class Intake:
             Result: self._on_result,
             Value: self._on_value,
             Raised: self._on_raised,
-            Failed: self._on_failed,
+            Faulted: self._on_faulted,
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Joined: self._on_joined,
@@ -185,7 +185,7 @@ class Intake:
         )
         return raised
 
-    def _on_failed(self, completion: Failed) -> None:
+    def _on_faulted(self, completion: Faulted) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Watcher
+    from rlightning_aio._core.hosts.base import Driver
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
@@ -67,13 +67,13 @@ class Parts:
     Attributes:
         tables: the state of the group.
         supervisor, poller: of the hosts.
-        watcher: the driver.
+        driver: of the group.
     """
 
     tables: Tables
     supervisor: Supervisor
     poller: Poller
-    watcher: Watcher
+    driver: Driver
 
 
 class Steps:
@@ -112,7 +112,7 @@ class Steps:
         self._hints = parts.supervisor.hints
         self._poller = parts.poller
         self._completions = tables.completions
-        self._watcher = parts.watcher
+        self._driver = parts.driver
         self._results = results
         self._arrivals = arrivals
         self._dispatch = dispatch
@@ -223,7 +223,7 @@ class Steps:
                     now = yield from waiting.turn(wanted, until)
             finally:
                 self.collecting = False
-            slots, local = collector.take(most), self._envs.all
+            slots, local = collector.pop_ready(most), self._envs.all
             if len(slots) == len(local) > slots[-1]:
                 slots = local  # The same slots, which lie side by side.
             # In a window, others are waited for, too.
@@ -370,7 +370,7 @@ class Steps:
         if out_of_band:
             self._results.keep(0, out_of_band)
         requests.join(0, now, _STEP)
-        requests.collector.take(1)
+        requests.collector.pop_ready(1)
         if self._completions:
             self._intake.apply_completions()  # An info has come in a new form.
         return True
@@ -431,7 +431,7 @@ class Steps:
             )
             if self._first_observations.left:
                 self._first_observations.check(parts)
-            self._watcher.check_interrupt()
+            self._driver.check_interrupt()
             self._stats.account(parts, synchronous=synchronous, since=since, needed=needed)
             continuity.returned(slots, flagged, judged)
             if self._conditions.unusual & BESIDE_ROWS:

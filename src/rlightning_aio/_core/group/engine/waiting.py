@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.requests import Requests, Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Host, Watcher
+    from rlightning_aio._core.hosts.base import Driver, Host
     from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["REPLIES", "Poller", "Waiting"]
@@ -46,7 +46,7 @@ class Waiting:
     Args:
         tables, supervisor, poller: of the group.
         intake: applies what the poller finds.
-        watcher: the driver.
+        driver: of the group.
         shares_thread: other tasks may use the group while a call waits. So inline envs are executed
             in one turn each.
 
@@ -61,7 +61,7 @@ class Waiting:
         supervisor: Supervisor,
         poller: Poller,
         intake: Intake,
-        watcher: Watcher,
+        driver: Driver,
         *,
         shares_thread: bool,
     ) -> None:
@@ -73,7 +73,7 @@ class Waiting:
         self._bell = poller.bell
         self.intake = intake
         self._completions = tables.completions
-        self._watcher = watcher
+        self._driver = driver
         self._shares_thread = shares_thread
         # Of the ticket whose call leads; 0 if none does.
         self._leader = 0
@@ -110,7 +110,7 @@ class Waiting:
             if wait := tickets.parked.pop(tickets.replied.pop(), None):
                 wait.unpark()
         if self.wanted:
-            self._watcher.wake()
+            self._driver.wake()
 
     def check_now(self) -> Procedure[float]:
         """Check all hosts; return the time. It must be called by `Supervisor.look_by`.
@@ -268,7 +268,7 @@ class Waiting:
         if wait := self._tickets.parked.pop(self._served.owner, None):
             wait.unpark()
         else:
-            self._watcher.wake()
+            self._driver.wake()
 
     def _next(self, ticket: Ticket, wanted: int) -> Procedure[float]:
         """Wait once for `wanted` replies to a ticket, as the leader or not; return the time."""

@@ -11,7 +11,7 @@ from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
-from rlightning_aio._core.group.setup.plan import host_class, place_of
+from rlightning_aio._core.group.setup.plan import host_class, placement_for
 from rlightning_aio._core.group.setup.start_orders import start_orders
 from rlightning_aio._core.group.state.checked import DEBUG, CheckedRequests
 from rlightning_aio._core.group.state.conditions import Conditions
@@ -32,27 +32,27 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio._core.group.setup.plan import Plan
-    from rlightning_aio._core.hosts.base import Watcher
+    from rlightning_aio._core.hosts.base import Driver
     from rlightning_aio._core.hosts.messages import StartOrder
 
 __all__ = ["assemble"]
 
 
-def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
+def assemble(plan: Plan, driver: Driver, *, shares_thread: bool) -> Core:
     """Create the core of a group and its hosts, without starting anything.
 
     An error of a host's factory propagates, after everything created before it is released.
 
     Args:
         plan: from `plan_group`.
-        watcher: the driver.
+        driver: of the group.
         shares_thread: other tasks may use the group while a procedure waits.
 
     Raises:
         ConfigError: an entry needs the event loop that a synchronous group doesn't have.
     """
     for config in plan.configs:
-        if not shares_thread and place_of(config).awaits == "only":
+        if not shares_thread and placement_for(config).awaits == "only":
             raise ConfigError(
                 f"entry {config.name!r}: a synchronous group has no event loop for placement "
                 f"{config.placement!r}; use placement: process, whose workers run awaitable envs "
@@ -62,7 +62,7 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
     orders = start_orders(plan, cores)
     tables = _tables(plan, orders)
     try:
-        return _assembled(plan, orders, tables, watcher, cores, shares_thread=shares_thread)
+        return _assembled(plan, orders, tables, driver, cores, shares_thread=shares_thread)
     except BaseException:
         tables.arena.close()
         raise
@@ -72,7 +72,7 @@ def _assembled(
     plan: Plan,
     orders: Sequence[StartOrder],
     tables: Tables,
-    watcher: Watcher,
+    driver: Driver,
     cores: int,
     *,
     shares_thread: bool,
@@ -86,7 +86,7 @@ def _assembled(
     poller = Poller(tables.requests, bell, cores, clock=tables.clock)
     wiring = Wiring(
         completions=tables.completions,
-        watcher=watcher,
+        driver=driver,
         arena=arena,
         bell=bell,
         bell_offset=bell_offset,
@@ -104,18 +104,18 @@ def _assembled(
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = Parts(tables, supervisor, poller, watcher)
+    parts = Parts(tables, supervisor, poller, driver)
     return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
 
 
 def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
     """Make the state of a group whose hosts get `orders`."""
-    local = [config for config in plan.configs if not place_of(config).max_members]
-    servers = [config for config in plan.configs if place_of(config).max_members]
+    local = [config for config in plan.configs if not placement_for(config).max_members]
+    servers = [config for config in plan.configs if placement_for(config).max_members]
     envs = EnvTable(
         [config for config in local for _ in range(config.num_workers)],
         [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
-        [(f"{config.name}-0", config, place_of(config).max_members) for config in servers],
+        [(f"{config.name}-0", config, placement_for(config).max_members) for config in servers],
     )
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]

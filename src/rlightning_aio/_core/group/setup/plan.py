@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import HostFactory
     from rlightning_aio.registry import Placement
 
-__all__ = ["Plan", "PreprocessFn", "host_class", "place_of", "plan_group"]
+__all__ = ["Plan", "PreprocessFn", "host_class", "placement_for", "plan_group"]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 
@@ -60,7 +60,7 @@ def plan_group(
     check_installed(configs)
     fns = _preprocess_fns(configs, preprocess_fn)
     for config, own in zip(configs, fns, strict=True):
-        place = place_of(config)
+        place = placement_for(config)
         if place.check:
             load(place.check)(config)
         host_class(config)
@@ -75,7 +75,7 @@ def plan_group(
     return Plan(configs, fns, mixed_actions, zero_copy, frozenset(filmed))
 
 
-def place_of(config: EnvConfig) -> Placement:
+def placement_for(config: EnvConfig) -> Placement:
     """Return the place of the envs of an entry."""
     return placement_of(config.backend, config.placement)
 
@@ -86,7 +86,7 @@ def host_class(config: EnvConfig) -> HostFactory:
     Raises:
         ConfigError: a package that the placement needs is missing.
     """
-    place = place_of(config)
+    place = placement_for(config)
     try:
         return load(place.target)
     except ImportError as error:
@@ -134,7 +134,7 @@ def _distinct(fns: Any) -> list[Any]:
 
 def _check_sendable(config: EnvConfig, field: str, fn: Any) -> None:
     """Raise `ConfigError` if a function can't be sent to the workers of an entry."""
-    if not place_of(config).spreads:
+    if not placement_for(config).spreads:
         return
     try:
         dumped_with_code(fn)

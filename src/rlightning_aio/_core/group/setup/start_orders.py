@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
-from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, place_of
+from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, placement_for
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of
@@ -26,7 +26,7 @@ Share: TypeAlias = "list[tuple[int, PreprocessFn | None]]"
 
 def _has_worker_here(config: EnvConfig) -> bool:
     """True if the envs of an entry run in worker processes on this machine."""
-    place = place_of(config)
+    place = placement_for(config)
     return place.spreads and place.local
 
 
@@ -35,7 +35,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
     shares = _all_shares(plan, num_cores)
     num_processes = sum(_has_worker_here(config) for config, _ in shares)
     variables = _environment_variables([config for config, _ in shares])
-    elsewhere = any(place_of(config).spreads for config, _ in shares)
+    elsewhere = any(placement_for(config).spreads for config, _ in shares)
     tasks = known_tasks() if elsewhere else ()
     orders = [
         StartOrder(
@@ -50,7 +50,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
         )
         for host_id, (config, share) in enumerate(shares)
     ]
-    return orders + [_order_of_members(c) for c in plan.configs if place_of(c).max_members]
+    return orders + [_order_of_members(c) for c in plan.configs if placement_for(c).max_members]
 
 
 def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
@@ -58,7 +58,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
     local = [
         (config, fns)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
-        if not place_of(config).max_members
+        if not placement_for(config).max_members
     ]
     counts = nums_hosts([config for config, _ in local], num_cores)
     return [
@@ -70,7 +70,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
 
 def _order_of_members(config: EnvConfig) -> StartOrder:
     """The order of a host whose envs join and leave."""
-    count = place_of(config).max_members
+    count = placement_for(config).max_members
     return StartOrder(config, None, tuple(range(count)), (None,) * count, spins=False)
 
 
@@ -114,7 +114,7 @@ def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     own = sum(config.num_workers for config in configs if _is_own(config))
     together = envs_per_worker(own, num_cores)
     for k, config in enumerate(configs):
-        if not place_of(config).spreads:
+        if not placement_for(config).spreads:
             nums.append(1)
         elif config.envs_per_process != "auto":
             nums.append(-(-config.num_workers // config.envs_per_process))
@@ -122,7 +122,7 @@ def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             nums.append(1)
         elif _is_own(config):
             nums.append(-(-config.num_workers // together))
-        elif ENVS.is_cpu_bound(config.backend) and place_of(config).local:
+        elif ENVS.is_cpu_bound(config.backend) and placement_for(config).local:
             nums.append(1)
             sharing.append(k)
         else:
@@ -141,7 +141,7 @@ def _is_own(config: EnvConfig) -> bool:
 
     Those of a class with coroutines wait on the event loop of a worker, so they may share it.
     """
-    if not ENVS.is_cpu_bound(config.backend) or not place_of(config).local:
+    if not ENVS.is_cpu_bound(config.backend) or not placement_for(config).local:
         return False
     task: Any = config.task
     if isinstance(task, tuple):
@@ -165,7 +165,7 @@ def _shares(
     count = len(fns)
     envs = list(enumerate(fns))
     bounds = {count * k // num_hosts for k in range(num_hosts + 1)}
-    if place_of(config).spreads and config.envs_per_process == "auto":
+    if placement_for(config).spreads and config.envs_per_process == "auto":
         alone = [k for k in range(count) if f"{config.name}-{k}" in filmed]
         bounds |= {k + side for k in alone for side in (0, 1)}
     return [envs[first:end] for first, end in itertools.pairwise(sorted(bounds))]

@@ -150,7 +150,7 @@ class CollectorQueue(UncollectedErrors):
         self.num_ready += len(slots)
         self.num_awaited -= len(slots)
 
-    def take(self, most: int) -> NDArray[np.intp]:
+    def pop_ready(self, most: int) -> NDArray[np.intp]:
         """Return the slots of the first `most` results that are ready, in ascending order."""
         taken: list[NDArray[np.intp]] = []
         count = 0

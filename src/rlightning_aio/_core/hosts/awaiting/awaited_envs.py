@@ -31,7 +31,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     watched,
 )
 from rlightning_aio._core.hosts.limits import RestartPolicy, hung, limits_of, restart_pause
-from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result
+from rlightning_aio._core.hosts.messages import ErrorText, Faulted, NotBuilt, Raised, Result
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
@@ -269,7 +269,7 @@ class AwaitedEnvs:
             record, entry, arguments = self._queue.popleft()
             if record.fault is not None:
                 # Not at once: a completion never comes before its request was handed over.
-                fault = Failed(self._host_id, entry, copy(record.fault), for_good=True)
+                fault = Faulted(self._host_id, entry, copy(record.fault), for_good=True)
                 self._loop.call_soon(lambda it=fault: None if self._ending else self._post(it))
                 continue
             self.num_busy += 1
@@ -480,7 +480,7 @@ class AwaitedEnvs:
         self._put_away(record, env, why)
         return None
 
-    def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Failed | None:
+    def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Faulted | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         record.losses += 1
         is_borne, then = self._restarts.count(record.losses, self._loop.time())
@@ -498,7 +498,7 @@ class AwaitedEnvs:
         fault.env_ids = (record.name,)
         if for_good:
             record.fault = fault
-        return Failed(self._host_id, record.entry, fault, for_good)
+        return Faulted(self._host_id, record.entry, fault, for_good)
 
 
 def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int) -> Any:

@@ -121,7 +121,7 @@ class EnvServerHost(Membership):
         )
         self._listener = Listener(self.server_id, self._settings, self._sessions)
         self._post = wiring.completions.append
-        self._watcher = wiring.watcher
+        self._driver = wiring.driver
         self._is_idle = wiring.is_idle
         self._slab: Slab | None = None
         self._rows: list[_ClientRow] = []
@@ -134,7 +134,7 @@ class EnvServerHost(Membership):
         """Listen."""
         self._listener.start()
         self._open = True
-        self._watcher.watch(self)
+        self._driver.watch(self)
         self._post(Built(self.host_id, []))
 
     def attach(self, order: AttachOrder) -> None:
@@ -151,7 +151,7 @@ class EnvServerHost(Membership):
         """Stop listening."""
         if self._open:
             self._open = False
-            self._watcher.unwatch(self)
+            self._driver.unwatch(self)
             self._listener.close()
 
     # -- clients ------------------------------------------------------------------

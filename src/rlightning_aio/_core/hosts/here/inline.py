@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.hosts.base import Watcher, Wiring
+    from rlightning_aio._core.hosts.base import Driver, Wiring
     from rlightning_aio._core.hosts.messages import (
         AttachOrder,
         EnvStarted,
@@ -61,14 +61,14 @@ class InlineHost(Host):
         self._post = wiring.completions.append
         self._runners: list[EnvRunner] = []
         self._queue: deque[_Waiting] = deque()
-        self._watcher = wiring.watcher
+        self._driver = wiring.driver
         self._shares_thread = wiring.shares_thread
         self._threads: _Threads | None = None
 
     def start(self) -> None:
         """Build the envs immediately."""
         try:
-            started = self._watcher.interruptible(self._built)
+            started = self._driver.interruptible(self._built)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -76,7 +76,7 @@ class InlineHost(Host):
             self._post(NotBuilt(self.host_id, index, ErrorText.of(error)))
             return
         if self._shares_thread:
-            self._threads = _Threads(self._runners, self._queue, self._watcher)
+            self._threads = _Threads(self._runners, self._queue, self._driver)
         self._post(Built(self.host_id, started))
 
     def _built(self) -> list[EnvStarted]:
@@ -128,7 +128,7 @@ class InlineHost(Host):
         entry, execute = self._queue.popleft()
         outcome = error = None
         try:
-            outcome = self._watcher.interruptible(execute)
+            outcome = self._driver.interruptible(execute)
         except BaseException as raised:
             error = raised
         runner = self._runners[slot_of(entry) - self.first_slot]
@@ -141,7 +141,7 @@ class InlineHost(Host):
     def step_now(self) -> OutOfBand | None:
         runner = self._runners[0]
         try:
-            return self._watcher.interruptible(runner.step)
+            return self._driver.interruptible(runner.step)
         except BaseException as error:
             runner.note_error(_STEP, ErrorText.of(error))
             raise
@@ -169,7 +169,7 @@ class _Threads:
     Args:
         runners: of the host's envs.
         queue: of the host.
-        watcher: the driver.
+        driver: of the group.
 
     Attributes:
         indices: of the envs that report the end of a step.
@@ -177,17 +177,17 @@ class _Threads:
     """
 
     def __init__(
-        self, runners: Sequence[EnvRunner], queue: deque[_Waiting], watcher: Watcher
+        self, runners: Sequence[EnvRunner], queue: deque[_Waiting], driver: Driver
     ) -> None:
         self.unfinished: dict[int, _Waiting] = {}
-        self._queue, self._watcher = queue, watcher
+        self._queue, self._driver = queue, driver
         self._inbox = inbox = Inbox()
         self.indices = {
             index
             for index, runner in enumerate(runners)
             if runner.on_stepped(partial(inbox.put, partial(self._ended, index)))
         }
-        watcher.watch(self)
+        driver.watch(self)
 
     def _ended(self, index: int) -> None:
         self._queue.append(self.unfinished.pop(index))
@@ -196,7 +196,7 @@ class _Threads:
         return self._inbox.fileno()
 
     def on_readable(self) -> None:
-        for task in self._inbox.take():
+        for task in self._inbox.pop_all():
             task()
 
     def on_writable(self) -> None:
@@ -204,7 +204,7 @@ class _Threads:
 
     def close(self) -> None:
         """Forget running steps."""
-        self._watcher.unwatch(self)
+        self._driver.unwatch(self)
         self._inbox.close()
 
 

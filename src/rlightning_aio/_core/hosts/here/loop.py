@@ -124,7 +124,7 @@ class LoopHost(Host):
             return
         # Where the trainer waits for all that is in flight, only the last result need look.
         if (bell.publish(self._num_done) or not self._envs.num_busy) and bell.is_due():
-            self._wiring.watcher.wake()
+            self._wiring.driver.wake()
 
     def _post(self, completion: Completion) -> None:
         if type(completion) is Result:
@@ -132,7 +132,7 @@ class LoopHost(Host):
             return
         self.poll()  # What came before it is reported before it.
         self._wiring.completions.append(completion)
-        self._wiring.watcher.wake()
+        self._wiring.driver.wake()
 
     def poll(self) -> None:
         done = self._done

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.base import Watcher, Wiring
+    from rlightning_aio._core.hosts.base import Driver, Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, StartOrder
     from rlightning_aio._core.hosts.process.fork_messages import Message
     from rlightning_aio.config import EnvConfig
@@ -81,7 +81,7 @@ class ForkServerHandle:
         interpreter: its Python.
         env_vars: added to the environment of the trainer.
         preload: modules to import before the first fork.
-        watcher: the driver.
+        driver: of the group.
     """
 
     @classmethod
@@ -96,7 +96,7 @@ class ForkServerHandle:
                 if _surroundings(other) == _surroundings(config) and backend is not None:
                     preload.update(dict.fromkeys(backend.preload))
             env_vars = dict(config.env_vars)
-            fork_server = cls(config.interpreter, env_vars, tuple(preload), wiring.watcher)
+            fork_server = cls(config.interpreter, env_vars, tuple(preload), wiring.driver)
             wiring.resources[key] = fork_server
         assert isinstance(fork_server, ForkServerHandle)
         return fork_server
@@ -106,12 +106,12 @@ class ForkServerHandle:
         interpreter: str | None,
         env_vars: dict[str, str],
         preload: tuple[str, ...],
-        watcher: Watcher,
+        driver: Driver,
     ) -> None:
         self._interpreter = interpreter
         self._env_vars = env_vars
         self._preload = preload
-        self._watcher = watcher
+        self._driver = driver
         self._hosts: dict[int, ProcessHost] = {}
         self._server: RunningForkServer | None = None
         self._key: spares.Key = ()
@@ -147,14 +147,14 @@ class ForkServerHandle:
         lent: Sequence[int] = (),
     ) -> None:
         server.messages.send(message, given, lent)
-        self._watcher.watch_writable(self, server.messages.waiting)
+        self._driver.watch_writable(self, server.messages.waiting)
 
     def on_writable(self) -> None:
         """Send waiting messages; a fork server reads nothing while it imports modules."""
         if self._server is not None:
             messages = self._server.messages
             messages.flush()
-            self._watcher.watch_writable(self, messages.waiting)
+            self._driver.watch_writable(self, messages.waiting)
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
         """Kill the worker of `host`, if it still runs."""
@@ -193,7 +193,7 @@ class ForkServerHandle:
         self._ready = spare is not None
         server = self._server = spare or self._started()
         try:
-            self._watcher.watch(self)
+            self._driver.watch(self)
         except BaseException:
             self._end(0.0)
             raise
@@ -267,7 +267,7 @@ class ForkServerHandle:
         if server is None or not is_well or server.messages.waiting:
             self._end(seconds)
             return
-        self._watcher.unwatch(self)
+        self._driver.unwatch(self)
         self._server = None
         spares.keep(self._key, server)
 
@@ -281,7 +281,7 @@ class ForkServerHandle:
         server, self._server = self._server, None
         if server is None:
             return 0
-        self._watcher.unwatch(self)
+        self._driver.unwatch(self)
         return server.end(seconds)
 
 

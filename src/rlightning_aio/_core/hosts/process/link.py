@@ -48,7 +48,7 @@ class Link:
         self._rings = TrainerRings(memory, place.num_envs, wiring.bell, place.host_id)
         self._host_id = place.host_id
         self._completions = wiring.completions
-        self._watcher = wiring.watcher
+        self._driver = wiring.driver
         self._socket: socket.socket | None = channel
         self._frames = FrameReader()
         self._outgoing = bytearray()
@@ -57,7 +57,7 @@ class Link:
         self.traffic = 0
         self._all_rings = wiring.rings
         self._all_rings[place.host_id] = self._rings.ring(self.wake)
-        self._watcher.watch(self)
+        self._driver.watch(self)
 
     def fileno(self) -> int:
         """Return the descriptor of the channel."""
@@ -68,7 +68,7 @@ class Link:
         """Close the channel; unread data is lost."""
         if self._socket is not None:
             self._all_rings[self._host_id] = None
-            self._watcher.unwatch(self)
+            self._driver.unwatch(self)
             self._socket.close()
             self._socket = None
 
@@ -108,7 +108,7 @@ class Link:
         sent = self._write_some(data)
         if sent < len(data):
             self._outgoing += data[sent:]
-            self._watcher.watch_writable(self, True)
+            self._driver.watch_writable(self, True)
         elif self._frames_outgoing:
             self._all_written()
 
@@ -132,7 +132,7 @@ class Link:
         del self._outgoing[:sent]
         self.traffic += sent
         if not self._outgoing:
-            self._watcher.watch_writable(self, False)
+            self._driver.watch_writable(self, False)
             self._all_written()
 
     def _all_written(self) -> None:

@@ -84,7 +84,7 @@ class _Life:
     Attributes:
         actor: Ray's handle.
         inbox: for its replies.
-        has_place: a node has started it.
+        is_placed: a node has started it.
         is_built: its envs are built.
         sent: unanswered batches, in the order of execution.
         began_ns: estimated start of the first of them.
@@ -95,7 +95,7 @@ class _Life:
     def __init__(self, actor: Any) -> None:
         self.actor = actor
         self.inbox = Inbox()
-        self.has_place = self.is_built = False
+        self.is_placed = self.is_built = False
         self.sent: deque[_Sent] = deque()
         self.began_ns = 0
         self.late: tuple[int, int] | None = None
@@ -163,7 +163,7 @@ class RayHost(Host):
             self._post(Died(self.host_id, Death(f"has no Ray cluster to live in: {error}")))
             return
         life = self._life = _Life(actor)
-        self._wiring.watcher.watch(self)
+        self._wiring.driver.watch(self)
         life.call(actor.hello, self._on_placed)
         life.call(actor.build, self._on_built, self._start_payload)
         if self._limits:
@@ -188,7 +188,7 @@ class RayHost(Host):
             return
         if self._closing:
             self._end("did not close in time and was killed")
-        elif not self._life.has_place:
+        elif not self._life.is_placed:
             self._end(f"could not be placed: {shortage(self._config)}")
         else:
             self._end("was killed", -9)
@@ -199,7 +199,7 @@ class RayHost(Host):
 
     def close(self) -> None:
         self._closing = True
-        if self._life is not None and self._life.has_place:
+        if self._life is not None and self._life.is_placed:
             self._life.call(self._life.actor.close, self._on_closed)
         else:
             self.release()
@@ -212,7 +212,7 @@ class RayHost(Host):
         if os.getpid() != self._pid:
             _OF_ANOTHER_PROCESS.append(life)
             return
-        self._wiring.watcher.unwatch(self)
+        self._wiring.driver.unwatch(self)
         life.end()
 
     def _end(self, cause: str, exit_code: int | None = None) -> None:
@@ -282,7 +282,7 @@ class RayHost(Host):
 
     def on_readable(self) -> None:
         life = self._life
-        for task in life.inbox.take() if life is not None else ():
+        for task in life.inbox.pop_all() if life is not None else ():
             if self._life is life:  # A task may end it.
                 task()
 
@@ -298,7 +298,7 @@ class RayHost(Host):
 
     def _on_placed(self, life: _Life, outcome: Any) -> None:
         if self._has_returned(outcome):
-            life.has_place = True
+            life.is_placed = True
 
     def _on_built(self, life: _Life, outcome: Frame | Exception) -> None:
         if not self._has_returned(outcome):
