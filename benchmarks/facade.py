@@ -59,7 +59,7 @@ class RawDriver:
             while True:
                 for descriptor, _ in self._poll.poll(None if wait.until is None else 0):
                     self._sources[descriptor].on_readable()
-                self.drain()
+                self.apply_completions()
                 wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
@@ -77,7 +77,7 @@ class Raw(Stepped):
         config = group_config(self.work, "auto")
         plan = plan_group(config, {}, None, mixed_actions=False, zero_copy=False)
         self._core = assemble(plan, self._driver, shares_thread=False)
-        self._driver.drain = self._core.drain
+        self._driver.apply_completions = self._core.apply_completions
         metas = self._driver.run(self._core.start(time.monotonic()))
         self._actions = sampled(metas[0].action_space, self.work.num_envs)
 

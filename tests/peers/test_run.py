@@ -42,7 +42,7 @@ def test_a_file_that_fails_to_import_fails_the_run_and_absent_sources_do_not(
     tests.mkdir(parents=True)
     (tests.parent / "conftest.py").touch()
     (tests / "test_registry.py").write_text("import rlightning.env\n\ndef test_it():\n    pass\n")
-    (tests / "test_config.py").write_text("import rlightning.no_such_module\n")
+    (tests / "test_env_group_stats.py").write_text("import rlightning.no_such_module\n")
     done = run(tmp_path)
     assert "names of ours: 1 passed, 1 failed" in done.stdout, done.stdout + done.stderr
     assert done.stdout.endswith(
