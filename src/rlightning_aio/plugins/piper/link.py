@@ -62,7 +62,7 @@ _OPEN_SECONDS: Final = 30.0
 _STOP_SECONDS: Final = 1.0
 """Time limit for a watchdog to stop the arm, before a new watchdog is started to do it."""
 _END_SECONDS: Final = 5.0
-_CLAIM_SECONDS: Final = 1.0
+_CLAIM_SECONDS: Final = 5.0
 """Time limit for the previous owner of a channel to stop the arm and release the channel."""
 _BOOTSTRAP: Final = """
 import json, sys
