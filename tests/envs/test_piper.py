@@ -362,7 +362,7 @@ def test_a_reset_opens_a_bus_that_is_back(
 ) -> None:
     """An adapter is unplugged and plugged in again; in between the reset raises."""
     monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.0}')
-    channel = tmp_path / "adapter"
+    channel = tmp_path / ("adapter" * 20)  # A name as long as an address of a socket can't be.
     port = SlcanPort()
     channel.symlink_to(port.path)
     with running(WatchedArm(), port):

@@ -10,6 +10,7 @@ Absent on purpose: limits, rates and episodes, which are in `env`.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import math
 import os
@@ -62,7 +63,7 @@ _OPEN_SECONDS: Final = 30.0
 _STOP_SECONDS: Final = 1.0
 """Time limit for a watchdog to stop the arm, before a new watchdog is started to do it."""
 _END_SECONDS: Final = 5.0
-_CLAIM_SECONDS: Final = 5.0
+_CLAIM_SECONDS: Final = 1.0
 """Time limit for the previous owner of a channel to stop the arm and release the channel."""
 _BOOTSTRAP: Final = """
 import json, sys
@@ -422,7 +423,8 @@ def _claimed(interface: str, channel: str) -> socket.socket:
         name = f"{os.getpid()}:{channel}"  # Each process has its own.
     elif interface == "slcan":
         name = str(Path(channel).resolve())  # A serial port has many names.
-    address = f"\0rlightning_aio.plugins.piper:{interface}:{name}"
+    # A path may be longer than an address.
+    address = f"\0rlightning_aio.piper:{interface}:{hashlib.sha256(name.encode()).hexdigest()}"
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     until = time.monotonic() + _CLAIM_SECONDS
     while True:
