@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rlightning_aio.plugins.policy_servers.arrays import Codec
     from rlightning_aio.plugins.policy_servers.connection import Address
 
-__all__ = ["PolicyClient", "instruction"]
+__all__ = ["PolicyClient", "instruction", "observed"]
 
 R = TypeVar("R")
 
@@ -244,3 +244,23 @@ def instruction(info: dict[str, Any]) -> str | None:
     """Return the instruction of an episode: ``task_description``, else ``task``, of its info."""
     found = info.get("task_description", info.get("task"))
     return None if found is None else str(found)
+
+
+def observed(
+    observation: Any, info: dict[str, Any], *, state: str, instructed: str
+) -> dict[str, Any]:
+    """Return what is sent where the user doesn't say it.
+
+    Args:
+        observation: a dict as it is; any other becomes the value of `state`.
+        info: of the reset that began the episode.
+        state: the key of an observation that is no dict.
+        instructed: the key of the episode's instruction, if it has one.
+    """
+    sent: dict[str, Any] = (
+        {**cast("dict[str, Any]", observation)}
+        if isinstance(observation, dict)
+        else {state: observation}
+    )
+    text = instruction(info)
+    return sent if text is None else {**sent, instructed: text}

@@ -6,10 +6,11 @@ answered by a map with ``actions``, a chunk ``[horizon, *action]``. A text frame
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.plugins.policy_servers.arrays import Codec
-from rlightning_aio.plugins.policy_servers.client import PolicyClient, instruction
+from rlightning_aio.plugins.policy_servers.client import PolicyClient, observed
 from rlightning_aio.plugins.policy_servers.connection import Address
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from rlightning_aio.plugins.one_frame import OneFrame
 
 __all__ = ["OpenPiPolicy"]
+
+_OBSERVED: Final = partial(observed, state="observation/state", instructed="prompt")
 
 
 class OpenPiPolicy(PolicyClient[bytes]):
@@ -52,7 +55,7 @@ class OpenPiPolicy(PolicyClient[bytes]):
     ) -> None:
         headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
         address = Address(url, timeout, connect_timeout, headers)
-        super().__init__(address, Codec(str.encode), observe or _observed)
+        super().__init__(address, Codec(str.encode), observe or _OBSERVED)
 
     async def _greet(self, connection: OneFrame) -> None:
         # The metadata only describe the policy.
@@ -73,13 +76,3 @@ class OpenPiPolicy(PolicyClient[bytes]):
         if isinstance(frame, str):
             raise self._raised(frame)
         return self._decoded(frame)
-
-
-def _observed(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
-    prompt = instruction(info)
-    sent: dict[str, Any] = (
-        {**cast("dict[str, Any]", observation)}
-        if isinstance(observation, dict)
-        else {"observation/state": observation}
-    )
-    return sent if prompt is None else {**sent, "prompt": prompt}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from weakref import WeakSet
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from rlightning_aio.plugins.one_frame import OneFrame
 from rlightning_aio.plugins.policy_servers.arrays import Codec
-from rlightning_aio.plugins.policy_servers.client import PolicyClient, instruction
+from rlightning_aio.plugins.policy_servers.client import PolicyClient, instruction, observed
 from rlightning_aio.plugins.policy_servers.connection import Address
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["VlaEvalPolicy"]
 
+_OBSERVED: Final = partial(observed, state="state", instructed="task_description")
 _PROTOCOL: Final = 1
 
 
@@ -64,7 +66,7 @@ class VlaEvalPolicy(PolicyClient[_Asked]):
         connect_timeout: float = 30.0,
     ) -> None:
         address = Address(url, timeout, connect_timeout, {})
-        super().__init__(address, Codec(str), observe or _observed)
+        super().__init__(address, Codec(str), observe or _OBSERVED)
         self._seqs = itertools.count()
         self._in_episode = WeakSet[OneFrame]()
 
@@ -129,13 +131,3 @@ def _task(info: dict[str, Any]) -> dict[str, Any]:
     }
     name = instruction(info)
     return plain if name is None else {"name": str(info.get("task", name)), **plain}
-
-
-def _observed(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
-    text = instruction(info)
-    sent: dict[str, Any] = (
-        {**cast("dict[str, Any]", observation)}
-        if isinstance(observation, dict)
-        else {"state": observation}
-    )
-    return sent if text is None else {**sent, "task_description": text}
