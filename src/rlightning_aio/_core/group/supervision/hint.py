@@ -254,7 +254,7 @@ def hint(
         configs: the entries.
         num_workers: workers of each entry, by its name.
         num_cores: cores that this process and its workers may use.
-        latency_us: from `Stats.summary`; empty before anything was measured.
+        latency_us: from `EnvGroup.get_stats`; empty before anything was measured.
     """
     if not latency_us:
         return None
