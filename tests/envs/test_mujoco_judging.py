@@ -106,3 +106,24 @@ def test_a_build_of_another_version_is_left_alone(monkeypatch: pytest.MonkeyPatc
     built = pytest.importorskip("rlightning_aio.envs.mujoco._advance")
     monkeypatch.setattr(built, "PLAN_SIZE", 8)
     assert outputs.compiled() is None
+
+
+@pytest.mark.parametrize("task", ["Hopper-v5", "Humanoid-v5"])
+def test_memory_that_nobody_has_written_is_not_read(
+    task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where some simulations are reset instead of a step: such values overflow in infos."""
+
+    def garbage(shape: Any, dtype: Any = np.float64) -> Any:
+        return np.full(shape, 1e300, dtype) if dtype == np.float64 else np.zeros(shape, dtype)
+
+    monkeypatch.setattr(outputs.np, "empty", garbage)
+    env = gym.make(task, disable_env_checker=True)
+    batch = MujocoBatch(env, 3, AutoresetMode.NEXT_STEP, num_threads=2)
+    batch.reset(seed=3)
+    batch.action_space.seed(3)
+    # Arrays that somebody has are not written again.
+    steps = [batch.step(batch.action_space.sample()) for _ in range(60)]
+    reset = [infos["_reward_ctrl"] for *_, infos in steps if "_reward_ctrl" in infos]
+    assert any(not all(each) and any(each) for each in reset)
+    batch.close()

@@ -328,7 +328,8 @@ class Outputs:
         """Leave the frame to whoever has it, and write to another one.
 
         Making arrays, and asking for their addresses, takes longer than a step's own Python, so
-        those that nobody has any more are used again.
+        those that nobody has any more are used again. New columns are zeros: infos are computed
+        of all simulations, also of those that are reset instead of a step and leave theirs as is.
         """
         known = self._known
         for k, made in enumerate(known):
@@ -337,7 +338,7 @@ class Outputs:
                 break
         else:
             del known[: 1 - _MOST_KNOWN]
-            made = self._made(*map(np.empty, self._shapes))
+            made = self._made(np.empty(self._shapes[0]), np.zeros(self._shapes[1]))
         known.append(made)
         self._use(made)
 
