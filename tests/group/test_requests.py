@@ -74,7 +74,7 @@ class Driven:
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
             Event.CLAIMED: self._claim,
-            Event.DROPPED: lambda: self.table.claim(self.table.alone(SLOT), None),
+            Event.DROPPED: lambda: self.table.drop(self.table.alone(SLOT)),
             Event.KEPT: lambda: self.table.collector.keep(self.table.alone(SLOT), fault()),
             Event.FREED: self._free,
             Event.ABORTED: self._abort,

@@ -63,7 +63,7 @@ class Aborts:
         ready = self._requests.ready(slots)
         ready = ready[self._requests.owner[ready] == COLLECTOR]
         if len(ready):
-            self._requests.claim(ready, None)
+            self._requests.drop(ready)
             self._results.let_go(ready)
             self._stats.note_failures(ready, _WHY.kind)
         failed = self._requests.collector.free(slots.tolist())

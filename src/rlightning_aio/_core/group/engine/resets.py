@@ -212,7 +212,9 @@ class Resets:
         An env that joins has been reset. That is `enough` unless the reset has a seed or options,
         so a robot that takes minutes to reset isn't reset twice.
         """
-        self._requests.claim(slots, ticket if enough else None)
-        if not enough:
-            for slot in slots.tolist():
-                self._results.drop(slot)
+        if enough:
+            self._requests.claim(slots, ticket)
+            return
+        self._requests.drop(slots)
+        for slot in slots.tolist():
+            self._results.drop(slot)

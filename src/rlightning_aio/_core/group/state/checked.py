@@ -10,26 +10,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.request_states import COLLECTOR, LEGAL, Event, Owner, State
-from rlightning_aio._core.group.state.requests import CollectorQueue, Requests
-from rlightning_aio.protocol.entries import Operation
+from rlightning_aio._core.group.state.requests import Requests
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator
 
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.group.state.conditions import Conditions
     from rlightning_aio._core.group.state.requests import Ticket
-    from rlightning_aio.errors import EnvFault
-    from rlightning_aio.protocol.exchange import Ring
 
 __all__ = ["DEBUG", "CheckedRequests"]
 
+Change: TypeAlias = "tuple[Event, NDArray[np.intp]]"
+Changes: TypeAlias = "list[Change]"
+Rules: TypeAlias = "dict[str, Callable[[Any, Any], Changes]]"
 DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
 """Groups check their requests."""
 
@@ -57,20 +57,55 @@ def _codes_after(event: Event) -> NDArray[np.int64]:
 _AFTER: Final = {event: _codes_after(event) for event in Event}
 
 
-class _CheckedQueue(CollectorQueue):
-    """The collector's queue in a checked table."""
+def _asked(slots: NDArray[np.intp], owner: int) -> Changes:
+    return [(Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL, slots)]
 
-    def __init__(self, requests: CheckedRequests, conditions: Conditions) -> None:
-        super().__init__(conditions, requests.state)
-        self._changes = requests.changes
 
-    def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
-        with self._changes((Event.KEPT, slots)):
-            super().keep(slots, fault)
+def _given_up(requests: Requests, ticket: Ticket) -> Changes:
+    slots = ticket.submitted(requests.owner)
+    slots = slots[requests.state[slots] != State.IDLE]  # An interrupt came before it was sent.
+    values = slots if ticket.calls else slots[:0]
+    return [(Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, np.setdiff1d(slots, values))]
 
-    def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
-        with self._changes((Event.FREED, self.with_errors(slots))):
-            return super().free(slots)
+
+_OF_REQUESTS: Final[Rules] = {
+    "issue": lambda _, args: _asked(args[0], owner=args[2]),
+    "publish": lambda _, args: _asked(args[0], owner=args[2]),
+    "ask_again": lambda _, args: [(Event.ASKED_AGAIN, args[1])],
+    "join": lambda it, args: [(Event.JOINED, it.alone(args[0]))],
+    "deliver": lambda _, args: [(Event.RESULT, args[0])],
+    "set_value": lambda it, args: [(Event.VALUE, it.alone(args[0]))],
+    "fail": lambda _, args: [(Event.FAULT, args[0])],
+    "withdraw": lambda it, args: [(Event.WITHDRAWN, it.alone(args[0]))],
+    "hand_out": lambda _, args: [(Event.HANDED_OUT, args[0])],
+    "end_aborted": lambda it, args: [(Event.ABORTED, args[0][it.aborted.among(args[0])])],
+    "claim": lambda _, args: [(Event.CLAIMED, args[0])],
+    "drop": lambda _, args: [(Event.DROPPED, args[0])],
+    "settle": lambda _, args: [(Event.SETTLED, args[0].slots)],
+    "settle_ended": lambda _, args: [(Event.SETTLED, slots) for slots in args[0].ended],
+    "give_up": lambda it, args: _given_up(it, *args),
+}
+"""The changes that each method makes, by its arguments."""
+_OF_QUEUE: Final[Rules] = {
+    "keep": lambda _, args: [(Event.KEPT, args[0])],
+    "free": lambda it, args: [(Event.FREED, it.with_errors(args[0]))],
+}
+
+
+def _check(table: Any, owner: Any, methods: Rules) -> None:
+    """Have `table` check what the methods of `owner`, a part of it or itself, change."""
+
+    def wrap(name: str) -> None:
+        method, changes = getattr(owner, name), methods[name]
+
+        def checked(*args: Any) -> Any:
+            with table.changes(*changes(owner, args)):
+                return method(*args)
+
+        setattr(owner, name, checked)
+
+    for name in methods:
+        wrap(name)
 
 
 class CheckedRequests(Requests):
@@ -79,11 +114,11 @@ class CheckedRequests(Requests):
     def __init__(
         self, host_of: NDArray[np.int64], num_hosts: int, conditions: Conditions | None = None
     ) -> None:
-        conditions = conditions or Conditions()
         super().__init__(host_of, num_hosts, conditions)
-        self.collector = _CheckedQueue(self, conditions)
         self._known = self._situations()
         self._is_changing = False
+        _check(self, self, _OF_REQUESTS)
+        _check(self, self.collector, _OF_QUEUE)
 
     def _situations(self) -> NDArray[np.int64]:
         """Return the situation of each slot; an idle slot has no owner."""
@@ -93,7 +128,7 @@ class CheckedRequests(Requests):
         return self.state.astype(np.int64) * len(_OWNERS) + kinds
 
     @contextlib.contextmanager
-    def changes(self, *events: tuple[Event, NDArray[np.intp]]) -> Generator[None]:
+    def changes(self, *events: Change) -> Generator[None]:
         """Check that the context does to slots what these events mean, and nothing else."""
         if self._is_changing:  # The event is a part of another.
             yield
@@ -131,71 +166,6 @@ class CheckedRequests(Requests):
                 f"slot {slot} became {_named(found.item(slot))} {how}; it would be "
                 f"{_named(expected.item(slot))}"
             )
-
-    def issue(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
-        event = Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL
-        with self.changes((event, slots)):
-            return super().issue(slots, op, owner, now)
-
-    def publish(
-        self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
-    ) -> list[Ring]:
-        event = Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL
-        with self.changes((event, slots)):
-            return super().publish(slots, resets, owner, now)
-
-    def ask_again(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        with self.changes((Event.ASKED_AGAIN, slots)):
-            return super().ask_again(host_id, slots)
-
-    def join(self, slot: int, now: float, op: int = Operation.JOIN) -> None:
-        with self.changes((Event.JOINED, self.alone(slot))):
-            super().join(slot, now, op)
-
-    def deliver(self, slots: NDArray[np.intp]) -> None:
-        with self.changes((Event.RESULT, slots)):
-            super().deliver(slots)
-
-    def set_value(self, slot: int, value: Any) -> None:
-        with self.changes((Event.VALUE, self.alone(slot))):
-            super().set_value(slot, value)
-
-    def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
-        with self.changes((Event.FAULT, slots)):
-            super().fail(slots, owner, fault)
-
-    def withdraw(self, slot: int) -> None:
-        with self.changes((Event.WITHDRAWN, self.alone(slot))):
-            super().withdraw(slot)
-
-    def hand_out(self, slots: NDArray[np.intp]) -> None:
-        with self.changes((Event.HANDED_OUT, slots)):
-            super().hand_out(slots)
-
-    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        with self.changes((Event.ABORTED, slots[self.aborted.among(slots)])):
-            return super().end_aborted(slots)
-
-    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
-        with self.changes((Event.DROPPED if ticket is None else Event.CLAIMED, slots)):
-            super().claim(slots, ticket)
-
-    def settle(self, ticket: Ticket) -> None:
-        with self.changes((Event.SETTLED, ticket.slots)):
-            super().settle(ticket)
-
-    def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
-        ended = np.concatenate((*ticket.ended, ticket.slots[:0]))
-        with self.changes((Event.SETTLED, ended)):
-            return super().settle_ended(ticket)
-
-    def give_up(self, ticket: Ticket) -> None:
-        slots = ticket.submitted(self.owner)
-        slots = slots[self.state[slots] != State.IDLE]  # An interrupt came before it was sent.
-        values = slots if ticket.calls else slots[:0]
-        others = np.setdiff1d(slots, values)
-        with self.changes((Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, others)):
-            super().give_up(ticket)
 
 
 def _named(code: int) -> str:

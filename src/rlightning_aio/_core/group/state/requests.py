@@ -526,16 +526,18 @@ class Requests:
         ready = (self.state[slots] == _READY_CODE) & (self.owner[slots] == COLLECTOR)
         return ready & (self.numbering.ops(slots) == _JOIN)
 
-    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
-        """Give results of the collector to a call; None drops them."""
+    def claim(self, slots: NDArray[np.intp], ticket: Ticket) -> None:
+        """Give results of the collector to a call."""
         self.collector.remove(slots)
-        if ticket is None:
-            self.state[slots] = _IDLE_CODE
-        else:
-            self.owner[slots] = ticket.owner
-            ticket.remaining -= len(slots)
-            if ticket.apart:
-                ticket.ended.append(slots)
+        self.owner[slots] = ticket.owner
+        ticket.remaining -= len(slots)
+        if ticket.apart:
+            ticket.ended.append(slots)
+
+    def drop(self, slots: NDArray[np.intp]) -> None:
+        """Drop results of the collector."""
+        self.collector.remove(slots)
+        self.state[slots] = _IDLE_CODE
 
     # -- calls that wait for their own replies ------------------------------------
 
