@@ -127,7 +127,7 @@ class Driven:
 
     def _restart(self) -> None:
         owed = self.table.owed(np.arange(3))
-        self.table.lose_host(1)
+        self.table.in_flight[1] = 0
         self.table.ask_again(1, owed)
 
     def _settle(self) -> None:
@@ -303,7 +303,7 @@ def test_a_late_reply_has_no_effect() -> None:
     table = CheckedRequests(HOST_OF, 2)
     slots = np.array([SLOT])
     (late,) = table.issue(slots, Operation.STEP, COLLECTOR, 1.0).tolist()
-    table.lose_host(1)
+    table.in_flight[1] = 0
     (entry,) = table.ask_again(1, slots).tolist()
     assert table.end(1, late) is table.complete_one(1, late) is None
     assert not len(table.complete([(1, np.array([late]))]))

@@ -246,7 +246,7 @@ class Fleet:
                 self.carry_out(loss)
 
     def carry_out(self, loss: HostLoss) -> None:
-        self.requests.lose_host(loss.host_id)
+        self.requests.in_flight[loss.host_id] = 0
         if not loss.replaced:
             self.requests.fail(loss.owed, COLLECTOR, loss.error(loss.owed))
             return

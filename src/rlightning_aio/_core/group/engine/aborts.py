@@ -87,9 +87,8 @@ class Aborts:
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
         self._waiting.wake_server()  # It may have results of these that it has not handed out.
-        while left := aborted.faults.keys() & slots.tolist():
-            now = yield from self._waiting.turn(len(left), None)
-            self._waiting.poll()
+        chosen = set(slots.tolist())
+        now = yield from self._waiting.until(now, lambda: len(aborted.faults.keys() & chosen))
         self._arrivals.admit(slots, self._intake.now)
         return now
 

@@ -134,23 +134,21 @@ class Calls:
         end = None if deadline is None else now + deadline
         self._collecting = True
         try:
-            while True:
-                self._waiting.poll()
-                remaining = sum(ticket.remaining for ticket in self._sent)
-                if not remaining:
-                    break
-                if end is not None and now >= end:
-                    raise TimeoutError(
-                        f"{remaining} calls have not returned within {deadline} s; nothing is "
-                        "lost, the next collect_calls gets their values"
-                    )
-                now = yield from self._waiting.turn(remaining, end)
+            yield from self._waiting.until(now, self._num_outstanding, end)
         finally:
             self._collecting = False
+        if remaining := self._num_outstanding():
+            raise TimeoutError(
+                f"{remaining} calls have not returned within {deadline} s; nothing is lost, the "
+                "next collect_calls gets their values"
+            )
         tickets, self._sent = self._sent, []
         for ticket in tickets:
             self._requests.settle(ticket)
         return values_of(tickets)
+
+    def _num_outstanding(self) -> int:
+        return sum(ticket.remaining for ticket in self._sent)
 
 
 def values_of(tickets: Sequence[Ticket]) -> list[Any]:

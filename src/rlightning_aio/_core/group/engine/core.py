@@ -183,10 +183,7 @@ class Core:
         self.steps.collecting = True
         try:
             self.intake.now = now
-            self.waiting.poll()
-            while now < end and collector.num_awaited:
-                now = yield from self.waiting.turn(collector.num_awaited, end)
-                self.waiting.poll()
+            now = yield from self.waiting.until(now, lambda: collector.num_awaited, end)
             yield from self._aborts.end(self._all_slots, now)
         finally:
             self.steps.collecting = False

@@ -244,7 +244,7 @@ class Intake:
         requests, continuity = self._requests, self._continuity
         # The episodes of aborted requests were over before.
         lost = [slot for slot in loss.slots if slot not in requests.aborted.faults]
-        requests.lose_host(loss.host_id)
+        requests.in_flight[loss.host_id] = 0  # It answers none of them.
         owed = requests.end_aborted(loss.owed)
         if not loss.replaced:
             continuity.give_up(loss.slots)

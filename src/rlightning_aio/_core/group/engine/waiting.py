@@ -170,6 +170,16 @@ class Waiting:
             self.check(now)
         return now
 
+    def until(
+        self, now: float, num_left: Callable[[], int], end: float | None = None
+    ) -> Procedure[float]:
+        """Wait until `num_left` replies are 0, or until `end`; return the time."""
+        self.poll()
+        while (wanted := num_left()) and (end is None or now < end):
+            now = yield from self.turn(wanted, end)
+            self.poll()
+        return now
+
     def _want(self, wanted: int, calls: int) -> None:
         """Note that more or fewer calls want so many results."""
         calls += self.wanted.pop(wanted, 0)

@@ -340,10 +340,6 @@ class Requests:
         self.in_flight[host_id] += len(slots)
         return self.numbering.renew(slots, _RESET)
 
-    def lose_host(self, host_id: int) -> None:
-        """Record that a host will answer none of its outstanding requests."""
-        self.in_flight[host_id] = 0
-
     def alone(self, slot: int) -> NDArray[np.intp]:
         """Return one slot as an array of slots."""
         return self._each[slot : slot + 1]
