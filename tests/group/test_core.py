@@ -9,7 +9,7 @@ from unittest.mock import Mock
 import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
-from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import CLOSED, UNLIKE_ENVS
 from rlightning_aio._core.hosts.messages import Faulted, Withdrawn
 from rlightning_aio.batch import BatchedData

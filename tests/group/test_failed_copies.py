@@ -13,7 +13,7 @@ from group.fake_host import PLAIN, RAISES, SENDS_INFO, TERMINATES, FakeGroup
 from group.sample_envs import HALVED
 
 import rlightning_aio.sync
-from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.hosts.messages import Result
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import EnvRaised

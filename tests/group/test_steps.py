@@ -30,7 +30,7 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
 from rlightning_aio._core.group.timeline.trace import Trace
 from rlightning_aio.batch import BatchedData

@@ -12,7 +12,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.drivers.scope import Scope
-from rlightning_aio._core.group.drivers.wait import CollectRules, this_process
+from rlightning_aio._core.group.drivers.wait import this_process
+from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.observed import NO_SPAN
 from rlightning_aio._core.group.timeline.trace import Trace

@@ -1,7 +1,6 @@
 """`Wait` and `Procedure`: how the core, which never waits, asks its driver to wait.
 
-`GroupDriver` is what a group asks of whoever waits for it, and `CollectRules` says for which
-results a collect waits.
+`GroupDriver` is what a group asks of whoever waits for it.
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ import os
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
-
-import msgspec
 
 from rlightning_aio._core.hosts.base import Driver
 from rlightning_aio.errors import RLightningError
@@ -22,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = [
     "TURN",
     "CallTime",
-    "CollectRules",
     "GroupDriver",
     "Parked",
     "Patient",
@@ -149,19 +145,6 @@ def forked_from(pid: int) -> RLightningError:
         f"this group belongs to process {pid}, which has forked this one; only that process can "
         "use and close the group; build another one here"
     )
-
-
-class CollectRules(msgspec.Struct, frozen=True, kw_only=True, gc=False):
-    """The checked arguments of `EnvGroup.collect_async`.
-
-    Each collect makes one, so this is a `Struct`: a frozen dataclass takes four times as long.
-    """
-
-    timeout: float | None = None
-    wait_all: bool = False
-    min_results: int = 1
-    max_results: int | None = None
-    deadline: float | None = None
 
 
 def earliest(*times: float | None) -> float | None:

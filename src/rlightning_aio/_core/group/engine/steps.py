@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
+import msgspec
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Procedure, earliest
@@ -22,8 +23,8 @@ from rlightning_aio._core.group.engine.actions import (
     write_actions,
     write_column,
 )
-from rlightning_aio._core.group.engine.first_observations import FirstObservations
 from rlightning_aio._core.group.engine.newest import Newest
+from rlightning_aio._core.group.engine.results import FirstObservations
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.drivers.wait import CollectRules
     from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
     from rlightning_aio._core.group.engine.results import Results
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
 
-__all__ = ["Flags", "Parts", "Steps"]
+__all__ = ["CollectRules", "Flags", "Parts", "Steps"]
 
 _STEP: Final = int(Operation.STEP)
 Flags: TypeAlias = "list[bool]"
@@ -74,6 +74,19 @@ class Parts:
     supervisor: Supervisor
     poller: Poller
     driver: Driver
+
+
+class CollectRules(msgspec.Struct, frozen=True, kw_only=True, gc=False):
+    """The checked arguments of `EnvGroup.collect_async`.
+
+    Each collect makes one, so this is a `Struct`: a frozen dataclass takes four times as long.
+    """
+
+    timeout: float | None = None
+    wait_all: bool = False
+    min_results: int = 1
+    max_results: int | None = None
+    deadline: float | None = None
 
 
 class Steps:

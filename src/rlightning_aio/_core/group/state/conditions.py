@@ -1,4 +1,4 @@
-"""`Conditions`: whether anything is unlike an ordinary step.
+"""`Conditions`: whether anything is unlike an ordinary step; `Lifetime`: whether a group is open.
 
 The ordinary step (`steps`, `waiting`) asks one question about most that is rare: is `unusual` 0?
 The component that knows of a condition sets it and clears it; while any is set, nothing is skipped.
@@ -7,6 +7,8 @@ The component that knows of a condition sets it and clears it; while any is set,
 from __future__ import annotations
 
 from typing import Final
+
+from rlightning_aio.errors import GroupClosed, RLightningError
 
 __all__ = [
     "ABORTING",
@@ -20,6 +22,7 @@ __all__ = [
     "PAST_END",
     "UNLIKE_ENVS",
     "Conditions",
+    "Lifetime",
 ]
 
 CLOSED: Final = 1 << 0
@@ -61,3 +64,36 @@ class Conditions:
     def note(self, condition: int, holds: bool) -> None:
         """Set or clear a condition."""
         self.unusual = self.unusual | condition if holds else self.unusual & ~condition
+
+
+class Lifetime:
+    """Whether the group is open.
+
+    Attributes:
+        open, closed: the group is initialised; it has been closed.
+    """
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self.open = False
+        self.closed = False
+
+    def begin(self) -> None:
+        """Record that the group is initialised."""
+        self.open = True
+        self._conditions.note(CLOSED, False)
+
+    def end(self) -> None:
+        """Record that the group is closed, for good."""
+        self.closed = True
+        self.open = False
+        self._conditions.note(CLOSED, True)
+
+    def check_open(self) -> None:
+        """Raise `RLightningError` before `init`, and `GroupClosed` after `close`."""
+        if self.closed:
+            raise GroupClosed("this group is closed; build a new one")
+        if not self.open:
+            raise RLightningError(
+                "this group has not been initialised; call init() first, or use it in a with block"
+            )

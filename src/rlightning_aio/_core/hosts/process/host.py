@@ -35,8 +35,8 @@ from rlightning_aio._core.hosts.process.fork_messages import (
 )
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
-from rlightning_aio._core.hosts.process.processor_times import processor_times
 from rlightning_aio._core.hosts.process.spares import RunningForkServer
+from rlightning_aio._core.hosts.process.system import processor_times
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind

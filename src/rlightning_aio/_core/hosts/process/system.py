@@ -1,8 +1,9 @@
-"""Refuses worker processes on systems that don't have what they need."""
+"""What worker processes need of this system, and what its accounts say of them."""
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import ConfigError
@@ -10,7 +11,7 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["check_system"]
+__all__ = ["check_system", "processor_times"]
 
 
 def check_system(config: EnvConfig) -> None:
@@ -26,3 +27,19 @@ def check_system(config: EnvConfig) -> None:
             "placement: loop (awaitable envs, in the asynchronous group) or backend: env_server "
             "(envs elsewhere connect); make_vec steps MuJoCo's tasks in one batch in this process"
         )
+
+
+def processor_times(pid: int) -> tuple[int, int] | None:
+    """Return the ns for which the living threads of a process have run, and have waited for a core.
+
+    None if the process has ended, or the kernel keeps no such accounts.
+    """
+    ran = queued = 0
+    try:
+        for accounts in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            on_core, in_queue, _ = accounts.read_text().split()
+            ran += int(on_core)
+            queued += int(in_queue)
+    except (OSError, ValueError):
+        return None  # A thread has ended meanwhile, or the accounts have another form.
+    return (ran, queued) if ran else None
