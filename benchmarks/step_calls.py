@@ -113,9 +113,9 @@ class Held:
     """The workers of a group, stopped until the trainer waits."""
 
     def __init__(self, group: Any) -> None:
-        parts = vars(group)["_core"].parts
-        self._rings = parts.tables.requests.rings
-        parts.poller.num_cores = 0
+        core = vars(group)["_core"]
+        self._rings = core.tables.requests.rings
+        vars(core.waiting)["_poller"].num_cores = 0
         self._pids = [worker["pid"] for worker in group.get_workers()]
         self._driver = vars(vars(group)["_driver"])
         self._epoll = self._driver.get("_epoll")

@@ -149,6 +149,6 @@ def marked(ret: EnvRet) -> bool:
 
 def fork_server_of(group: Any) -> ForkServerHandle:
     """Return the only fork server of a group."""
-    shared = group._core.parts.tables.resources.values()
+    shared = group._core.tables.resources.values()
     (server,) = (one for one in shared if isinstance(one, ForkServerHandle))
     return server

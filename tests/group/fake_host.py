@@ -18,7 +18,6 @@ from gymnasium import spaces
 
 from rlightning_aio._core.group.drivers.wait import Parked
 from rlightning_aio._core.group.engine.core import Core
-from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.state.checked import CheckedRequests
@@ -26,6 +25,7 @@ from rlightning_aio._core.group.state.conditions import Conditions, Lifetime
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
@@ -449,7 +449,11 @@ class FakeGroup:
             observed,
             lifetime,
             Arena(),
+            Stats(envs, requests),
             clock=lambda: self.now,
+            driver=self,
+            num_cores=0,
+            shares_thread=True,
         )
         completions, arena = tables.completions, tables.arena
         supervisor = Supervisor(tables)
@@ -465,8 +469,7 @@ class FakeGroup:
             self.hosts.append(host)
             supervisor.add(host, self.config)
             poller.add(host)
-        parts = Parts(tables, supervisor, poller, self)
-        self.core = Core(parts, zero_copy=False, shares_thread=True)
+        self.core = Core(tables, supervisor, poller, zero_copy=False)
         self.steps = self.core.steps
         self.running: list[Running] = []
         opened = self.begin(self.core.start(self.now))

@@ -212,5 +212,5 @@ async def test_ordinary_steps_go_on_after_an_abort(start: Any, entry: Any) -> No
         batch, _ = await group.step(before.respond(action=np.full((4, 2), [DO_NOTHING, 1.0])))
         assert batch.reward.tolist() == [1] * 4
         before = batch
-    conditions = getattr(group, "wrapped", group)._core.parts.tables.conditions
+    conditions = getattr(group, "wrapped", group)._core.tables.conditions
     assert not conditions.unusual & (ABORTING | DEATH | LOST_EPISODE)

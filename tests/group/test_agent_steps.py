@@ -264,7 +264,7 @@ async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_
 ) -> None:
     pause(monkeypatch, share=1000, longest=30, many=2)
     async with rl.build_env_group(Long, num_workers=2, placement="loop") as group:
-        requests = group._core.parts.tables.requests
+        requests = group._core.tables.requests
         first, other = await episodes(group)
         steps = [asyncio.ensure_future(first.step(0)), asyncio.ensure_future(other.step(HANG))]
         while requests.state[0] != State.READY:  # noqa: ASYNC110  # Nothing tells.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -114,7 +115,8 @@ class Machine:
         total = self.num_workers * count
         config = entry(num_workers=total, envs_per_process=self.envs_per_process)
         self.records = [HostRecord(worker, config) for worker in self.workers]
-        self.hints = Hints(self.records)
+        tables: Any = SimpleNamespace(records=self.records, stats=self, num_cores=2)
+        self.hints = Hints(tables)
 
     def executed(self, since_ns: int) -> Any:
         return np.array([step for step in self.steps if step[1] >= since_ns]).reshape(-1, 3).T
@@ -122,9 +124,9 @@ class Machine:
     def summary(self, now_ns: int) -> Any:
         return {"latency_us": {}}
 
-    def look(self, num_cores: int = 2) -> None:
+    def look(self) -> None:
         with patch.object(time, "monotonic_ns", lambda: self.at_ns):
-            self.hints.look(self, num_cores)
+            self.hints.look()
 
     def step_all(self, times: int, busy: int, *, ran: int, queued: int = 0, idle: int = 0) -> None:
         """Let each worker step its envs, one after the other; times in ns, of one step."""

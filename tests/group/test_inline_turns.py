@@ -76,7 +76,7 @@ async def test_a_call_delays_no_ordinary_step_on_one_core(
         for _ in range(12):  # As many batches as are compared with their spaces, and more.
             batch, _ = await group.reset(seed=0)
         core: Any = getattr(group, "wrapped", group)._core
-        assert not core.parts.tables.conditions.unusual
+        assert not core.tables.conditions.unusual
         core.supervisor.look_by = math.inf
         if calls == "two halves":
             send_calls(group, "get_attr", "gravity", env_ids=["pole-0"])

@@ -43,7 +43,7 @@ class Used:
     def __init__(self, entry: dict[str, Any], *, ordinary: bool) -> None:
         self.group = rlightning_aio.sync.build_env_group(entry)
         self.group.init()
-        conditions = self.group._core.parts.tables.conditions
+        conditions = self.group._core.tables.conditions
         if not ordinary:
             conditions.note(UNLIKE_ENVS, True)
         self.backend = entry["backend"]

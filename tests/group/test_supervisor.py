@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeGuard
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision import hang_detector
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
@@ -201,7 +203,9 @@ class Fleet:
             Observed(),
             self.lifetime,
             Arena(),
+            Stats(envs, self.requests),
             clock=lambda: self.now,
+            driver=Mock(),
         )
         self.completions = tables.completions
         self.supervisor = Supervisor(tables)

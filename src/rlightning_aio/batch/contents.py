@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.batch.data import BatchedData, Origin
+    from rlightning_aio.batch.data import BatchedData, Issuer, Origin
     from rlightning_aio.batch.names import EnvNames
     from rlightning_aio.batch.sent import Sources
 
@@ -112,7 +112,7 @@ def ended_episodes(
     return [(part.episode_of_all(row), part.reported_info_of(row)) for part, row in chosen]
 
 
-def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
+def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
     """Slots of the envs, each once, if the batch was made by `group`."""
     origin = batch._origin
     if origin is None or origin.group is not group or origin.repeats:

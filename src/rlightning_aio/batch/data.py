@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final, Protocol, overload
 
 import msgspec
 import numpy as np
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BatchedData",
+    "Issuer",
     "Origin",
     "answer_of",
     "batch_of_results",
@@ -50,6 +51,17 @@ _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
 """The end of an env's id: its number in the entry, and the name of a client."""
 
 
+class Issuer(Protocol):
+    """What a batch knows of the group that has returned it.
+
+    Attributes:
+        shares_thread: its calls are awaited.
+    """
+
+    @property
+    def shares_thread(self) -> bool: ...
+
+
 class Origin(msgspec.Struct):
     """Group and slots of a batch, so that the answer to it needs no look-up.
 
@@ -57,7 +69,7 @@ class Origin(msgspec.Struct):
         repeats: True if `slots` may have an env twice; the group then looks the envs up.
     """
 
-    group: object
+    group: Issuer | None
     slots: NDArray[np.intp]
     names: EnvNames
     repeats: bool = False
@@ -407,7 +419,7 @@ def _entry_of(env_id: str) -> str:
 
 def batch_of_results(
     parts: Sequence[ResultColumns],
-    group: object,
+    group: Issuer | None,
     slots: NDArray[np.intp],
     names: EnvNames,
     sources: Sources | None = None,
@@ -437,7 +449,7 @@ def with_repeats(batch: BatchedData) -> BatchedData:
     return batch
 
 
-def answer_of(batch: BatchedData, group: object) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
+def answer_of(batch: BatchedData, group: Issuer) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
     """Distinct slots, and columns of responses, to results of `group`; None for other batches."""
     if type(batch) is not BatchedData or batch._columns is None:
         return None

@@ -12,7 +12,6 @@ import asyncio
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
-from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import origin_of
 from rlightning_aio.errors import BadAction
@@ -37,7 +36,7 @@ def can_await(batch: BatchedData) -> bool:
         return False
     origin = origin_of(batch)
     group = None if origin is None else origin.group
-    return not isinstance(group, Core) or group.shares_thread
+    return group is None or group.shares_thread
 
 
 def answers_of(

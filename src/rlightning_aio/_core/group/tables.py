@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.observed import Observed
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.base import Shared
+    from rlightning_aio._core.hosts.base import Driver, Shared
     from rlightning_aio._core.hosts.messages import Completion, Completions
 
 __all__ = ["Tables"]
@@ -33,7 +34,11 @@ class Tables:
         observed: holds the observer.
         lifetime: whether the group is open.
         arena: the memory that hosts share with the group.
+        stats: of the results that were returned.
         clock: monotonic seconds, for the parts that can't be given the time.
+        driver: of the group.
+        num_cores: that this process and its workers may use.
+        shares_thread: other tasks may use the group while a call waits.
         mixed_actions: the actions of envs may differ in shape.
         records: of the hosts, in the order of their slots; complete when the group starts.
         completions: the queue to which hosts post.
@@ -48,7 +53,11 @@ class Tables:
     observed: Observed
     lifetime: Lifetime
     arena: Arena
+    stats: Stats
     clock: Callable[[], float]
+    driver: Driver
+    num_cores: int = 1
+    shares_thread: bool = False
     mixed_actions: bool = False
     records: list[HostRecord] = field(default_factory=list["HostRecord"])
     completions: Completions = field(default_factory=deque["Completion"])

@@ -128,7 +128,7 @@ class Facade:
         self._driver = self._new_driver()
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
         self._steps = self._core.steps
-        self._driver.completions = self._core.parts.tables.completions
+        self._driver.completions = self._core.tables.completions
         self._driver.apply_completions = self._core.apply_completions
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False

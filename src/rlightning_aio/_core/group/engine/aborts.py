@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.arrivals import Arrivals
-    from rlightning_aio._core.group.engine.intake import Intake
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
-    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
@@ -43,20 +41,17 @@ class Aborts:
         supervisor: Supervisor,
         results: Results,
         arrivals: Arrivals,
-        intake: Intake,
         waiting: Waiting,
-        stats: Stats,
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
         self._continuity = tables.continuity
-        self._lifetime = tables.lifetime
         self._supervisor = supervisor
         self._results = results
         self._arrivals = arrivals
-        self._intake = intake
+        self._intake = waiting.intake
         self._waiting = waiting
-        self._stats = stats
+        self._stats = tables.stats
 
     def drop(self, slots: NDArray[np.intp]) -> None:
         """Drop those results of `slots` that wait for the collector; errors that do so stay."""

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.results import Results
-    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import Joined
 
@@ -36,13 +35,13 @@ class Arrivals:
             dropped, because their first results answer them.
     """
 
-    def __init__(self, tables: Tables, results: Results, stats: Stats) -> None:
+    def __init__(self, tables: Tables, results: Results) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
         self._layout = tables.layout
         self._continuity = tables.continuity
         self._results = results
-        self._stats = stats
+        self._stats = tables.stats
         self.held_back: dict[int, Joined] = {}
         self._withdrawn: set[int] = set()
         self.asked = self.back = np.zeros(0, np.intp)

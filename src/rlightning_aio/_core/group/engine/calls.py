@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.dispatch import Dispatch
-    from rlightning_aio._core.group.engine.intake import Intake
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.tables import Tables
@@ -31,19 +30,13 @@ Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
 class Calls:
     """Send method calls, and collect the returned values."""
 
-    def __init__(
-        self,
-        tables: Tables,
-        dispatch: Dispatch,
-        intake: Intake,
-        waiting: Waiting,
-    ) -> None:
+    def __init__(self, tables: Tables, dispatch: Dispatch, waiting: Waiting) -> None:
         self._observed = tables.observed
         self._envs = tables.envs
         self._requests = tables.requests
         self._lifetime = tables.lifetime
         self._dispatch = dispatch
-        self._intake = intake
+        self._intake = waiting.intake
         self._waiting = waiting
         # Calls that `collect_calls` returns next.
         self._sent: list[Ticket] = []

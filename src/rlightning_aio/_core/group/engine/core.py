@@ -25,7 +25,6 @@ from rlightning_aio._core.group.engine.snapshots import Snapshots
 from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.engine.waiting import Waiting
 from rlightning_aio._core.group.state.request_states import NOBODY, State
-from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio.batch.data import BatchedData
 
 if TYPE_CHECKING:
@@ -34,8 +33,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
-    from rlightning_aio._core.group.engine.steps import Flags, Parts
+    from rlightning_aio._core.group.engine.steps import Flags
+    from rlightning_aio._core.group.engine.waiting import Poller
     from rlightning_aio._core.group.episodes.seeds import Seeds
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Membership
     from rlightning_aio.types import EnvMeta
 
@@ -46,47 +48,39 @@ class Core:
     """The operations of an `EnvGroup`; methods have its names, and those of `steps` too.
 
     Args:
-        parts: of the group.
+        tables, supervisor, poller: of the group.
         zero_copy: return observations as views if their rows are contiguous.
-        shares_thread: other tasks may use the group while a procedure waits.
 
     Attributes:
-        parts, shares_thread: as given; results, intake, waiting, stats, metrics, steps, newest,
-            agent_steps, calls: made of them.
+        tables, supervisor: as given; envs, requests, continuity, observed, lifetime, stats: of the
+            tables; results, intake, waiting, metrics, steps, newest, agent_steps, calls: made here.
     """
 
-    def __init__(self, parts: Parts, *, zero_copy: bool, shares_thread: bool) -> None:
-        self.parts = parts
-        self.shares_thread = shares_thread
-        tables, supervisor, poller = parts.tables, parts.supervisor, parts.poller
-        envs, requests = tables.envs, tables.requests
-        self.envs = envs
-        self.requests = requests
+    def __init__(
+        self, tables: Tables, supervisor: Supervisor, poller: Poller, *, zero_copy: bool
+    ) -> None:
+        self.tables = tables
         self.supervisor = supervisor
+        self.envs = tables.envs
+        self.requests = tables.requests
         self.continuity = tables.continuity
         self.observed = tables.observed
         self.lifetime = tables.lifetime
-        self.stats = stats = Stats(envs, requests)
-        self.metrics = Metrics(tables, stats, shares_thread=shares_thread)
-        self.results = results = Results(
-            envs, tables.layout, tables.conditions, zero_copy=zero_copy
-        )
-        self._arrivals = arrivals = Arrivals(tables, results, stats)
-        self.intake = intake = Intake(tables, supervisor, results, arrivals, stats)
+        self.stats = tables.stats
+        self.metrics = Metrics(tables)
+        self.results = results = Results(tables, zero_copy=zero_copy)
+        arrivals = Arrivals(tables, results)
+        self.intake = intake = Intake(tables, supervisor, results, arrivals)
         self.apply_completions = intake.apply_completions
-        self.waiting = waiting = Waiting(
-            tables, supervisor, poller, intake, parts.driver, shares_thread=shares_thread
-        )
-        dispatch = Dispatch(tables, supervisor, poller, waiting, parts.driver)
-        self.steps = Steps(parts, self, results, arrivals, dispatch, waiting, stats)
+        self.waiting = waiting = Waiting(tables, supervisor, poller, intake)
+        dispatch = Dispatch(tables, supervisor, poller, waiting)
+        self.steps = Steps(tables, supervisor, results, arrivals, dispatch, waiting)
         self.newest = self.steps.newest
-        self.calls = Calls(tables, dispatch, intake, waiting)
-        self._snapshots = Snapshots(
-            envs, supervisor, dispatch, self.calls, tables.continuity, waiting
-        )
-        self._resets = Resets(tables, supervisor, dispatch, results, intake, waiting)
+        self.calls = Calls(tables, dispatch, waiting)
+        self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, waiting)
+        self._resets = Resets(tables, supervisor, dispatch, results, waiting)
         self.agent_steps = AgentSteps(tables, self.steps, self._resets, waiting)
-        self._aborts = Aborts(tables, supervisor, results, arrivals, intake, waiting, stats)
+        self._aborts = Aborts(tables, supervisor, results, arrivals, waiting)
 
     # -- life -------------------------------------------------------------------------
 
@@ -96,8 +90,8 @@ class Core:
             self.results.begin_schemas(record.slots)
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
-        self.steps.begin(shares_thread=self.shares_thread)
-        self.supervisor.overdue.begin(self.parts.tables.clock())
+        self.steps.begin()
+        self.supervisor.overdue.begin(self.tables.clock())
         return metas
 
     def close(self, now: float) -> Procedure[None]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.waiting import Poller, Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Driver, Host, Membership
+    from rlightning_aio._core.hosts.base import Host, Membership
 
 __all__ = ["Dispatch", "Packed"]
 
@@ -35,12 +35,7 @@ class Dispatch:
     """The outgoing side of a group."""
 
     def __init__(
-        self,
-        tables: Tables,
-        supervisor: Supervisor,
-        poller: Poller,
-        waiting: Waiting,
-        driver: Driver,
+        self, tables: Tables, supervisor: Supervisor, poller: Poller, waiting: Waiting
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
@@ -49,7 +44,7 @@ class Dispatch:
         self._poller = poller
         self._intake = waiting.intake
         self._waiting = waiting
-        self._driver = driver
+        self._driver = tables.driver
 
     def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
         """The slots of `env_ids`; `EnvBusy` if an id appears twice."""

@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.results import Results
-    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.errors import EnvFault, EnvRaised
@@ -65,7 +64,6 @@ class Intake:
         supervisor: Supervisor,
         results: Results,
         arrivals: Arrivals,
-        stats: Stats,
     ) -> None:
         self.now = 0.0
         self._completions = tables.completions
@@ -77,7 +75,7 @@ class Intake:
         self._results = results
         self._continuity = tables.continuity
         self._arrivals = arrivals
-        self._stats = stats
+        self._stats = tables.stats
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
             Result: self._on_result,

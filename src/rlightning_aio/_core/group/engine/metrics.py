@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.tables import Tables
 
 __all__ = ["Metrics"]
@@ -29,14 +28,11 @@ class Metrics:
     """See the module.
 
     Args:
-        tables, stats: of the group.
-        shares_thread: the group is used from an event loop.
+        tables: of the group.
     """
 
-    def __init__(self, tables: Tables, stats: Stats, *, shares_thread: bool) -> None:
+    def __init__(self, tables: Tables) -> None:
         self._tables = tables
-        self._stats = stats
-        self._shares_thread = shares_thread
 
     def read(
         self, now_ns: int, call_seconds: tuple[float, float], *, by_entry: bool
@@ -48,14 +44,14 @@ class Metrics:
             call_seconds: from `CallTime.so_far`.
             by_entry: add the numbers of each entry.
         """
-        reading = _Reading(self._tables, self._stats, now_ns)
+        reading = _Reading(self._tables, now_ns)
         names = self._tables.envs.names.entry_names
         numbers = reading.of(np.arange(len(names)))
         sizes = reading.window.batch_sizes()
         if len(sizes):
             numbers["batch_size"] = float(sizes.mean())
         numbers["seconds_waiting_for_envs"], numbers["seconds_in_trainer"] = call_seconds
-        if self._shares_thread and len(lags := reading.window.lags()):
+        if self._tables.shares_thread and len(lags := reading.window.lags()):
             numbers["loop_lag_seconds_p99"] = percentiles(lags)[1]
             numbers["loop_lag_seconds_max"] = float(lags.max())
         found = {_PREFIX + name: value for name, value in numbers.items()}
@@ -68,11 +64,11 @@ class Metrics:
 class _Reading:
     """The state of a group at a time, in ns of the monotonic clock."""
 
-    def __init__(self, tables: Tables, stats: Stats, now_ns: int) -> None:
+    def __init__(self, tables: Tables, now_ns: int) -> None:
         envs, requests = tables.envs, tables.requests
+        self._stats = stats = tables.stats
         self.window = stats.window(now_ns)
         self._tables = tables
-        self._stats = stats
         self._now_ns = now_ns
         self._entries = envs.names.entries
         self._sums = stats.times.so_far(now_ns)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.dispatch import Dispatch
-    from rlightning_aio._core.group.engine.intake import Intake
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.episodes.seeds import Seeds
@@ -43,7 +42,6 @@ class Resets:
         supervisor: Supervisor,
         dispatch: Dispatch,
         results: Results,
-        intake: Intake,
         waiting: Waiting,
     ) -> None:
         self._envs = tables.envs
@@ -54,7 +52,7 @@ class Resets:
         self._members = supervisor.members
         self._dispatch = dispatch
         self._results = results
-        self._intake = intake
+        self._intake = waiting.intake
         self._waiting = waiting
 
     def reset(

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.episodes.continuity import Report
-    from rlightning_aio._core.group.state.conditions import Conditions
     from rlightning_aio._core.group.state.env_table import EnvTable
-    from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio.batch.sent import Sources
     from rlightning_aio.protocol.info import InfoSchema
@@ -48,16 +47,14 @@ class Results:
     """What lies in the rows of a group, and what came out of band.
 
     Args:
-        envs: names them; layout: where their rows are; conditions: of the group.
+        tables: of the group.
         zero_copy: observations are handed out as views where their rows are contiguous.
     """
 
-    def __init__(
-        self, envs: EnvTable, layout: SlabLayout, conditions: Conditions, *, zero_copy: bool
-    ) -> None:
-        self._envs = envs
-        self._conditions = conditions
-        self._layout = layout
+    def __init__(self, tables: Tables, *, zero_copy: bool) -> None:
+        self._envs = envs = tables.envs
+        self._conditions = tables.conditions
+        self._layout = tables.layout
         self._zero_copy = zero_copy
         self._out_of_band: dict[int, Any] = {}
         # Of each slot's host; a host's slots share one dict.

@@ -35,10 +35,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.calls import Calls
     from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.waiting import Waiting
-    from rlightning_aio._core.group.episodes.continuity import Continuity
-    from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import EnvState
 
 __all__ = ["Snapshots"]
@@ -52,18 +51,17 @@ class Snapshots:
 
     def __init__(
         self,
-        envs: EnvTable,
+        tables: Tables,
         supervisor: Supervisor,
         dispatch: Dispatch,
         calls: Calls,
-        continuity: Continuity,
         waiting: Waiting,
     ) -> None:
-        self._envs = envs
+        self._envs = tables.envs
         self._supervisor = supervisor
         self._dispatch = dispatch
         self._calls = calls
-        self._continuity = continuity
+        self._continuity = tables.continuity
         self._waiting = waiting
 
     def take(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:

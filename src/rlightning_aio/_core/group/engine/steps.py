@@ -9,7 +9,6 @@ writes, and finds the words for what it refuses, and `Dispatch` sends.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
@@ -44,36 +43,18 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
     from rlightning_aio._core.group.engine.results import Results
-    from rlightning_aio._core.group.engine.waiting import Poller, Waiting
+    from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
-    from rlightning_aio._core.group.state.stats import Stats
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Driver
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
 
-__all__ = ["CollectRules", "Flags", "Parts", "Steps"]
+__all__ = ["CollectRules", "Flags", "Steps"]
 
 _STEP: Final = int(Operation.STEP)
 Flags: TypeAlias = "list[bool]"
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a core is built from.
-
-    Attributes:
-        tables: the state of the group.
-        supervisor, poller: of the hosts.
-        driver: of the group.
-    """
-
-    tables: Tables
-    supervisor: Supervisor
-    poller: Poller
-    driver: Driver
 
 
 class CollectRules(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -93,9 +74,8 @@ class Steps:
     """See the module; methods have the names of those of `EnvGroup`.
 
     Args:
-        parts: of the group.
-        group: what batches of results say that they are from.
-        results, arrivals, dispatch, waiting, stats: of the group.
+        tables: of the group; batches of results say that they are from these.
+        supervisor, results, arrivals, dispatch, waiting: of the group.
 
     Attributes:
         newest: which results are the newest.
@@ -104,16 +84,14 @@ class Steps:
 
     def __init__(
         self,
-        parts: Parts,
-        group: object,
+        tables: Tables,
+        supervisor: Supervisor,
         results: Results,
         arrivals: Arrivals,
         dispatch: Dispatch,
         waiting: Waiting,
-        stats: Stats,
     ) -> None:
-        tables = parts.tables
-        self._group = group
+        self._tables = tables
         self._layout = tables.layout
         self._conditions = tables.conditions
         self._envs = tables.envs
@@ -121,28 +99,27 @@ class Steps:
         self._continuity = tables.continuity
         self._observed = tables.observed
         self._lifetime = tables.lifetime
-        self._supervisor = parts.supervisor
-        self._hints = parts.supervisor.hints
-        self._poller = parts.poller
+        self._supervisor = supervisor
+        self._hints = supervisor.hints
         self._completions = tables.completions
-        self._driver = parts.driver
+        self._driver = tables.driver
         self._results = results
         self._arrivals = arrivals
         self._dispatch = dispatch
         self._waiting = waiting
         self._intake = waiting.intake
-        self._stats = stats
+        self._stats = tables.stats
         self._first_observations = FirstObservations(tables.envs)
-        self.newest = Newest(tables, parts.supervisor.members)
+        self.newest = Newest(tables, supervisor.members)
         self.collecting = False
         # The host of the only env, which steps in the calls of a synchronous group.
         self._alone: Executing | None = None
 
-    def begin(self, *, shares_thread: bool) -> None:
-        """Note what kind of envs were started, and whether other tasks may run during a step."""
+    def begin(self) -> None:
+        """Note what kind of envs were started."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
         here = hosts[0] if len(hosts) == 1 and isinstance(hosts[0], Executing) else None
-        self._alone = here if len(envs) == 1 and not shares_thread else None
+        self._alone = here if len(envs) == 1 and not self._tables.shares_thread else None
         self._requests.in_rings = None not in self._requests.rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
         ordinary = (
@@ -290,7 +267,7 @@ class Steps:
         """
         if self._completions:
             self._intake.apply_completions()
-        answer = None if self._conditions.unusual else answer_of(batch, self._group)
+        answer = None if self._conditions.unusual else answer_of(batch, self._tables)
         if answer is None:
             return self._write_any(batch, now)
         slots, columns = answer
@@ -332,7 +309,7 @@ class Steps:
                 f"a step takes a batch of responses, not a {type(batch).__name__}: answer the last "
                 "results with batch.respond(action=...); nothing was sent"
             )
-        slots = slots_of(batch, self._group)
+        slots = slots_of(batch, self._tables)
         return self._dispatch.distinct(_answered(batch)) if slots is None else slots
 
     def send(
@@ -440,7 +417,7 @@ class Steps:
                     self._mark_cut(part, is_cut)
                 results.add_episodes(part)
             batch = batch_of_results(
-                parts, self._group, slots, self._envs.names, results.sources(slots)
+                parts, self._tables, slots, self._envs.names, results.sources(slots)
             )
             if self._first_observations.left:
                 self._first_observations.check(parts)
@@ -469,7 +446,7 @@ class Steps:
         """Let envs join whose rows are free now, keep the newest results, and give hints."""
         self._arrivals.admit(slots, self._intake.now)
         if self._stats.num_batches >= self._hints.due:
-            self._hints.look(self._stats, self._poller.num_cores)
+            self._hints.look()
         if synchronous and self.newest.keeps:
             self.newest.note_returned(batch)
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.requests import Requests, Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Driver, Host
+    from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["REPLIES", "Poller", "Waiting"]
@@ -46,9 +46,6 @@ class Waiting:
     Args:
         tables, supervisor, poller: of the group.
         intake: applies what the poller finds.
-        driver: of the group.
-        shares_thread: other tasks may use the group while a call waits. So inline envs are executed
-            in one turn each.
 
     Attributes:
         wanted: the numbers of results that calls wait for, and how many calls for each.
@@ -56,14 +53,7 @@ class Waiting:
     """
 
     def __init__(
-        self,
-        tables: Tables,
-        supervisor: Supervisor,
-        poller: Poller,
-        intake: Intake,
-        driver: Driver,
-        *,
-        shares_thread: bool,
+        self, tables: Tables, supervisor: Supervisor, poller: Poller, intake: Intake
     ) -> None:
         self._requests = tables.requests
         self._tickets = tables.requests.tickets
@@ -73,8 +63,9 @@ class Waiting:
         self._bell = poller.bell
         self.intake = intake
         self._completions = tables.completions
-        self._driver = driver
-        self._shares_thread = shares_thread
+        self._driver = tables.driver
+        # Then inline envs are executed in one turn each.
+        self._shares_thread = tables.shares_thread
         # Of the ticket whose call leads; 0 if none does.
         self._leader = 0
         # Of the call of `serve`, while there is one.

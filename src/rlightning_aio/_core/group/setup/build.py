@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rlightning_aio._core.group.engine.core import Core
-from rlightning_aio._core.group.engine.steps import Parts
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.setup.plan import host_class, placement_for
@@ -19,6 +18,7 @@ from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
@@ -59,33 +59,25 @@ def assemble(plan: Plan, driver: Driver, *, shares_thread: bool) -> Core:
             )
     cores = num_cores()
     orders = start_orders(plan, cores)
-    tables = _tables(plan, orders)
+    tables = _tables(plan, orders, driver, cores, shares_thread=shares_thread)
     try:
-        return _assembled(plan, orders, tables, driver, cores, shares_thread=shares_thread)
+        return _assembled(plan, orders, tables)
     except BaseException:
         tables.arena.close()
         raise
 
 
-def _assembled(
-    plan: Plan,
-    orders: Sequence[StartOrder],
-    tables: Tables,
-    driver: Driver,
-    cores: int,
-    *,
-    shares_thread: bool,
-) -> Core:
+def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core:
     arena = tables.arena
     bell_offset = arena.append(bell_size(len(orders)))
     bell_memory = arena.map(bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
     tables.resources["bell"] = bell
     supervisor = Supervisor(tables)
-    poller = Poller(tables.requests, bell, cores, clock=tables.clock)
+    poller = Poller(tables.requests, bell, tables.num_cores, clock=tables.clock)
     wiring = Wiring(
         completions=tables.completions,
-        driver=driver,
+        driver=tables.driver,
         arena=arena,
         bell=bell,
         bell_offset=bell_offset,
@@ -95,7 +87,7 @@ def _assembled(
         objection=lambda meta: supervisor.members.objection(meta, supervisor.metas),
         is_idle=tables.requests.is_idle,
         resources=tables.resources,
-        shares_thread=shares_thread,
+        shares_thread=tables.shares_thread,
     )
     first_slot = 0
     for host_id, order in enumerate(orders):
@@ -103,11 +95,12 @@ def _assembled(
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = Parts(tables, supervisor, poller, driver)
-    return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
+    return Core(tables, supervisor, poller, zero_copy=plan.zero_copy)
 
 
-def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
+def _tables(
+    plan: Plan, orders: Sequence[StartOrder], driver: Driver, cores: int, *, shares_thread: bool
+) -> Tables:
     """Make the state of a group whose hosts get `orders`."""
     local = [config for config in plan.configs if not placement_for(config).max_members]
     servers = [config for config in plan.configs if placement_for(config).max_members]
@@ -119,15 +112,20 @@ def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)
+    requests = (CheckedRequests if DEBUG else Requests)(hosts, len(orders), conditions)
     return Tables(
         envs=envs,
-        requests=(CheckedRequests if DEBUG else Requests)(hosts, len(orders), conditions),
+        requests=requests,
         layout=SlabLayout(len(envs)),
         continuity=Continuity(envs, conditions),
         conditions=conditions,
         observed=Observed(),
         lifetime=Lifetime(conditions),
         arena=Arena(),
+        stats=Stats(envs, requests),
         clock=time.monotonic,
+        driver=driver,
+        num_cores=cores,
+        shares_thread=shares_thread,
         mixed_actions=plan.mixed_actions,
     )

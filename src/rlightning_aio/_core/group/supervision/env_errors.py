@@ -26,22 +26,22 @@ class EnvErrors:
     """See the module.
 
     Args:
-        group: its tables.
+        tables: of the group.
         crash_log: of the group.
         on_count: called when an exception was counted.
     """
 
-    def __init__(self, group: Tables, crash_log: CrashLog, on_count: Callable[[], object]) -> None:
-        self._group = group
+    def __init__(self, tables: Tables, crash_log: CrashLog, on_count: Callable[[], object]) -> None:
+        self._tables = tables
         self._crash_log = crash_log
         self._on_count = on_count
 
     def _record(self, slot: int) -> HostRecord:
-        return self._group.records[self._group.requests.hosts.item(slot)]
+        return self._tables.records[self._tables.requests.hosts.item(slot)]
 
     def ends_env(self, slot: int, error: ErrorText) -> bool:
         """Return True if an env that has raised this is rebuilt before its next request."""
-        op = self._group.requests.numbering.op(slot)
+        op = self._tables.requests.numbering.op(slot)
         return not self._record(slot).error_policy.raises and error.ends_env(op)
 
     def count_restart(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
@@ -52,21 +52,21 @@ class EnvErrors:
             error: what it has raised.
             fault: what the caller gets otherwise.
         """
-        group, record = self._group, self._record(slot)
+        tables, record = self._tables, self._record(slot)
         policy, name = record.error_policy, record.config.name
         count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
         self._on_count()
-        now = group.clock()
+        now = tables.clock()
         is_borne, then = policy.count(count, now, pauses=False)
         if not is_borne:
             fault.add_note(then)
             return False
         record.restarts += 1
-        doing = Operation(group.requests.numbering.op(slot)).name.lower()
-        message = f"{group.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
+        doing = Operation(tables.requests.numbering.op(slot)).name.lower()
+        message = f"{tables.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
         cause = f"raised {error.type_name}"
         self._crash_log.note(name, message, cause, fault.env_id, now, error.traceback)
-        observer = group.observed.observer
+        observer = tables.observed.observer
         if observer is not None:
             observer.note_fate("raised", record.host.host_id, slot, error.summary)
         return True

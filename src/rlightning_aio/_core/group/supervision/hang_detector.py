@@ -41,10 +41,10 @@ class HangDetector:
             killed were aborted. If neither holds, nothing needs to be checked.
     """
 
-    def __init__(self, group: Tables) -> None:
-        self._group = group
-        self._records = group.records
-        self._requests = group.requests
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._records = tables.records
+        self._requests = tables.requests
         self.any_ending = False
         self._now = 0.0
         self.timed = False
@@ -150,7 +150,7 @@ class HangDetector:
         busy = self._requests.owed(np.array(record.slots, np.intp))
         record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
         slot = record.blamed[0]
-        observer = self._group.observed.observer
+        observer = self._tables.observed.observer
         if observer is not None and slot is not None:
             observer.note_fate("hung", record.host.host_id, slot, "")
         self.kill(record, dump=True)
@@ -162,7 +162,7 @@ class HangDetector:
                 continue
             if record.die_by is None:
                 # The trainer may have been stopped until it was killed.
-                record.die_by = self._group.clock() + _OBEY_SECONDS
+                record.die_by = self._tables.clock() + _OBEY_SECONDS
             elif self._now >= record.die_by and not read_news(record):
                 assert record.killable is not None
                 record.die_by = None

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.stats import Stats
+    from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["BRIEF_US", "HINT_AFTER_BATCHES", "TINY_US", "Hints", "Spent", "hint", "waits"]
@@ -96,25 +97,21 @@ class Hints:
     """Looks from time to time whether other settings would be faster, and logs it.
 
     Args:
-        records: of the group's hosts; the list grows until the group starts.
+        tables: of the group.
 
     Attributes:
         due: the number of returned batches at which to `look` next.
     """
 
-    def __init__(self, records: Sequence[HostRecord]) -> None:
+    def __init__(self, tables: Tables) -> None:
         self.due: float = _FIRST_LOOK
-        self._records = records
+        self._records, self._stats = tables.records, tables.stats
+        self._num_cores = tables.num_cores
         # By entry; one that was given a hint has none any more.
         self._since: dict[str, _Since | None] = {}
 
-    def look(self, stats: Stats, num_cores: int) -> None:
-        """Log what the measured times suggest.
-
-        Args:
-            stats: of the group.
-            num_cores: that this process and its workers may use.
-        """
+    def look(self) -> None:
+        """Log what the measured times suggest."""
         is_last = self.due >= HINT_AFTER_BATCHES
         self.due = float("inf") if is_last else min(2 * self.due, HINT_AFTER_BATCHES)
         measured: dict[str, list[HostRecord]] = {}
@@ -124,11 +121,11 @@ class Hints:
         for name, records in measured.items():
             sharing = [record for record in records if len(record.slots) > 1]
             if sharing:
-                self._look_at(name, sharing, stats, num_cores)
-            elif records[0].config.envs_per_process == "auto" and len(records) > num_cores:
-                self._look_at_separate(name, records, stats, num_cores)
+                self._look_at(name, sharing)
+            elif records[0].config.envs_per_process == "auto" and len(records) > self._num_cores:
+                self._look_at_separate(name, records)
         if is_last:
-            self._look_at_latencies(stats, num_cores)
+            self._look_at_latencies()
 
     def _last_look(self, name: str, now: _Since) -> _Since | None:
         """Return when an entry was looked at last; None if it was warned of or begins anew."""
@@ -139,20 +136,18 @@ class Hints:
             self._since[name] = now
         return None
 
-    def _look_at(
-        self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
-    ) -> None:
+    def _look_at(self, name: str, records: Sequence[HostRecord]) -> None:
         """Warn if envs that share workers wait."""
         now = _now(records)
         if now is None or (since := self._last_look(name, now)) is None:
             return
-        spent = _spent(records, stats, since, now)
+        spent = _spent(records, self._stats, since, now)
         if not spent.is_enough:
             return
         self._since[name] = now
         config = records[0].config
         together = max(len(record.slots) for record in records)
-        best = envs_per_worker(config.num_workers, num_cores)
+        best = envs_per_worker(config.num_workers, self._num_cores)
         if waits(spent) and best < together:
             self._since[name] = None
             warn_where(
@@ -164,28 +159,31 @@ class Hints:
                 after=spent.step_seconds / 2,  # In a step, probably.
             )
 
-    def _look_at_separate(
-        self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
-    ) -> None:
+    def _look_at_separate(self, name: str, records: Sequence[HostRecord]) -> None:
         """Warn if envs that have a worker each make steps so short that sharing is faster."""
         restarts = [record.restarts for record in records]
         since = self._last_look(name, _Since(time.monotonic_ns(), restarts, 0, 0))
         if since is None:
             return
-        slots, begun, done = stats.executed(since.at_ns)
+        slots, begun, done = self._stats.executed(since.at_ns)
         own = np.isin(slots, [record.slots.start for record in records])
         if np.count_nonzero(own) < _ENOUGH_RESULTS:
             return
         step_us = float(np.median((done - begun)[own])) / 1e3
         if step_us < BRIEF_US:
             self._since[name] = None
-            _log.warning("%s", _advice_to_share(name, len(records), num_cores, step_us))
+            _log.warning("%s", _advice_to_share(name, len(records), self._num_cores, step_us))
 
-    def _look_at_latencies(self, stats: Stats, num_cores: int) -> None:
+    def _look_at_latencies(self) -> None:
         workers = Counter(record.config.name for record in self._records if record.is_worker_here)
         warned = {name for name, since in self._since.items() if since is None}
         configs = [r.config for r in self._records if r.config.name not in warned]
-        text = hint(configs, workers, num_cores, stats.summary(time.monotonic_ns())["latency_us"])
+        text = hint(
+            configs,
+            workers,
+            self._num_cores,
+            self._stats.summary(time.monotonic_ns())["latency_us"],
+        )
         if text is not None:
             _log.info("%s; `rlightning-aio bench` measures what is best", text)
 

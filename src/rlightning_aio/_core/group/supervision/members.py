@@ -30,9 +30,9 @@ class Members:
         server_ids: of the hosts that envs join, in order.
     """
 
-    def __init__(self, group: Tables) -> None:
-        self._group = group
-        self._envs = group.envs
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._envs = tables.envs
         self._servers: list[Membership] = []
         self.possible = False
 
@@ -90,7 +90,7 @@ class Members:
         known = [one for one in local if one.action_space is not None]
         known += [one for server in self._servers for one in server.members().values()]
         try:
-            if not self._group.mixed_actions:
+            if not self._tables.mixed_actions:
                 check_actions([*known[:1], meta])
         except ConfigError as error:
             return str(error)

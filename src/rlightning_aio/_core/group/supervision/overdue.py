@@ -36,8 +36,8 @@ class Overdue:
         wait: what a call waits for that has no other time to keep.
     """
 
-    def __init__(self, group: Tables) -> None:
-        self._group = group
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
         self.due = math.inf
         self.wait = Patient()
         # Slots of entries without a limit, which were not named.
@@ -45,7 +45,7 @@ class Overdue:
 
     def begin(self, now: float) -> None:
         """Watch the envs, which have started."""
-        configs: Sequence[EnvConfig] = self._group.envs.configs
+        configs: Sequence[EnvConfig] = self._tables.envs.configs
         limited = [None not in (one.step_timeout, one.reset_timeout) for one in configs]
         self._watched = ~np.array(limited, np.bool_)
         self._look_at(now + OWED_SECONDS)
@@ -57,7 +57,7 @@ class Overdue:
 
     def look(self, now: float) -> None:
         """Log which entries have envs that owe a result for too long."""
-        requests, envs = self._group.requests, self._group.envs
+        requests, envs = self._tables.requests, self._tables.envs
         due = now + OWED_SECONDS
         owed: list[int] = requests.owed(np.flatnonzero(self._watched)).tolist()
         for slot in owed:
@@ -76,13 +76,13 @@ class Overdue:
 
     def _name(self, slot: int, seconds: float, setting: str) -> None:
         """Log that an env owes a result, and where it stands if its host can say so."""
-        group = self._group
+        tables = self._tables
         warn_where(
-            group.records[group.requests.hosts.item(slot)],
+            tables.records[tables.requests.hosts.item(slot)],
             slot,
-            f"{group.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
+            f"{tables.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
             f"what it does: set {setting} of its entry, in seconds, to have it replaced; ",
             "it stands in {}; ",
-            group.envs.env_ids[slot],
+            tables.envs.env_ids[slot],
             rest="group.get_workers() tells who owes what",
         )

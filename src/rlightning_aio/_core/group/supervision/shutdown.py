@@ -34,15 +34,15 @@ _END_SECONDS: Final = 1.5
 class Shutdown:
     """See the module."""
 
-    def __init__(self, group: Tables) -> None:
-        self._group = group
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
 
     def close(self, now: float) -> Procedure[None]:
         """Close all envs, and kill workers that take too long. Idempotent."""
-        if self._group.lifetime.closed:
+        if self._tables.lifetime.closed:
             return
-        self._group.lifetime.end()
-        alive = [r for r in self._group.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
+        self._tables.lifetime.end()
+        alive = [r for r in self._tables.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         for record in alive:
             record.held, record.restart_at = [], None
             if record.stage in (Stage.GIVEN_UP, Stage.DOWN):
@@ -52,7 +52,7 @@ class Shutdown:
         try:
             yield from self._until_closed(alive, now)
         finally:
-            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._group.records)
+            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._tables.records)
             self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
 
     def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
@@ -77,28 +77,28 @@ class Shutdown:
             now = yield Wait(until)
 
     def _let_go(self, seconds: float) -> None:
-        for record in self._group.records:
+        for record in self._tables.records:
             record.host.release()
-        for shared in self._group.resources.values():
+        for shared in self._tables.resources.values():
             shared.release(seconds)
-        self._group.layout.release()
-        self._group.arena.close()
+        self._tables.layout.release()
+        self._tables.arena.close()
 
     def disown(self) -> None:
         """Release this process's copies after a fork, without affecting the parent's group."""
-        self._group.lifetime.end()
-        for record in self._group.records:
+        self._tables.lifetime.end()
+        for record in self._tables.records:
             if record.killable is not None:
                 record.host.release()
-        for shared in self._group.resources.values():
+        for shared in self._tables.resources.values():
             shared.disown()
 
     def abandon(self) -> None:
         """Release everything immediately: the group was garbage-collected without a close."""
-        if self._group.lifetime.closed:
+        if self._tables.lifetime.closed:
             return
-        self._group.lifetime.end()
-        started = any(r.stage is not Stage.NEW for r in self._group.records)
+        self._tables.lifetime.end()
+        started = any(r.stage is not Stage.NEW for r in self._tables.records)
         self._let_go(_END_SECONDS)
         if started:
             # The garbage collector calls this, so no caller's line would help.

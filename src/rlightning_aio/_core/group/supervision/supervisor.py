@@ -93,27 +93,27 @@ class Supervisor:
         look_by: time by which a trainer that never waits must call `check`.
     """
 
-    def __init__(self, group: Tables) -> None:
+    def __init__(self, tables: Tables) -> None:
         self.hosts: list[Host] = []
-        self.records = group.records
+        self.records = tables.records
         self.any_deaths = False
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.look_by = 0.0
-        self._group = group
-        self._envs = group.envs
-        self._requests = group.requests
-        self._continuity = group.continuity
-        self._lifetime = group.lifetime
-        self._clock = group.clock
-        self.members = Members(group)
-        self.detector = HangDetector(group)
-        self.shutdown = Shutdown(group)
-        self.workers = Workers(group)
-        self.hints = Hints(self.records)
-        self.overdue = Overdue(group)
+        self._tables = tables
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._continuity = tables.continuity
+        self._lifetime = tables.lifetime
+        self._clock = tables.clock
+        self.members = Members(tables)
+        self.detector = HangDetector(tables)
+        self.shutdown = Shutdown(tables)
+        self.workers = Workers(tables)
+        self.hints = Hints(tables)
+        self.overdue = Overdue(tables)
         self.crash_log = CrashLog()
-        self.env_errors = EnvErrors(group, self.crash_log, self._update_any_deaths)
+        self.env_errors = EnvErrors(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False
@@ -210,10 +210,10 @@ class Supervisor:
         """Give each env a row in the slab of its layout."""
         started = [env for record in self.records for env in record.started]
         self.metas = [env.meta for env in started]
-        if not self._group.mixed_actions:
+        if not self._tables.mixed_actions:
             check_actions(self.metas)
-        layout = self._group.layout
-        layout.lay_out(started, self._group.arena)
+        layout = self._tables.layout
+        layout.lay_out(started, self._tables.arena)
         self._envs.note_started(started)
         for record in self.records:
             count = len(record.started)
@@ -420,7 +420,7 @@ class Supervisor:
         record.refusals += 1
         pause = restart_pause(record.refusals + 1)
         if now + pause > record.refused_since + _SHORTAGE_SECONDS:
-            self._group.completions.append(
+            self._tables.completions.append(
                 Died(record.host.host_id, Death(f"could not be replaced: {refusal}"))
             )
             return
@@ -465,7 +465,7 @@ class Supervisor:
         self.records[host_id].lost_slots.add(slot)
 
     def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
-        observer = self._group.observed.observer
+        observer = self._tables.observed.observer
         if observer is not None:
             observer.note_fate(fate, host_id, slot, cause)
 
@@ -484,7 +484,7 @@ class Supervisor:
 
     def _note_deaths(self, any_deaths: bool) -> None:
         self.any_deaths = any_deaths
-        self._group.conditions.note(DEATH, any_deaths or self._any_given_up)
+        self._tables.conditions.note(DEATH, any_deaths or self._any_given_up)
 
 
 def _refusal(record: HostRecord, why: OSError | str) -> str:

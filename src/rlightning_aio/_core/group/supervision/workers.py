@@ -30,19 +30,19 @@ _STATES: Final = {
 class Workers:
     """See the module."""
 
-    def __init__(self, group: Tables) -> None:
-        self._group = group
-        self._envs = group.envs
+    def __init__(self, tables: Tables) -> None:
+        self._tables = tables
+        self._envs = tables.envs
 
     def describe(self, now_ns: int) -> list[dict[str, Any]]:
         """Describe each host and its outstanding requests, as `EnvGroup.get_workers`.
 
         `now_ns` is from the monotonic clock.
         """
-        return [self._described(record, now_ns) for record in self._group.records]
+        return [self._described(record, now_ns) for record in self._tables.records]
 
     def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
-        env_ids, requests = self._envs.env_ids, self._group.requests
+        env_ids, requests = self._envs.env_ids, self._tables.requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
         lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.lost_slots)
@@ -62,11 +62,11 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        starting = [r for r in self._group.records if r.is_starting]
+        starting = [r for r in self._tables.records if r.is_starting]
         if starting:
             names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
             return f"not started yet: {_listed(names)}"
-        env_ids, requests = self._envs.env_ids, self._group.requests
+        env_ids, requests = self._envs.env_ids, self._tables.requests
         busy: list[int] = requests.owed(np.arange(len(self._envs))).tolist()
         names = [
             f"{env_ids[k]} (for {(now_ns - requests.sent_ns.item(k)) / 1e9:.1f} s)" for k in busy
@@ -76,7 +76,7 @@ class Workers:
     def summary(self) -> str:
         """Summarise entries, envs, placement and worker processes in one line."""
         entries: dict[str, list[HostRecord]] = {}
-        for record in self._group.records:
+        for record in self._tables.records:
             entries.setdefault(record.config.name, []).append(record)
         return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
 
