@@ -1,9 +1,10 @@
-"""A client that is interrupted while it dials."""
+"""A client that dials: what it takes meanwhile, and what interrupts it."""
 
 from __future__ import annotations
 
 import os
 import signal
+import time
 from typing import TYPE_CHECKING
 
 import pytest
@@ -52,3 +53,12 @@ def test_a_signal_while_a_socket_is_made_comes_after_that(monkeypatch: pytest.Mo
     with pytest.raises(KeyboardInterrupt), client:
         client.run()
     assert env.closed
+
+
+def test_between_two_attempts_a_client_takes_no_time_of_a_core() -> None:
+    """It sleeps. A server that is away may stay away for hours."""
+    with RemoteEnvClient(CountingEnv(), "127.0.0.1", 1) as client:
+        began = time.thread_time()
+        with pytest.raises(TimeoutError):
+            client.connect(timeout=1.0)
+        assert time.thread_time() - began < 0.5

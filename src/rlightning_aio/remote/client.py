@@ -262,6 +262,9 @@ class RemoteEnvClient:
         times = [until, self._due if self._session.phase is Phase.AWAY else None]
         due = min([moment for moment in times if moment is not None], default=None)
         wait_ms = None if due is None else ceil(1000 * max(0.0, due - time.monotonic()))
+        if self._dealer is None and wait_ms:
+            time.sleep(wait_ms / 1000)  # A poller without sockets doesn't wait.
+            return
         for source, _ in self._poller.poll(wait_ms):
             dealer = self._dealer
             if dealer is None:
