@@ -1,7 +1,8 @@
 """Collecting for training: the layer between a group and a learner.
 
 `Collector` steps a group with a policy and returns `Rollout`s: transitions as columns, ordered by
-env, with the observations needed to bootstrap at each end, and advantages over them.
+env, with the observations needed to bootstrap at each end, and advantages over them. `collector`
+calls the policy, `kind` and `staging` fill the columns, `record` writes and follows an order.
 Rule: it uses only the public `EnvGroup` and NumPy; torch shares the arrays.
 """
 

@@ -2,7 +2,7 @@
 
 Rule: it uses only the public `EnvGroup`. The set of episodes is fixed before the first step,
 because taking the episodes that end first would favour short ones. It plays the queue of `attempts`
-with a policy for all envs at once.
+with a policy for all envs at once; `playing` calls it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Many envs used as one: `group` from the public classes down to its tables.
 
 Imports run down: `api` (the two public groups), `setup` (what is started), `timeline`, `engine`
-(send, wait, apply, hand out), `supervision` (deaths, hangs, restarts), `tables` (what all parts
-share), `episodes` (step limits, losses, snapshots), `state`, `drivers` (how a procedure waits).
+(send, wait, apply, hand out; snapshots are taken and restored there), `supervision` (deaths, hangs,
+restarts), `tables` (what all parts share), `episodes` (step limits, losses, seeds, the format of
+snapshots), `state`, `drivers` (how a procedure waits).
 Decisions get the time as an argument, or from `Tables.clock`; only drivers, `api` and what measures
 (`stats`, `hint`, `timeline`) read a clock, and none knows where an env runs.
 """
