@@ -116,13 +116,16 @@ def _repeats(item: pytest.Item) -> bool:
 
     A synchronous group doesn't depend on the running loop. If the driver doesn't matter
     (`one_driver_for_each_place`), inline envs are in a synchronous group, and workers in one on
-    uvloop.
+    uvloop. Only awaitable envs in this process are on both loops then.
     """
     params = item.callspec.params if hasattr(item, "callspec") else {}
     place = params.get("place")
     on_uvloop = any(value is uvloop.new_event_loop for value in params.values())
-    if hasattr(place, "inline") and item.get_closest_marker("one_driver_for_each_place"):
-        return place.synchronous != place.inline or on_uvloop == place.inline
+    if item.get_closest_marker("one_driver_for_each_place"):
+        if hasattr(place, "inline"):
+            return place.synchronous != place.inline or on_uvloop == place.inline
+        on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
+        return on_asyncio and place not in (None, "loop", "openenv")
     synchronous = any(getattr(value, "synchronous", False) for value in params.values())
     return synchronous and on_uvloop
 

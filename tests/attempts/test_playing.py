@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts import AttemptEpisode, AttemptGroup
 
 
+pytestmark = pytest.mark.one_driver_for_each_place
+
+
 def tasks(count: int, **options: Any) -> list[EpisodeSpec]:
     return [EpisodeSpec("", seed, options or None) for seed in range(count)]
 
@@ -103,7 +106,7 @@ async def test_a_failed_attempt_is_tried_again(
 
     limit: dict[str, Any] = {"on_env_error": on_env_error}
     if deed == "hang":
-        limit = {"step_timeout": 2.0}
+        limit = {"step_timeout": 1.0}
     async with rooms(place, **limit) as group:
         found = await played(group, tasks(3), agent, size=2)
     assert len(found) == 3

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rlightning_aio.collecting import Rollout
 
 pytestmark = pytest.mark.usefixtures("python_raises")
-STRIDE = int(os.environ.get("RLIGHTNING_AIO_STRIDE", "53"))
+STRIDE = int(os.environ.get("RLIGHTNING_AIO_STRIDE", "97"))
 """Every so many lines, Ctrl-C is pressed; 1 takes minutes."""
 NUM_LINES = 9000
 """More lines than a collect executes."""

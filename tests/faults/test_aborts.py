@@ -120,17 +120,17 @@ def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_p
     group, tokens = start(entry(3, env_kwargs=kwargs, max_restarts=5)), Tokens()
     ids = group.group.env_ids
     switch.touch()
-    pid = group.group._core.supervisor.hosts[0].pid
+    pid = group.get_workers()[0]["pid"]
     os.kill(pid, signal.SIGSTOP)  # It answers nothing before it is killed.
     group.step_async(tokens.steps(ids))
     kill(pid)
-    while group.group._core.supervisor.hosts[0].pid in (None, pid):
+    while group.get_workers()[0]["pid"] in (None, pid):
         with pytest.raises(TimeoutError):
             group.collect_async(deadline=0.01)
     group.abort(ids[:1])
     assert group.group.pending == ids[1:]
     switch.unlink()
-    kill(group.group._core.supervisor.hosts[0].pid)
+    kill(group.get_workers()[0]["pid"])
     batch, _ = group.collect_async(wait_all=True)
     assert sorted(batch.ids()) == ids[1:]
     assert all(marked(ret) for ret in batch.values())

@@ -13,6 +13,7 @@ import rlightning_aio as rl
 if TYPE_CHECKING:
     from pathlib import Path
 
+pytestmark = pytest.mark.one_driver_for_each_place
 AWAITABLE, PLAIN = "slow to close, awaitable", "slow to close"
 PLACES = {
     "loop": {"backend": AWAITABLE, "placement": "loop"},

@@ -247,6 +247,7 @@ def test_worker_that_hangs_or_stops_behind_megabytes_is_found(start: Start, stop
     tokens.check(group.step(tokens.steps(["faulty-1", "faulty-2"]))[0])
 
 
+@on_one_driver
 def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
     """`init` reports the limit and the position in the constructor."""
     kwargs = {"faults": {"building": "deadlock"}, "only": 3}

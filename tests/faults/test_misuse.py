@@ -212,7 +212,7 @@ async def test_second_collect_is_refused_and_the_first_continues() -> None:
     async with rlightning_aio.build_env_group(two_workers()) as group:
         await group.reset()
         # Stopped workers keep the first collect waiting.
-        pids = [host.pid for host in group._core.supervisor.hosts]
+        pids = [worker["pid"] for worker in group.get_workers()]
         for pid in pids:
             stop(pid)
         try:

@@ -121,7 +121,7 @@ def test_the_envs_of_a_worker_that_dies_in_a_restore_resume_what_was_not_restore
         assert counts(batch) == [2, 2, 4, 4]
         assert batch.restarted.tolist() == [True, True, False, False]
         assert [info["worker_resumed"] for info in batch.info()[:2]] == [1, 1]
-        kill(group.group._core.supervisor.hosts[1].pid)
+        kill(group.get_workers()[1]["pid"])
         batch, _ = group.step(batch.respond(action=[0] * 4))
         assert counts(batch) == [3, 3, 3, 3]
         assert [info["worker_resumed"] for info in batch.info()[2:]] == [1, 1]

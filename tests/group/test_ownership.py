@@ -139,7 +139,7 @@ def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
     """While a thread waits in it, every call of another is refused; the first continues."""
     with sync.build_env_group(PROBE) as group:
         batch, _ = group.reset()
-        worker = group._core.supervisor.hosts[0].pid
+        worker = group.get_workers()[0]["pid"]
         stop(worker)
         group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
         found: list[Any] = []

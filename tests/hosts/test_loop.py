@@ -53,6 +53,7 @@ from rlightning_aio.spaces import Anything
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+pytestmark = pytest.mark.one_driver_for_each_place
 EAGER: Any = getattr(asyncio, "eager_task_factory", None)
 SOON = 0.3
 """A limit that is meant to pass. What answers beside it needs a few turns of the loop, which even a
@@ -485,8 +486,7 @@ async def test_a_reset_that_takes_too_long_is_repeated_by_a_new_env(place: dict[
         assert batch.observation.tolist() == [[2, 1, 0, 7], [2, 1, 0, 8]]
 
 
-@pytest.mark.parametrize("max_restarts", [0, 1])
-@pytest.mark.parametrize("after", ["step", "reset"])
+@pytest.mark.parametrize(("max_restarts", "after"), [(0, "reset"), (1, "step")])
 async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
     place: dict[str, Any], max_restarts: int, after: str
 ) -> None:

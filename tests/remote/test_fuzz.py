@@ -13,8 +13,8 @@ from remote.fuzz import fuzz, fuzz_keys
 if TYPE_CHECKING:
     from pathlib import Path
 
-FRAMES = 2_000
-"""For each end and seed."""
+FRAMES = 1_000
+"""For each end."""
 
 
 def test_corrupted_key_files_keep_no_client_out(tmp_path: Path) -> None:
@@ -28,7 +28,7 @@ def test_unauthenticated_peers_leave_nothing_behind(curve: bool) -> None:
 
     With keys, none of their messages is read.
     """
-    with disturbed(curve=curve, messages=2_000 if curve else 8_000) as (group, listener, peers):
+    with disturbed(curve=curve, messages=1_000 if curve else 5_000) as (group, listener, peers):
         batch, _ = group.reset()
         steps = 0
         while peers.poll() is None or listener.connections.num_unauthenticated:
@@ -36,15 +36,14 @@ def test_unauthenticated_peers_leave_nothing_behind(curve: bool) -> None:
             batch, _ = group.collect_async(deadline=HANG)
             steps += 1
         assert steps
-        assert (listener._sessions.num_malformed > 10) != curve
+        assert (listener._sessions.num_malformed > 5) != curve
         assert group["robots-0"].clients == ["robots-0/c0"]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_corrupted_messages_do_no_harm(seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_corrupted_messages_do_no_harm(caplog: pytest.LogCaptureFixture) -> None:
     """Every request between them is answered."""
     caplog.set_level(logging.ERROR, "rlightning_aio.remote")  # Which pytest keeps.
-    findings = fuzz(FRAMES, seed)
+    findings = fuzz(FRAMES, 0)
     assert findings.steps >= FRAMES // 25
     assert findings.malformed > FRAMES // 2
     assert findings.grown < 200_000

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 # A process that is killed as it begins to run a coroutine never awaits it.
 pytestmark = pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
 
-CHUNKS, SEEDS = 20, 15
+CHUNKS, SEEDS = 5, 15
 ROOT = Path(__file__).parents[2]
 TRACES = """
 import sys

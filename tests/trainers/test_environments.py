@@ -128,7 +128,7 @@ def test_tools_rewards_and_attributes() -> None:
 @pytest.mark.parametrize(("tool", "kind"), [("hang", "env_hung"), ("die", "env_died")])
 def test_a_failure_has_no_reward(tool: str, kind: str) -> None:
     """And no tools; the next rollout has an env again."""
-    with Environments(Counter, num_envs=1, step_timeout=10) as environments:
+    with Environments(Counter, num_envs=1, step_timeout=2.0) as environments:
         one = environments()
         one.reset(row=1)
         one.add(5)

@@ -36,7 +36,7 @@ def made(**arguments: Any) -> VectorEnv:
 
 def killed(group: Any, send: Callable[[], None]) -> None:
     """Kill the first worker before it executes what `send` sends."""
-    pid = group._core.supervisor.hosts[0].pid
+    pid = group.get_workers()[0]["pid"]
     stop(pid)
     send()
     kill(pid)
