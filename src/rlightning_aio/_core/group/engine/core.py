@@ -207,8 +207,8 @@ class Core:
         """Restore envs, and return their last results as first observations."""
         with self.observed.call("restore", now):
             slots, positions, now = yield from self._snapshots.restore(now, data, env_ids)
-            self.continuity.note_shows(slots.tolist(), positions)
-            return self.steps.settled(*(yield from self._resets.show_restored(now, slots)))
+            replied = yield from self._resets.show_restored(now, slots, positions)
+            return self.steps.settled(*replied)
 
     def pending(self, *, unasked: bool = True) -> list[str]:
         """Return the ids of envs whose result, value or error was not returned yet.

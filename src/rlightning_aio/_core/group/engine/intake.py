@@ -249,6 +249,8 @@ class Intake:
             self._fail(owed, loss.error)
             return
         self._keep_ready(loss.slots)
+        unanswered = set(requests.numbering.entry[loss.owed].tolist())
+        continuity.drop_unfinished(loss.slots, unanswered)
         if loss.resets:
             continuity.lose(lost, loss.why, from_checkpoint=True)
         # A replacement answers steps and resets, but not calls.

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.episodes.continuity import Position
     from rlightning_aio._core.group.episodes.seeds import Seeds
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
@@ -107,9 +108,10 @@ class Resets:
         self._send(slots, seeds, options, packed, COLLECTOR, now)
 
     def show_restored(
-        self, now: float, slots: NDArray[np.intp]
+        self, now: float, slots: NDArray[np.intp], positions: Sequence[Position]
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
-        """Have restored envs show their states, and wait for all of them."""
+        """Have restored envs show their states at `positions`, and wait for all of them."""
+        self._continuity.note_shows(slots.tolist(), positions)
         seeds = np.full(len(slots), AS_RESTORED)
 
         def send(ticket: Ticket) -> None:

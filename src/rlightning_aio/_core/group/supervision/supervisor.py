@@ -347,7 +347,7 @@ class Supervisor:
 
         Returns None where it means nothing for requests: while the group starts or closes, and if
         the worker was a replacement that never came up. Requests wait for the next one then, which
-        is started here. Checkpoints that can't be used any more are dropped.
+        is started here.
         """
         record, death = self.records[exited.host_id], exited.death
         record.dying, record.die_by, record.abort_by = False, None, None
@@ -362,8 +362,6 @@ class Supervisor:
         if record.stage is not Stage.DOWN:
             record.refusals, record.refused_since = 0, None  # It had started.
         owed = self._requests.owed(np.array(record.slots, np.intp))
-        unanswered = self._requests.numbering.entry[owed].tolist()
-        self._continuity.drop_unfinished(record.slots, set(unanswered))
         was_up = record.stage is Stage.UP
         loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None

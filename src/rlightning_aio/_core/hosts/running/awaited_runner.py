@@ -15,6 +15,7 @@ from rlightning_aio.protocol.entries import answers_with_value
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import EnvState
+    from rlightning_aio._core.hosts.running.env_steps import Execute
 
 __all__ = ["Abandoned", "AwaitedRunner"]
 
@@ -36,8 +37,9 @@ class AwaitedRunner(EnvRunner):
     is_abandoned = False
     reset_with: tuple[Any, Any] = (None, None)
 
-    def _bind(self) -> None:
+    def _stepper(self) -> Execute:
         """Prepare nothing: `answer` executes everything."""
+        return self._not_attached
 
     def use_rows_of(self, other: AwaitedRunner) -> None:
         """Take over the row of `other`, which this env replaces, its episode and its films."""

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from rlightning_aio._core.hosts.messages import OutOfBand
 
@@ -45,12 +45,13 @@ def step_in_halves(
     return begin
 
 
-def followed(execute: Execute, then: Callable[[], None]) -> Execute:
-    """Return a function that calls `execute`, then `then`."""
+def followed(execute: Execute, followers: Sequence[Callable[[], None]]) -> Execute:
+    """Return a function that calls `execute`, then each of `followers`."""
 
-    def execute_both() -> OutOfBand | None:
+    def execute_all() -> OutOfBand | None:
         outcome = execute()
-        then()
+        for then in followers:
+            then()
         return outcome
 
-    return execute_both
+    return execute_all

@@ -206,17 +206,14 @@ class EnvRunner:
         self._bind()
 
     def _bind(self) -> None:
-        """Choose the functions that step the env with the action in its row."""
-        self.begin_step = None
-        step = self._stepper()
-        followers = [] if self._saver is None else [self._saver.after_step]
+        """Choose the functions that step the env with the action in its row, and what follows."""
+        self._followers = [] if self._saver is None else [self._saver.after_step]
         if self._camera is not None:
-            followers.append(self._camera.see)
-        for then in followers:
-            step = followed(step, then)
-            # A step in halves would bypass them.
-            self.begin_step = None
-        self.step = step
+            self._followers.append(self._camera.see)
+        self.begin_step = None
+        self.step = self._stepper()
+        if self._followers:  # A step in halves would bypass them.
+            self.step, self.begin_step = followed(self.step, self._followers), None
 
     def execute(self, op: int, arguments: Any) -> Any:
         """Execute a request.
@@ -390,12 +387,7 @@ class EnvRunner:
         return self._write(method, returned, busy_ns)
 
     def _finish_step(self, returned: Any, busy_ns: int) -> OutOfBand | None:
-        out_of_band = self._store_step(returned, busy_ns)
-        if self._saver is not None:
-            self._saver.after_step()
-        if self._camera is not None:
-            self._camera.see()
-        return out_of_band
+        return followed(partial(self._store_step, returned, busy_ns), self._followers)()
 
     # -- resets -------------------------------------------------------------------
 
