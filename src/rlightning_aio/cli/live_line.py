@@ -75,6 +75,13 @@ class LiveLine:
         """Print a line that stays."""
         self._console.print(words, soft_wrap=True, markup=False)
 
+    def announce(self, words: str) -> None:
+        """Print a line that stays, or draw the live line anew, whose parts say the same."""
+        if self.is_live:
+            self.show()
+        else:
+            self.say(words)
+
     def due(self) -> bool:
         """Return True if the line is old enough to be drawn again."""
         return time.monotonic() >= self._next_at

@@ -288,10 +288,7 @@ class Watch:
     def say(self, words: str) -> None:
         """Show the present activity."""
         self._words, self._began = words, time.monotonic()
-        if self._line.is_live:
-            self._line.show()
-        else:
-            self._line.say(words)
+        self._line.announce(words)
 
     def measured(self, contender: Contender) -> None:
         """Count a finished measurement."""

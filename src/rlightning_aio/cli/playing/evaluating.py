@@ -362,7 +362,7 @@ class _Watch:
 
     def __enter__(self) -> Self:
         self.line.__enter__()
-        self.line.say(self._doing)
+        self.line.announce(self._doing)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -378,8 +378,8 @@ class _Watch:
         )
         self._begun, self._before = time.monotonic(), len(self.found.attempts)
         before = f", {count(self._before)} of them played before" if self._before else ""
-        self.line.say(f"playing {counted(self._total, 'episode')}{before}")
         self._doing = ""
+        self.line.announce(f"playing {counted(self._total, 'episode')}{before}")
 
     def note(self, attempt: Attempt) -> None:
         """Count an episode."""

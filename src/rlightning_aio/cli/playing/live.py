@@ -69,8 +69,8 @@ class Display:
 
     def __enter__(self) -> Self:
         self._lines.enter_context(self.line)
+        self.line.announce(self._doing)
         if not self.line.is_live:
-            self.line.say(self._doing)
             self._lines.enter_context(connections_logged())
         return self
 
@@ -84,10 +84,9 @@ class Display:
     def ready(self) -> None:
         """Show that the first reset is complete."""
         self._doing = ""
-        if not self.line.is_live:
-            words = [] if self._steps is None else [counted(self._steps, "step")]
-            words += [] if self._seconds is None else [f"for {self._seconds:g} s"]
-            self.line.say(f"collecting {' '.join(words)}")
+        words = [] if self._steps is None else [counted(self._steps, "step")]
+        words += [] if self._seconds is None else [f"for {self._seconds:g} s"]
+        self.line.announce(f"collecting {' '.join(words)}")
 
     def _share_done(self, now: float) -> float | None:
         if self._doing:
