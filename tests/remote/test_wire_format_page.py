@@ -39,14 +39,6 @@ def written(message: Any, space: gym.Space[Any] | None = None, value: Any = None
 
 
 EXAMPLES = [
-    written(
-        ClientHello(
-            version=wire.VERSION,
-            name="arm",
-            observation_space=describe(OBSERVATIONS, "observation"),
-            action_space=describe(ACTIONS, "action"),
-        )
-    ),
     written(Step(number=1), ACTIONS, 1),
     written(
         ClientResult(
@@ -116,6 +108,15 @@ def test_the_limits_are_those_of_the_code() -> None:
     assert f"| frame | {wire.MAX_FRAME_BYTES >> 20} MiB |" in PAGE
     assert f"| parts of a message | {wire.MAX_PARTS:,} |" in PAGE
     assert f"`extras` or `options` | {wire.MAX_NESTING} |" in PAGE
+
+
+def test_the_hello_is_read() -> None:
+    """It is that of the client whose messages follow, with the defaults left out."""
+    (text,) = re.findall(r"^```js\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    hello = msgspec.convert(json.loads(text), ClientHello)
+    assert hello.version == wire.VERSION
+    spaces = (hello.observation_space, hello.action_space)
+    assert tuple(map(space_from, spaces)) == (OBSERVATIONS, ACTIONS)
 
 
 def test_the_described_space_is_one() -> None:
