@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import uvloop
 from attempts.room import AwaitedRoom, Room
-from group.conftest import ON_ACTORS
+from kit.driven import ON_ACTORS
 
 import rlightning_aio as rl
 from rlightning_aio.plugins.openenv.server import OpenEnvServer

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from attempts.room import CountedRoom
 from attempts.rooms import PLACES, openenv, rooms, serving
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play

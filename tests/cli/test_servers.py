@@ -6,8 +6,8 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from cli.command import CARTPOLE, start, write_config
+from kit.counting import ClientThread
 from patience import HANG
-from remote.counting import ClientThread
 
 if TYPE_CHECKING:
     import subprocess

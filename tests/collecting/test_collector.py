@@ -10,12 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from collecting.scripted import Script, Tickets, scripted_group
-from faults.driven import entry
-from faults.faulty import CODES
 from group import sample_envs
 from gymnasium.vector import AutoresetMode
+from kit.counting import ClientThread, CountingEnv
+from kit.faulty import CODES
+from kit.tokens import entry
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio import sync

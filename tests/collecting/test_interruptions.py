@@ -20,10 +20,10 @@ import numpy as np
 import pytest
 from combinations.features import copied, stored
 from combinations.played import Uneven, act, played
-from faults.driven import kill
-from group.conftest import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
+from kit.counting import ClientThread, CountingEnv
+from kit.driven import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
+from kit.processes import kill
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector

@@ -20,8 +20,8 @@ pytest.importorskip("serial")
 
 from envs.closing_table import closing_table, steps
 from envs.watched_arm import WatchedArm
+from kit.counting import ClientThread
 from patience import HANG
-from remote.counting import ClientThread
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
 from rlightning_aio.errors import BadAction, EnvRaised

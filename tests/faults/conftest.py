@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import uvloop
-from faults.driven import Driven
+from kit.driven import Driven
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

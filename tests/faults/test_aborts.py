@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, Tokens, entry, kill, marked, pid_of, two_workers
-from faults.drivers import kinds_on_both_drivers, on_one_driver
 from faults.test_resume import ENTRY as RESUMING
 from faults.test_resume import Walk
+from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
+from kit.processes import kill, pid_of
+from kit.tokens import Tokens, entry, marked, two_workers
 from patience import HANG
 
 import rlightning_aio as rl

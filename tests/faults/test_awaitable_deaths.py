@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, kill
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.processes import kill
 
 import rlightning_aio as rl
 

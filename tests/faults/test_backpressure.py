@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from faults.driven import Driven, Tokens, kill, marked, pid_of, stop, two_workers
 from faults.test_shutdown import read_until, trainer
-from patience import HANG
+from kit.processes import kill, pid_of, stop, wait_for_reply
+from kit.tokens import Tokens, marked, two_workers
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from kit.driven import Driven
 
     Start: TypeAlias = Callable[..., Driven]
 
@@ -92,9 +93,8 @@ def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -
     for env_id in group.group.env_ids:
         group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(MEGABYTES, np.uint8)})
     group.step_async(tokens.steps(group.group.env_ids))
-    for host in group.group._core.supervisor.hosts:
-        # The first reply of each worker has begun to fill its channel, which is not read yet.
-        assert select.select([host._link.fileno()], [], [], HANG)[0]
+    for worker in range(2):
+        wait_for_reply(group.group, worker)
     batch, _ = group.collect_async(wait_all=True)
     assert len(batch) == 4
     for ret in batch.values():

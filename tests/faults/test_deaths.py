@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
-from faults.drivers import kinds_on_both_drivers, on_one_driver
+from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
+from kit.processes import fork_server_pid, kill, pid_of
+from kit.tokens import Tokens, entry, marked, two_workers
 
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
@@ -403,9 +404,9 @@ def test_a_replaced_env_reports_the_death_until_a_reset_succeeds(
 def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:
     """All of its workers die; every env replies once, and continues."""
     group, tokens = start(two_workers()), Tokens()
-    server = fork_server_of(group.group)
+    server = fork_server_pid(group.group)
     group.step_async(tokens.steps(["faulty-1"]))
-    kill(server._server.process.pid)
+    kill(server)
     batch, _ = group.collect_async()
     assert batch.ids() == ["faulty-1"]
     if not marked(batch["faulty-1"]):  # This env had stepped before the kill.
@@ -423,11 +424,7 @@ def test_one_restart_outlasts_a_shortage_of_descriptors(
 ) -> None:
     """Attempts become rarer; the other envs step meanwhile."""
     group, tokens = start(two_workers(max_restarts=1)), Tokens()
-    pid = (
-        fork_server_of(group.group)._server.process.pid
-        if whose == "the fork server's"
-        else os.getpid()
-    )
+    pid = fork_server_pid(group.group) if whose == "the fork server's" else os.getpid()
     kept = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     listed = list(Path(f"/proc/{pid}/fd").iterdir())
     held = {int(path.name) for path in listed if path.is_symlink()}  # Not that of the listing.
@@ -502,7 +499,7 @@ def test_handling_a_death_imports_no_module() -> None:
     """An import needs descriptors, and at a death there may be none left."""
     script = """
 import sys
-from faults.driven import Tokens, two_workers
+from kit.tokens import Tokens, two_workers
 import rlightning_aio.sync
 with rlightning_aio.sync.build_env_group(two_workers()) as group:
     tokens = Tokens()

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, Tokens, entry, two_workers
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.tokens import Tokens, entry, two_workers
 from patience import HANG
 
 from rlightning_aio.errors import EnvRaised, RemoteTraceback, StartFailed
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 # Errors, and how they are reported: type and text.
 RAISED = {
     "raise": ("ValueError", "as asked for"),
-    "odd constructor": ("faults.faulty.OddConstructor", "code 7 in step"),
-    "unpicklable": ("faults.faulty.Unpicklable", "it holds a lock"),
-    "unprintable": ("faults.faulty.Unprintable", "<its __str__ raised RuntimeError>"),
-    "unspeakable": ("faults.faulty.Unspeakable", "<its __str__ raised SystemExit>"),
-    "oddly spoken": ("faults.faulty.OddlySpoken", "odd words"),
-    "wordless": ("faults.faulty.Wordless", "<its __str__ raised TypeError>"),
-    "oddly pickled": ("faults.faulty.OddlyPickled", "as it is"),
-    "untraceable": ("faults.faulty.Untraceable", "from nowhere"),
-    "not an exception": ("faults.faulty.NotAnException", "but raised"),
+    "odd constructor": ("kit.faulty.OddConstructor", "code 7 in step"),
+    "unpicklable": ("kit.faulty.Unpicklable", "it holds a lock"),
+    "unprintable": ("kit.faulty.Unprintable", "<its __str__ raised RuntimeError>"),
+    "unspeakable": ("kit.faulty.Unspeakable", "<its __str__ raised SystemExit>"),
+    "oddly spoken": ("kit.faulty.OddlySpoken", "odd words"),
+    "wordless": ("kit.faulty.Wordless", "<its __str__ raised TypeError>"),
+    "oddly pickled": ("kit.faulty.OddlyPickled", "as it is"),
+    "untraceable": ("kit.faulty.Untraceable", "from nowhere"),
+    "not an exception": ("kit.faulty.NotAnException", "but raised"),
     "system exit": ("SystemExit", "5"),
     "keyboard interrupt": ("KeyboardInterrupt", ""),
     "interrupt": ("KeyboardInterrupt", ""),

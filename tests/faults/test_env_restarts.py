@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, Tokens, entry, marked, two_workers
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.tokens import Tokens, entry, marked, two_workers
 
 from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.evaluation import evaluate
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 CAUSES = {
     "raise": "raised ValueError: as asked for",
-    "odd constructor": "raised faults.faulty.OddConstructor: code 7 in step",
+    "odd constructor": "raised kit.faulty.OddConstructor: code 7 in step",
     "system exit": "raised SystemExit: 5",
 }
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import select
 import signal
 import threading
 import time
@@ -12,17 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-from faults.driven import (
-    Driven,
-    Tokens,
-    entry,
-    fork_server_of,
-    marked,
-    pid_of,
-    stop,
-    two_workers,
-)
-from faults.drivers import kinds_on_both_drivers, on_one_driver
+from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
+from kit.processes import fork_server_pid, pid_of, stop, wait_for_reply
+from kit.tokens import Tokens, entry, marked, two_workers
 from patience import HANG
 
 import rlightning_aio
@@ -144,7 +135,7 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     monkeypatch.setattr(hang_detector, "_OBEY_SECONDS", LIMIT)
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     stop(pid_of(group, "faulty-0"))
-    stop(fork_server_of(group.group)._server.process.pid)
+    stop(fork_server_pid(group.group))
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
     assert batch["faulty-0"].info["worker_restarted"] == "hung in a step and was killed"
@@ -188,9 +179,8 @@ def test_a_trainer_that_reads_megabytes_late_takes_no_worker_for_hung(start: Sta
     for env_id in group.group.env_ids:
         group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
     group.step_async(tokens.steps(group.group.env_ids))
-    for host in group.group._core.supervisor.hosts:
-        # The worker's first reply has begun to fill its channel.
-        assert select.select([host._link.fileno()], [], [], HANG)[0]
+    for worker in range(2):
+        wait_for_reply(group.group, worker)
     threading.Event().wait(2 * LIMIT)  # The trainer has other things to do.
     for pid in pids:
         stop(pid)  # The worker needs a moment to continue.
@@ -213,7 +203,7 @@ async def test_an_unread_reply_while_the_loop_is_busy_is_no_hang() -> None:
         pid = int(batch["faulty-0"].observation[1])
         # Text doesn't fit in a row, so the reply comes through the channel.
         await group["faulty-0"].call("answer_with", info=lambda: {"word": "late"})
-        (host,) = group._core.supervisor.hosts
+        (host,) = group._core.supervisor.hosts  # No public name says that a worker is idle.
         while host.current_request()[0]:
             os.sched_yield()
         stop(pid)
@@ -221,7 +211,7 @@ async def test_an_unread_reply_while_the_loop_is_busy_is_no_hang() -> None:
         with pytest.raises(TimeoutError):
             await group.collect_async(deadline=0.05)
         os.kill(pid, signal.SIGCONT)
-        assert select.select([host._link.fileno()], [], [], HANG)[0]
+        wait_for_reply(group, 0)
         threading.Event().wait(2 * LIMIT)  # The loop has other things to do.
         batch, _ = await group.collect_async()
         assert batch["faulty-0"].info == {"word": "late"}
@@ -235,8 +225,7 @@ def test_worker_that_hangs_or_stops_behind_megabytes_is_found(start: Start, stop
     pid = pid_of(group, "faulty-0")
     group.call("faulty-0", "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
     group.step_async(tokens.steps(["faulty-0", "faulty-1"], {"faulty-1": "sleep"}))
-    host = group.group._core.supervisor.hosts[0]
-    assert select.select([host._link.fileno()], [], [], HANG)[0]
+    wait_for_reply(group.group, 0)
     if stopped:
         stop(pid)
     batch, _ = group.collect_async(wait_all=True)
@@ -263,7 +252,7 @@ def test_a_fork_server_that_hangs_in_an_import_fails_the_start(
 ) -> None:
     """It reads no messages while it imports, so it is killed; the error names the modules."""
     backend = registry.Backend(
-        "faulty", "faults.faulty:FaultyEnv", "faults", preload=("faults.hanging_import",)
+        "faulty", "kit.faulty:FaultyEnv", "faults", preload=("faults.hanging_import",)
     )
     monkeypatch.setitem(registry.BACKENDS, "faulty", backend)
     group = build(entry(start_timeout=LIMIT))

@@ -6,8 +6,9 @@ import signal
 from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, entry
 from faults.test_env_errors import RAISED, check_error
+from kit.driven import Driven
+from kit.tokens import Tokens, entry
 
 from rlightning_aio.errors import EnvRaised
 

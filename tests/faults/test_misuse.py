@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-from faults.driven import Driven, Tokens, entry, stop, two_workers
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.processes import stop
+from kit.tokens import Tokens, entry, two_workers
 
 import rlightning_aio
 from rlightning_aio import BatchedData, PolicyResponse

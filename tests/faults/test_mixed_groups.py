@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, entry, marked
+from kit.tokens import Tokens, entry, marked
 
 from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from kit.driven import Driven
 
     Start: TypeAlias = Callable[..., Driven]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.deeds import BLAME, CUT, DIE, END, GO, HANG, RAISE, Awaited, Deeds, Fails
+from kit.deeds import BLAME, CUT, DIE, END, GO, HANG, RAISE, Awaited, Deeds, Fails
 
 import rlightning_aio as rl
 from rlightning_aio.outcomes import TimeSpent
@@ -18,7 +18,7 @@ from rlightning_aio.outcomes import TimeSpent
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from faults.driven import Driven
+    from kit.driven import Driven
 
     Start: TypeAlias = Callable[..., Driven]
 

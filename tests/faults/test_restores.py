@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, kill
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.processes import kill
 
 from rlightning_aio.errors import WorkerDied
 

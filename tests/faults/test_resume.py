@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import Driven, kill
-from faults.drivers import on_one_driver
 from gymnasium.wrappers import NormalizeObservation
+from kit.driven import Driven, on_one_driver
+from kit.processes import kill
 
 from rlightning_aio.config import parse_configs
 from rlightning_aio.errors import ConfigError, EnvRaised

@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, fork_server_of, kill, pid_of, stop, two_workers
+from kit.driven import Driven
+from kit.processes import fork_server_pid, kill, pid_of, stop
+from kit.tokens import Tokens, two_workers
 from patience import HANG
 
 import rlightning_aio
@@ -46,7 +48,8 @@ def test_all_waits_in_the_library_take_less_than_two_seconds() -> None:
 
 SCRIPT = """
 import os, signal, sys, time
-from faults.driven import Tokens, entry, kill, pid_of, two_workers
+from kit.processes import kill, pid_of
+from kit.tokens import Tokens, entry, two_workers
 import rlightning_aio, rlightning_aio.sync
 def build(**fields):
     return rlightning_aio.sync.build_env_group(two_workers(**fields))
@@ -70,7 +73,7 @@ def descendants(pid: int) -> set[int]:
 
 def processes_of(group: rlightning_aio.EnvGroup) -> set[int]:
     """Return the group's workers and their fork server."""
-    server: int = fork_server_of(group)._server.process.pid
+    server: int = fork_server_pid(group)
     return {server} | descendants(server)
 
 
@@ -152,7 +155,7 @@ MOMENTS = {
     "importing": """
         from rlightning_aio import registry
         registry.BACKENDS["faulty"] = registry.Backend(
-            "faulty", "faults.faulty:FaultyEnv", "faults",
+            "faulty", "kit.faulty:FaultyEnv", "faults",
             preload=("faults.hanging_import",),
         )
         build().init()
@@ -468,9 +471,9 @@ def test_env_that_hangs_in_a_step_does_not_delay_close(start: Start) -> None:
 def test_stopped_fork_server_does_not_delay_close(start: Start) -> None:
     """It can't kill its workers, so it is killed itself, and the kernel kills them."""
     group = start(two_workers())
-    server = fork_server_of(group.group)
+    server = fork_server_pid(group.group)
     stop(pid_of(group, "faulty-0"))
-    stop(server._server.process.pid)
+    stop(server)
     with watched(processes_of(group.group)) as ended:
         group.close()
         ended()
@@ -550,13 +553,13 @@ def test_interrupted_wait_loses_nothing(waiting: str) -> None:
 def test_replaced_workers_leave_no_zombies(start: Start) -> None:
     """Dead workers are reaped, and their descriptors are closed."""
     group, tokens = start(two_workers(max_restarts=100)), Tokens()
-    server = fork_server_of(group.group)
+    server = fork_server_pid(group.group)
 
     def held() -> tuple[int, int, int]:
         return (
             len(processes_of(group.group)),
             len(list(Path("/proc/self/fd").iterdir())),
-            len(list(Path(f"/proc/{server._server.process.pid}/fd").iterdir())),
+            len(list(Path(f"/proc/{server}/fd").iterdir())),
         )
 
     before = held()

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, kill, pid_of, two_workers
-from faults.drivers import on_one_driver
+from kit.driven import Driven, on_one_driver
+from kit.processes import kill, pid_of
+from kit.tokens import Tokens, two_workers
 from timelines import Seen
 
 from rlightning_aio.errors import WorkerDied

@@ -128,7 +128,7 @@ def test_workers_find_their_share_in_their_environment(monkeypatch: pytest.Monke
         "name": "e",
         "backend": "faulty",
         "task": "-",
-        "imports": ["faults.faulty"],
+        "imports": ["kit.faulty"],
         "num_workers": 4,
         "envs_per_process": 2,
         "num_gpus": 1,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from group.conftest import INLINE, INLINE_SYNC, Place
+from kit.driven import INLINE, INLINE_SYNC, Place
 
 import rlightning_aio
 import rlightning_aio.sync

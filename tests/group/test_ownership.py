@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import uvloop
-from faults.driven import stop
+from kit.processes import stop
 from patience import HANG
 
 import rlightning_aio

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pytest
-from group.conftest import Place
 from group.sample_envs import Probe
 from hosts import beside_others, thread_host
 from hosts.beside_others import (
@@ -24,6 +23,7 @@ from hosts.beside_others import (
     steps,
 )
 from hosts.thread_host import EnvThread
+from kit.driven import Place
 
 import rlightning_aio.sync
 from rlightning_aio import ENVS, PolicyResponse

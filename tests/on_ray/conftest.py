@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import ray_cluster
 from group import sample_envs
-from group.conftest import Place
+from kit.driven import Place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import ray_cluster
-from faults.driven import Driven, Tokens, kill, marked, pid_of, two_workers
+from kit.driven import Driven
+from kit.processes import kill, pid_of
+from kit.tokens import Tokens, marked, two_workers
 from on_ray import cheetahs
 from patience import HANG
 
@@ -37,7 +39,7 @@ def start() -> Iterator[Start]:
         built.append(
             Driven(
                 "sync",
-                two_workers(placement="ray", num_cpus=0, imports=["faults.faulty"], **fields),
+                two_workers(placement="ray", num_cpus=0, imports=["kit.faulty"], **fields),
             )
         )
         built[-1].init()
@@ -132,9 +134,9 @@ def test_an_actor_that_can_tell_nothing_is_found_as_well(start: Start, hang: str
 
 TRAINER = """
 import os, signal, sys
-from faults.driven import Tokens, two_workers
+from kit.tokens import Tokens, two_workers
 import rlightning_aio.sync
-entry = two_workers(placement="ray", num_cpus=0, imports=["faults.faulty"])
+entry = two_workers(placement="ray", num_cpus=0, imports=["kit.faulty"])
 group = rlightning_aio.sync.build_env_group(entry)
 group.init(); group.reset()
 pids = [group[env_id].call("returns", os.getpid) for env_id in group.env_ids]

@@ -26,7 +26,7 @@ from rlightning_aio.errors import ConfigError, StartFailed
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from group.conftest import Place
+    from kit.driven import Place
 
 pytestmark = pytest.mark.ray
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import ray_cluster
-from faults.driven import Driven, kill
 from faults.test_resume import Episodes, Walk
 from group.test_snapshots import Fragile, Run, entry_of
+from kit.driven import Driven
+from kit.processes import kill
 
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvRaised
@@ -18,7 +19,7 @@ from rlightning_aio.errors import EnvRaised
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from group.conftest import Place
+    from kit.driven import Place
 
 pytestmark = pytest.mark.ray
 

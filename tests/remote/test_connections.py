@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 import zmq
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
 from rlightning_aio._core.hosts.env_server import (

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import zmq
-from remote.counting import CountingEnv
+from kit.counting import CountingEnv
 
 from rlightning_aio.remote import RemoteEnvClient
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 from remote.faulty_proxy import Faults, FaultyProxy
 
 from rlightning_aio import BatchedData, PolicyResponse, sync

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 from remote.random_spaces import any_space
 
 from rlightning_aio import sync

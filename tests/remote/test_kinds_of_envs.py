@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
+from kit.counting import ClientThread
 from patience import HANG
-from remote.counting import ClientThread
 from remote.random_spaces import same, sampled
 
 from rlightning_aio import (

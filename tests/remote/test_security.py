@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import zmq
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 from remote.random_spaces import mutation
 from zmq.utils.monitor import recv_monitor_message
 

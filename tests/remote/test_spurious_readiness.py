@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zmq
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
 from rlightning_aio._core.hosts.env_server import authenticator, connection_limiter, listener

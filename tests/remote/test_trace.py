@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from kit.counting import ClientThread, CountingEnv
 from patience import HANG
-from remote.counting import ClientThread, CountingEnv
 from timelines import Seen
 
 from rlightning_aio import sync

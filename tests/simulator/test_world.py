@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from remote.counting import CountingEnv as CountedSteps
+from kit.counting import CountingEnv as CountedSteps
 from simulator.world import Faults, World
 
 import rlightning_aio as rl

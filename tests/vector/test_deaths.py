@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.driven import kill, stop
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from kit.processes import kill, stop
 from vector.numbered import Walk, counted
 from vector.toys import Mortal, assert_alike
 

@@ -79,7 +79,7 @@ class OddlySpoken(Exception):
         return OddText("odd words")
 
 
-OddlySpoken.__module__ = OddText("faults.faulty")
+OddlySpoken.__module__ = OddText("kit.faulty")
 OddlySpoken.__qualname__ = OddText("OddlySpoken")
 
 
