@@ -1,15 +1,19 @@
-"""Inline envs share the trainer's process: their errors are reported, and so are interrupts."""
+"""Envs in the trainer's process: their errors are reported, and so are interrupts."""
 
 from __future__ import annotations
 
+import asyncio
 import signal
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from faults.test_env_errors import RAISED, check_error
 from kit.driven import Driven
 from kit.tokens import Tokens, entry
 
+import rlightning_aio as rl
 from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:
@@ -51,3 +55,40 @@ def test_interrupt_in_an_inline_step_comes_out_and_ends_its_request() -> None:
     group.reset()
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
     group.end()
+
+
+class Struck:
+    """Is interrupted in a step, or hangs there; the second one is interrupted in its reset."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    built: ClassVar[int] = 0
+
+    def __init__(self) -> None:
+        Struck.built += 1
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        del seed, options
+        if Struck.built > 1:
+            raise KeyboardInterrupt
+        return np.zeros(1), {}
+
+    async def step(self, action: Any) -> Any:
+        if not action:
+            raise KeyboardInterrupt
+        await asyncio.Event().wait()
+
+
+@pytest.mark.parametrize("hangs", [False, True], ids=["in a step", "in the reset after a hang"])
+def test_an_interrupt_on_the_trainers_event_loop_reaches_the_program(*, hangs: bool) -> None:
+    """It may be the user's Ctrl-C, whatever an awaitable env executes then."""
+    Struck.built = 0
+
+    async def use() -> None:
+        fields = {"name": "s", "task": Struck, "placement": "loop", "step_timeout": 0.1}
+        async with rl.build_env_group(fields) as group:
+            batch, _ = await group.reset()
+            await group.step(batch.respond(action=np.array([int(hangs)])))
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(use())

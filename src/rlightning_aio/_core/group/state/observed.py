@@ -55,6 +55,11 @@ class Observed:
         """Report events to `observer` from now on; None detaches the current one."""
         self.observer = observer
 
+    def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:
+        """Report what happened to a host; see `Observer.note_fate`."""
+        if self.observer is not None:
+            self.observer.note_fate(fate, host_id, slot, cause)
+
     @contextlib.contextmanager
     def call(self, name: str, began: float) -> Generator[None]:
         """Report an operation of the core that was called at `began`, when the context ends."""

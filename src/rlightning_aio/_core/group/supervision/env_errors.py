@@ -66,7 +66,5 @@ class EnvErrors:
         message = f"{tables.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
         cause = f"raised {error.type_name}"
         self._crash_log.note(name, message, cause, fault.env_id, now, error.traceback)
-        observer = tables.observed.observer
-        if observer is not None:
-            observer.note_fate("raised", record.host.host_id, slot, error.summary)
+        tables.observed.note_fate("raised", record.host.host_id, slot, error.summary)
         return True

@@ -150,9 +150,8 @@ class HangDetector:
         busy = self._requests.owed(np.array(record.slots, np.intp))
         record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
         slot = record.blamed[0]
-        observer = self._tables.observed.observer
-        if observer is not None and slot is not None:
-            observer.note_fate("hung", record.host.host_id, slot, "")
+        if slot is not None:
+            self._tables.observed.note_fate("hung", record.host.host_id, slot, "")
         self.kill(record, dump=True)
 
     def _check_dying(self) -> None:

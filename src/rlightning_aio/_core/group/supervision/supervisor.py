@@ -258,7 +258,7 @@ class Supervisor:
             record.deaths = {slot: count for slot, count in record.deaths.items() if count}
             self._update_any_deaths()
         if self._lifetime.open:
-            self._note_fate("up", record.host.host_id)
+            self._tables.observed.note_fate("up", record.host.host_id, -1, "")
         held, record.held = record.held, []
         for entries, arguments in held:
             record.host.submit(entries, arguments)
@@ -330,7 +330,7 @@ class Supervisor:
         if self.any_deaths:
             self._check_start_times()
             for record in self.records:
-                self._restart_due(record, now)
+                self._restart(record, now)
         if self.members.possible:
             self.members.tick(now)
         if self.detector.timed or self.detector.any_ending:
@@ -379,13 +379,11 @@ class Supervisor:
 
     def replace(self, host_id: int) -> None:
         """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
-        self._restart_due(self.records[host_id], self._clock())
-
-    def _restart_due(self, record: HostRecord, now: float) -> None:
-        if record.restart_at is not None and record.restart_at <= now:
-            self._restart(record, now)
+        self._restart(self.records[host_id], self._clock())
 
     def _restart(self, record: HostRecord, now: float) -> None:
+        if record.restart_at is None or record.restart_at > now:
+            return
         record.restart_at = None
         try:
             self._launch(record, Stage.REBUILDING)
@@ -443,7 +441,8 @@ class Supervisor:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
         loss = host_loss(self._envs, requests, record, death, owed, then, replaced=replaced)
-        self._note_fate("died" if replaced else "given up", loss.host_id, death.cause)
+        fate: Fate = "died" if replaced else "given up"
+        self._tables.observed.note_fate(fate, loss.host_id, -1, death.cause)
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:
@@ -456,16 +455,11 @@ class Supervisor:
     def note_rebuilt(self, host_id: int, slot: int, cause: str) -> None:
         """Record that a host has rebuilt one of its envs."""
         self.records[host_id].restarts += 1
-        self._note_fate("hung", host_id, cause, slot)
+        self._tables.observed.note_fate("hung", host_id, slot, cause)
 
     def note_lost_env(self, host_id: int, slot: int) -> None:
         """Record that a host will not rebuild one of its envs."""
         self.records[host_id].lost_slots.add(slot)
-
-    def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
-        observer = self._tables.observed.observer
-        if observer is not None:
-            observer.note_fate(fate, host_id, slot, cause)
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""

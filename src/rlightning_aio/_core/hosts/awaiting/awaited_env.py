@@ -18,6 +18,7 @@ from rlightning_aio._core.hosts.messages import ErrorText
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Coroutine
     from contextvars import Context
+    from typing import NoReturn
 
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
@@ -138,6 +139,9 @@ class AwaitedEnv:
             if asyncio.current_task(self._loop) is not self.task:
                 raise  # Nobody runs it any more: it is thrown away with its event loop.
             error = raised
+        # In the trainer it may be the user's Ctrl-C; a worker gets none.
+        if self.runner.inline and isinstance(error, KeyboardInterrupt):
+            self._loop.call_soon(_reraise, error)
         self._request = self.answering = None
         if not self.is_leaving:
             then(self, entry, outcome, error)
@@ -201,6 +205,10 @@ class AwaitedEnv:
         for future in (self.made, self.stopped):
             if not future.done():
                 future.cancel()
+
+
+def _reraise(error: BaseException) -> NoReturn:
+    raise error
 
 
 def _late(text: str) -> ErrorText:

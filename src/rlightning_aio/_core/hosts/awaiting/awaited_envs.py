@@ -42,7 +42,6 @@ from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
-    from typing import NoReturn
 
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
@@ -293,15 +292,20 @@ class AwaitedEnvs:
         if error is None and op_of(entry) == Operation.STEP:
             record.losses = 0
         completion = completion_of(self._host_id, env.runner, entry, outcome, error)
-        if self._renews and (why := _end_of(record, op_of(entry), completion)):
-            self._put_away(record, env, why)
-        self._finish(record, completion)
-        # In the trainer it may be the user's Ctrl-C; a worker gets none.
-        if self._inline and isinstance(error, KeyboardInterrupt):
-            self._loop.call_soon(_reraise, error)
+        self._finish(record, completion, by=env)
 
-    def _finish(self, record: _EnvRecord, completion: Completion | None) -> None:
-        """Report that a request has ended; None: its row holds the whole result."""
+    def _finish(
+        self, record: _EnvRecord, completion: Completion | None, *, by: AwaitedEnv | None = None
+    ) -> None:
+        """Report that a request has ended, `by` what an env has done; put away one that is spent.
+
+        None: its row holds the whole result.
+        """
+        if by is not None and self._renews and isinstance(completion, Raised):
+            error = completion.error
+            if error.ends_env(op_of(record.entry)):
+                why = Loss(f"raised {error.summary}", "env_raised", "either", record.name)
+                self._put_away(record, by, why)
         if self._ending:
             return
         entry, record.entry, record.arguments = record.entry, 0, None
@@ -452,33 +456,30 @@ class AwaitedEnvs:
                 return
             outcome = await self._reset(record, env)
             if outcome is not None:
-                if self._renews and (why := _end_of(record, Operation.RESET, outcome)):
-                    self._put_away(record, env, why)
-                self._finish(record, outcome)
+                self._finish(record, outcome, by=env)
                 return
             kind, message = EnvHung, f"env {record.name!r} took too long for the reset after that"
 
     async def _reset(self, record: _EnvRecord, env: AwaitedEnv) -> Result | Raised | None:
         """Begin an episode like the one that was lost; None if that takes too long."""
         entry, why = record.entry, record.lost
-        ended: asyncio.Future[Result | Raised] = self._loop.create_future()
+        ended: asyncio.Future[Completion | None] = self._loop.create_future()
 
-        def then(_: Any, entry: int, outcome: Any, error: BaseException | None) -> None:
-            if error is None:
-                ended.set_result(Result(self._host_id, entry, outcome or {}, restarted=why))
-                return
-            text = ErrorText.of(error)
-            message = f"{text.text} (in the reset after its env {why.cause})"
-            error_text = replace(text, text=message)
-            ended.set_result(Raised(self._host_id, entry, error_text))
+        def then(env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None) -> None:
+            ended.set_result(completion_of(self._host_id, env.runner, entry, outcome, error))
 
         env.give(Operation.RESET, entry, env.runner.reset_with, then)
         limit = self._limits.get(Operation.RESET)
         await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
-        if ended.done():
-            return ended.result()
-        self._put_away(record, env, why)
-        return None
+        if not ended.done():
+            self._put_away(record, env, why)
+            return None
+        found = ended.result()
+        if isinstance(found, Raised):
+            text = f"{found.error.text} (in the reset after its env {why.cause})"
+            return Raised(self._host_id, entry, replace(found.error, text=text))
+        out_of_band = found.out_of_band if isinstance(found, Result) else {}
+        return Result(self._host_id, entry, out_of_band, restarted=why)
 
     def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Faulted | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
@@ -508,14 +509,3 @@ def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int
         return make()
     finally:
         enter(0)
-
-
-def _reraise(error: BaseException) -> NoReturn:
-    raise error
-
-
-def _end_of(record: _EnvRecord, op: int, completion: Completion | None) -> Loss | None:
-    """Return how an env has ended by what it has raised in an operation; None if it has not."""
-    if not isinstance(completion, Raised) or not completion.error.ends_env(op):
-        return None
-    return Loss(f"raised {completion.error.summary}", "env_raised", "either", record.name)
