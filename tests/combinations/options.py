@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import inspect
 import itertools
 import math
 from dataclasses import dataclass
@@ -12,10 +10,9 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 import numpy as np
 from combinations.played import KINDS, TASKS, Transition, act, as_tuple, played
+from kit.driven import Driven
 from patience import HANG
 
-import rlightning_aio
-import rlightning_aio.sync
 from rlightning_aio.errors import NothingPending
 
 if TYPE_CHECKING:
@@ -106,12 +103,8 @@ def pairwise(make: Callable[..., C], factors: dict[str, tuple[Any, ...]]) -> lis
     return chosen
 
 
-class Use:
-    """A group that is used from plain code, whichever driver it has.
-
-    Attributes:
-        group: initialised.
-    """
+class Use(Driven):
+    """A group with these options, initialised."""
 
     def __init__(self, options: Options) -> None:
         self.options, self.kind = options, KINDS[options.kind]
@@ -124,23 +117,15 @@ class Use:
         if options.placement == BOTH:
             entry["num_workers"] = NUM_ENVS - 1
             entries.append({"name": "here", "task": task, **PLACEMENTS["inline"]})
-        build = rlightning_aio if options.is_async else rlightning_aio.sync
-        self._runner = asyncio.Runner() if options.is_async else None
-        self.group: Any = build.build_env_group(entries, zero_copy=options.zero_copy)
-        self.done(self.group.init())
-
-    def done(self, result: Any) -> Any:
-        """What a call has returned; awaited, if it must be."""
-        if not inspect.iscoroutine(result):
-            return result
-        assert self._runner is not None
-        return self._runner.run(result)
+        driver = "asyncio" if options.is_async else "sync"
+        super().__init__(driver, entries, zero_copy=options.zero_copy)
+        self.init()
 
     def drain(self) -> None:
         """Leave nothing outstanding."""
         while True:
             try:
-                self.done(self.group.collect_async(wait_all=True))
+                self.collect_async(wait_all=True)
             except NothingPending:
                 return
 
@@ -148,9 +133,7 @@ class Use:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.done(self.group.close())
-        if self._runner is not None:
-            self._runner.close()
+        self.end()
 
     @property
     def size(self) -> int:

@@ -38,7 +38,8 @@ class Driven:
             self.runner = asyncio.Runner(loop_factory=factory)
             self.group = rlightning_aio.build_env_group(cfgs, **kwargs)
 
-    def _wait(self, result: Any) -> Any:
+    def done(self, result: Any) -> Any:
+        """Return what a call has returned; awaited, if it must be."""
         if not inspect.iscoroutine(result):
             return result
         assert self.runner is not None
@@ -46,18 +47,18 @@ class Driven:
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(self.group, name)
-        return lambda *args, **kwargs: self._wait(method(*args, **kwargs))
+        return lambda *args, **kwargs: self.done(method(*args, **kwargs))
 
     def __len__(self) -> int:
         return len(self.group)
 
     def call(self, env_id: str, name: str, *args: Any, **kwargs: Any) -> Any:
         """Call a method through the env's handle."""
-        return self._wait(self.group[env_id].call(name, *args, **kwargs))
+        return self.done(self.group[env_id].call(name, *args, **kwargs))
 
     def end(self) -> None:
         """Close the group, and the loop."""
-        self._wait(self.group.close())
+        self.done(self.group.close())
         if self.runner is not None:
             self.runner.close()
 
