@@ -89,13 +89,13 @@ def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
     """Return the episodes of a run in which one of the workers is killed at random turns."""
     draw = np.random.default_rng(1)
     group = start(ENTRY)
-    hosts = group.group._core.supervisor.hosts
     left = num_deaths
 
     def strike() -> bool:
         nonlocal left
         before = left
-        pid = hosts[draw.integers(len(hosts))].pid
+        workers = group.get_workers()
+        pid = workers[draw.integers(len(workers))]["pid"]
         if left and draw.random() < 0.15 and pid is not None:
             kill(pid)
             left -= 1

@@ -63,7 +63,7 @@ def test_requests_in_progress_at_the_end_are_shown(start: Start, tmp_path: Path)
     (stuck,) = Seen(tmp_path / "run.json").called("step, not done")
     assert stuck.track == "faulty-3"
     with group.group.trace(tmp_path / "run.json"):
-        group.group._core.supervisor.hosts[1].kill(dump=False)
+        kill(group.get_workers()[1]["pid"])
         with pytest.raises(WorkerDied):
             group.collect_async(wait_all=True)
     assert ("given up", "worker") in marks(Seen(tmp_path / "run.json"))

@@ -78,7 +78,7 @@ def test_entries_share_the_cores(
     monkeypatch.setattr(build, "num_cores", lambda: num_cores)
     named = [entry | {"name": f"e{k}"} for k, entry in enumerate(entries)]
     group = sync.build_env_group(named)
-    hosts = [host.num_envs for host in group._core.supervisor.hosts]
+    hosts = [len(worker["env_ids"]) for worker in group.get_workers()]
     assert hosts == [count for counts in spread for count in counts]
     group.close()
 

@@ -240,8 +240,8 @@ def test_envs_of_a_cpu_bound_class_share_workers() -> None:
     count = 1000
     shared = sync.build_env_group(entry("tacit", placement="process", num_workers=count))
     alone = sync.build_env_group(entry("later", placement="process", num_workers=7))
-    assert 1 <= len(shared._core.supervisor.hosts) < count
-    assert len(alone._core.supervisor.hosts) == 7
+    assert 1 <= len(shared.get_workers()) < count
+    assert len(alone.get_workers()) == 7
 
 
 def test_memory_is_cleared_without_importing_anything(monkeypatch: pytest.MonkeyPatch) -> None:

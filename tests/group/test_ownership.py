@@ -92,8 +92,8 @@ def test_a_loop_that_is_not_closed_may_be_used_again(
         group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
         batch, _ = own.run(group.collect_async(wait_all=True))
         assert batch.reward.tolist() == [4.0] * 3
-        worker = group._core.supervisor.hosts[0]
-        stop(worker.pid)
+        pid = group.get_workers()[0]["pid"]
+        stop(pid)
         group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
 
         async def begin() -> asyncio.Task[Any]:
@@ -102,7 +102,7 @@ def test_a_loop_that_is_not_closed_may_be_used_again(
             return waiting
 
         waiting = own.run(begin())
-        os.kill(worker.pid, signal.SIGCONT)
+        os.kill(pid, signal.SIGCONT)
         run_in(new_loop, group.close())
         with pytest.raises(GroupClosed):
             own.run(asyncio.wait_for(waiting, HANG))
