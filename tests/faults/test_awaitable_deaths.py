@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
-import time
-from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-import gymnasium as gym
-import numpy as np
 import pytest
+from kit.deeds import BLOCK, DIE, DIE_LATER, GO, HANG, Awaited
 from kit.driven import Driven, on_one_driver
 from kit.processes import kill
 
@@ -20,43 +16,9 @@ if TYPE_CHECKING:
 
     Start: TypeAlias = Callable[..., Driven]
 
-STEP, WAIT, DIE, BLOCK, LATER = range(5)
-
-
-class Waits:
-    """Its action says what a step does.
-
-    Attributes:
-        waiting: how many steps wait for ever in this process.
-    """
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(5)
-    waiting: ClassVar[int] = 0
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        del seed, options
-        return np.zeros(1), {}
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(0)
-        if action == DIE:
-            os._exit(3)
-        elif action == BLOCK:
-            time.sleep(3600)  # noqa: ASYNC251  # As it should not.
-        elif action in (WAIT, LATER):
-            Waits.waiting += 1
-            if action == LATER:  # The end comes out of nobody's code, as from a thread.
-                asyncio.get_running_loop().call_soon(os._exit, 3)
-            await asyncio.Event().wait()
-        return np.ones(1), 1.0, False, False, {}
-
-    def num_waiting(self) -> int:
-        return Waits.waiting
-
 
 def waits(num_workers: int = 4, **fields: Any) -> dict[str, Any]:
-    config = {"name": "w", "task": Waits, "num_workers": num_workers}
+    config = {"name": "w", "task": Awaited, "num_workers": num_workers}
     return {**config, "envs_per_process": num_workers, **fields}
 
 
@@ -67,7 +29,7 @@ def steps(actions: dict[str, int]) -> rl.BatchedData:
 
 def let_wait(group: Driven, *env_ids: str) -> None:
     """Have steps of these envs wait for ever; return when all of them do."""
-    group.step_async(steps(dict.fromkeys(env_ids, WAIT)))
+    group.step_async(steps(dict.fromkeys(env_ids, HANG)))
     while group.call("w-3", "num_waiting") < len(env_ids):
         pass
 
@@ -88,7 +50,7 @@ def test_the_env_whose_code_ran_is_at_fault(start: Start) -> None:
     found = results_of(group, 3)
     assert {ret.info["env_at_fault"] for ret in found.values()} == {"w-2"}
     assert not any("suspects" in ret.info for ret in found.values())
-    found = group.step(steps(dict.fromkeys(group.group.env_ids, STEP)))[0].values()
+    found = group.step(steps(dict.fromkeys(group.group.env_ids, GO)))[0].values()
     assert ["worker_restarted" in ret.info for ret in found] == [False, False, False, True]
 
 
@@ -98,7 +60,7 @@ def test_envs_that_only_waited_are_suspects(start: Start) -> None:
     let_wait(group, "w-0", "w-2")
     kill(group.group.get_workers()[0]["pid"])
     found = results_of(group, 2)
-    found.update(group.step(steps({"w-1": STEP}))[0].items())
+    found.update(group.step(steps({"w-1": GO}))[0].items())
     assert {*found} == {"w-0", "w-1", "w-2"}
     for ret in found.values():
         assert ret.info["worker_restarted"].startswith("was killed by SIGKILL")
@@ -107,17 +69,17 @@ def test_envs_that_only_waited_are_suspects(start: Start) -> None:
 
 
 @on_one_driver
-@pytest.mark.parametrize("dies", [DIE, LATER])
+@pytest.mark.parametrize("dies", [DIE, DIE_LATER])
 def test_the_error_of_a_worker_that_is_not_replaced_names_them(start: Start, dies: int) -> None:
     """It is one error for all that owed a reply, which are busy until it is raised."""
     group = start(waits(8, envs_per_process=4, on_worker_death="raise"))
     let_wait(group, "w-0", "w-1")
     group.step_async(steps({"w-2": dies}))
     while not group.group.get_workers()[0]["given_up"]:
-        group.step(steps({"w-4": STEP}))
+        group.step(steps({"w-4": GO}))
     for env_id in ("w-0", "w-1", "w-2"):
         with pytest.raises(rl.EnvBusy, match=f"'{env_id}'.*error that was not collected"):
-            group.step_async(steps({env_id: STEP}))
+            group.step_async(steps({env_id: GO}))
     assert group.group.pending == ["w-0", "w-1", "w-2"]
     with pytest.raises(rl.WorkerDied, match="exited with code 3") as caught:
         group.collect_async()
@@ -130,7 +92,7 @@ def test_the_error_of_a_worker_that_is_not_replaced_names_them(start: Start, die
         assert "no env's code was running" in str(error)
     assert group.group.pending == []
     with pytest.raises(rl.WorkerDied, match="nothing was sent to w-1") as refused:
-        group.step_async(steps({"w-1": STEP}))
+        group.step_async(steps({"w-1": GO}))
     assert refused.value.suspects == error.suspects
     assert error.env_id == refused.value.env_id
 
@@ -142,5 +104,5 @@ def test_the_env_that_blocks_the_event_loop_has_hung(start: Start) -> None:
     with pytest.raises(
         rl.EnvHung, match=r"env 'w-1'.* took longer than 0\.5 s for a step"
     ) as caught:
-        group.step(steps({"w-0": STEP, "w-1": BLOCK, "w-2": STEP}))
+        group.step(steps({"w-0": GO, "w-1": BLOCK, "w-2": GO}))
     assert (caught.value.env_id, caught.value.suspects) == ("w-1", ())

@@ -8,21 +8,22 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.errors import EnvError
 
-GO, END, CUT, RAISE, BLAME, DIE, HANG = range(7)
+GO, END, CUT, RAISE, BLAME, DIE, HANG, BLOCK, DIE_LATER = range(9)
+"""In a coroutine, `HANG` waits, `BLOCK` keeps the event loop, and `DIE_LATER` is nobody's code."""
 
 
 class Deeds:
     """Its action, or the option ``deed`` of its reset, says what it does."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(7)
+    action_space = gym.spaces.Discrete(9)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         del seed
@@ -40,7 +41,7 @@ class Deeds:
             raise EnvError("the action is nonsense", blame="policy")
         if deed == DIE:
             os._exit(3)
-        if deed == HANG:
+        if deed in (HANG, BLOCK):
             time.sleep(3600)
 
 
@@ -49,17 +50,30 @@ class Fails(Deeds, gym.Env[Any, Any]):
 
 
 class Awaited(Deeds):
-    """The same with coroutines."""
+    """The same with coroutines.
+
+    Attributes:
+        waiting: how many steps wait for ever in this process.
+    """
+
+    waiting: ClassVar[int] = 0
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         if (options or {}).get("deed") == HANG:
-            await asyncio.sleep(3600)
+            await asyncio.Event().wait()
         return super().reset(seed=seed, options=options)
 
     async def step(self, action: Any) -> Any:
-        if action == HANG:
-            await asyncio.sleep(3600)
+        await asyncio.sleep(0)
+        if action in (HANG, DIE_LATER):
+            Awaited.waiting += 1
+            if action == DIE_LATER:
+                asyncio.get_running_loop().call_soon(os._exit, 3)
+            await asyncio.Event().wait()
         return super().step(action)
+
+    def num_waiting(self) -> int:
+        return Awaited.waiting
 
 
 gym.register("Fails-v0", Fails)
