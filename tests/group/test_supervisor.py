@@ -35,7 +35,7 @@ from rlightning_aio._core.hosts.messages import (
     NotBuilt,
 )
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
+from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import RowLayout
 from rlightning_aio.types import EnvMeta
@@ -399,30 +399,6 @@ def test_an_env_that_cannot_be_built_fails_the_start(
     assert "close 0" in ours.log
 
 
-def test_a_death_in_the_start_fails_it(fleet: Callable[..., Fleet]) -> None:
-    """Nothing is replaced before it has worked once; the error has the last output."""
-    ours = fleet(up=False)
-    ours.hosts[0].builds = False
-    start = ours.start()
-    assert ours.die(0) is None
-    ours.turn()
-    with pytest.raises(StartFailed, match=r"(?s)'e-0'.* started: .* SIGKILL.*last words"):
-        start.result()
-
-
-def test_closing_ends_a_start(fleet: Callable[..., Fleet]) -> None:
-    """The start raises."""
-    ours = fleet(up=False)
-    ours.hosts[0].builds = False
-    start = ours.start()
-    assert ours.close().done
-    ours.turn()
-    with pytest.raises(GroupClosed, match="closed while it was starting"):
-        start.result()
-    with pytest.raises(GroupClosed, match="build a new one"):
-        ours.start().result()
-
-
 # -- hangs
 
 
@@ -468,29 +444,6 @@ def test_a_killed_host_has_its_time_if_the_trainer_was_stopped(fleet: Callable[.
     ours.check()
     assert ours.log == ["dump and kill 0"]
     assert ours.supervisor.next_check() == ours.now + hang_detector._OBEY_SECONDS
-
-
-def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """After its limit, once, with a dump; the error has the env and the time."""
-    ours = fleet((1, 2), step_timeout=5.0)
-    entries = ours.ask(1, 2)
-    ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
-    ours.hosts[1].dies = False
-    assert ours.supervisor.next_check() == pytest.approx(ours.now + 5)
-    ours.now += 4.9
-    ours.check()
-    assert ours.log == []
-    ours.now += 0.2
-    ours.check()
-    ours.check()
-    assert ours.log == ["dump and kill 1"]
-    loss = ours.die(1)
-    assert is_replaced(loss)
-    assert loss.death.cause == "hung in a step and was killed"
-    error = loss.error(loss.owed)
-    assert isinstance(error, EnvHung)
-    assert (error.env_id, error.env_ids) == ("e-2", ("e-1", "e-2"))
-    assert "took longer than 5.0 s for a step" in str(error)
 
 
 def ended_as_hung(ours: Fleet) -> HostLoss:
@@ -635,87 +588,6 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
 
 
 # -- deaths
-
-
-def test_a_dead_host_is_replaced(fleet: Callable[..., Fleet]) -> None:
-    """It is started and gets its rows again; the loss has what it owed."""
-    ours = fleet((1, 3))
-    entries = ours.ask(1, 3)
-    ours.completions.append(Died(1, Death("left", 3, "last words", (entries[1],))))
-    loss = ours.supervisor.handle_exit(ours.completions.popleft())
-    assert is_replaced(loss)
-    assert (loss.slots, loss.owed.tolist(), loss.death.cause) == (range(1, 4), [1, 3], "left")
-    assert ours.log == []
-    ours.carry_out(loss)
-    assert ours.requests.in_flight == [0, 2]
-    assert ours.log == ["start 1", "attach 1"]
-    assert ours.supervisor.any_deaths
-    error = loss.error(np.array([1]))
-    assert (error.env_id, error.env_ids, error.exit_code) == ("e-3", ("e-1",), 3)
-    assert "restart 1 of 3 in a row" in str(error)
-    assert str(error).endswith("last words")
-
-
-@pytest.mark.parametrize(
-    ("fields", "why"),
-    [
-        ({"on_worker_death": "raise"}, "on_worker_death is 'raise', so it is not replaced"),
-        ({"max_restarts": 0}, r"not replaced after 0 restarts in a row \(max_restarts\)"),
-    ],
-)
-def test_a_dead_host_may_be_given_up(
-    fleet: Callable[..., Fleet], fields: dict[str, Any], why: str
-) -> None:
-    """Later requests to its envs raise the cause; the other envs can be used."""
-    ours = fleet((2, 1), **fields)
-    ours.ask(1, 2)
-    loss = ours.die(0)
-    assert is_given_up(loss)
-    assert (loss.host_id, loss.owed.tolist()) == (0, [1])
-    assert ours.log == []
-    with pytest.raises(WorkerDied, match=why):
-        raise ours.requests.collector.faults[0]
-    with pytest.raises(WorkerDied, match=why):
-        ours.supervisor.check_usable(np.array([2, 0]))
-    ours.supervisor.check_usable(np.array([2]))
-    assert not ours.supervisor.any_deaths
-
-
-def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> None:
-    """Neighbours don't add up; a completed step resets the count of its env only."""
-    ours = fleet((2,), max_restarts=2)
-    for slot in (0, 1, 0, 1):
-        (entry,) = ours.ask(slot)
-        assert is_replaced(ours.die(0, entry))
-        if ours.supervisor.next_check() is not None:
-            ours.wait()
-        # A reset of the replacement proves nothing yet.
-        assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(slot)) == slot
-        ours.requests.hand_out(ours.requests.collector.pop_ready(1))
-    ours.ask(0)
-    ours.reply(0)
-    (entry,) = ours.ask(0)
-    assert is_replaced(ours.die(0, entry))
-    ours.reply(0)
-    (entry,) = ours.ask(1)
-    assert is_given_up(ours.die(0, entry))
-
-
-@pytest.mark.parametrize("executing", [0, 1])
-def test_of_awaitable_envs_the_one_whose_code_ran_is_at_fault(
-    fleet: Callable[..., Fleet], executing: int
-) -> None:
-    """Not the one that was asked first; if all waited, those that owed a reply are suspected."""
-    ours = fleet((3, 1), awaits=True)
-    asked = ours.ask(0, 1)
-    loss = ours.die(0, (0, asked[1])[executing], *asked)
-    assert is_replaced(loss)
-    error = loss.error(np.array([1]))
-    suspects = () if executing else ("e-0", "e-1")
-    at_fault = "e-1" if executing else None
-    assert loss.why[3:] == (at_fault, suspects)
-    assert (error.env_id, error.suspects) == (at_fault or "e-0", suspects)
-    assert error.env_ids == ("e-1",)
 
 
 def test_a_worker_of_one_env_has_no_suspects(fleet: Callable[..., Fleet]) -> None:
@@ -869,19 +741,6 @@ def test_the_time_of_a_start_counts_from_the_death(fleet: Callable[..., Fleet]) 
     assert ours.supervisor.next_check() == ours.now + 10
 
 
-def test_a_replacement_that_cannot_be_built_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """Its death has the error, and it counts as not started."""
-    ours = fleet(max_restarts=1)
-    ours.hosts[0].builds = False
-    (entry,) = ours.ask(0)
-    ours.die(0)
-    ours.completions.append(NotBuilt(0, 0, ErrorText("ValueError", "no licence", "")))
-    ours.drain()
-    assert ours.log == ["start 0", "attach 0", "kill 0"]
-    assert ours.hosts[0].asked == [entry]
-    assert "could not be rebuilt: ValueError: no licence" in str(ours.requests.collector.faults[0])
-
-
 def test_a_replacement_with_other_spaces_gets_no_requests(fleet: Callable[..., Fleet]) -> None:
     """Its results would not fit the rows."""
     ours = fleet(max_restarts=1)
@@ -896,20 +755,6 @@ def test_a_replacement_with_other_spaces_gets_no_requests(fleet: Callable[..., F
     ours.hosts[0].end()
     ours.drain()
     assert "its spaces changed with the restart" in str(ours.requests.collector.faults[0])
-
-
-def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """With a dump, measured from its own start."""
-    ours = fleet(max_restarts=1)
-    ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
-    ours.ask(0)
-    ours.die(0)
-    assert ours.supervisor.next_check() == ours.now + 10
-    ours.now += 10
-    ours.check()
-    assert ours.log == ["start 0", "dump and kill 0"]
-    assert is_given_up(ours.losses[1])
-    assert "did not start again within 10.0 s" in str(ours.requests.collector.faults[0])
 
 
 def test_a_replacement_is_not_late_if_the_trainer_is(
