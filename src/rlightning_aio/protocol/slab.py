@@ -18,7 +18,7 @@ from rlightning_aio.protocol.columns import Leaf, assemble, leaf_of, leaves, str
 from rlightning_aio.protocol.info import INFO_BYTES, INFO_BYTES_OF_SUB_ENV
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     import gymnasium as gym
     from numpy.typing import NDArray
@@ -36,6 +36,7 @@ __all__ = [
     "TRUNCATED",
     "RowLayout",
     "Slab",
+    "rows_for",
 ]
 
 NO_SEED: Final = -1
@@ -139,6 +140,24 @@ class RowLayout:
 
 def _aligned(size: int) -> int:
     return -(-size // _ALIGNMENT) * _ALIGNMENT
+
+
+def rows_for(
+    layouts: Sequence[RowLayout],
+) -> tuple[list[tuple[RowLayout, int]], list[tuple[int, int]]]:
+    """Give each env a row in the slab of its layout.
+
+    Returns the layout and the number of rows of each slab, and each env's slab and row.
+    """
+    slabs: dict[tuple[object, ...], list[RowLayout]] = {}
+    rows: list[int] = []
+    for layout in layouts:
+        own = slabs.setdefault(layout.key, [])
+        rows.append(len(own))
+        own.append(layout)
+    index = {key: k for k, key in enumerate(slabs)}
+    places = [(index[layout.key], row) for layout, row in zip(layouts, rows, strict=True)]
+    return [(own[0], len(own)) for own in slabs.values()], places
 
 
 class Slab:

@@ -62,3 +62,7 @@ class Tables:
     records: list[HostRecord] = field(default_factory=list["HostRecord"])
     completions: Completions = field(default_factory=deque["Completion"])
     resources: dict[object, Shared] = field(default_factory=dict[object, "Shared"])
+
+    def record_of(self, slot: int) -> HostRecord:
+        """Return the record of the host of an env."""
+        return self.records[self.requests.hosts.item(slot)]

@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import Completion
 
-__all__ = ["completion_in", "frame_of"]
+__all__ = ["SENDER", "completion_in", "frame_of"]
+
+SENDER: Final = 0
+"""The host of completions that travel in frames; the trainer's end knows which it is."""
 
 
 def frame_of(completion: Completion) -> Frame:

@@ -62,7 +62,7 @@ def film(core: Core, env_ids: Sequence[str] | None, order: FilmOrder | None) -> 
 
 
 def _film_one(core: Core, slot: int, order: FilmOrder | None) -> Procedure[None]:
-    films = core.supervisor.records[core.requests.hosts.item(slot)].films
+    films = core.tables.record_of(slot).films
     if order is None:
         films.pop(slot, None)
     yield from core.calls.call_one(time.monotonic(), slot, (RECORD_VIDEO, (order,), {}))

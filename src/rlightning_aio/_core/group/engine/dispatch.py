@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.waiting import Poller, Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Host, Membership
 
 __all__ = ["Dispatch", "Packed"]
 
@@ -39,6 +38,7 @@ class Dispatch:
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
+        self._record_of = tables.record_of
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
         self._poller = poller
@@ -116,9 +116,9 @@ class Dispatch:
         chosen = slots[out_of_band.positions].tolist()
         try:
             for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
-                if slot >= len(self._envs.all):
-                    host = self._host_of(slot)
-                    cast("Membership", host).check_step(slot - host.first_slot, action, extras)
+                record = self._record_of(slot)
+                if record.membership is not None:
+                    record.membership.check_step(slot - record.slots.start, action, extras)
             return out_of_band.positions, [
                 self.packed(slot, content, "the response")
                 for slot, content in zip(chosen, out_of_band.contents, strict=True)
@@ -137,29 +137,27 @@ class Dispatch:
         packed: list[Any] = []
         for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
             given = (None if seed == NO_SEED else seed, options)
-            if slot >= len(self._envs.all):
-                self._check_reset(slot, *given)
+            self._check_reset(slot, *given)
             packed.append(self.packed(slot, given, "the options"))
         return packed
 
     def _check_reset(self, slot: int, seed: int | None, options: dict[str, Any]) -> None:
-        host = self._host_of(slot)
+        record = self._record_of(slot)
+        if record.membership is None:
+            return
         try:
-            cast("Membership", host).check_reset(slot - host.first_slot, seed, options)
+            record.membership.check_reset(slot - record.slots.start, seed, options)
         except ValueError as error:
             raise TypeError(f"{error}; nothing was sent") from error
 
     def packed(self, slot: int, arguments: Any, what: str) -> Any:
         try:
-            return self._host_of(slot).packed(arguments)
+            return self._record_of(slot).host.packed(arguments)
         except Exception as error:
             raise TypeError(
                 f"{what} for {self._envs.describe(slot)} can't be sent to its worker: {error}; "
                 "nothing was sent"
             ) from error
-
-    def _host_of(self, slot: int) -> Host:
-        return self._supervisor.hosts[self._requests.hosts.item(slot)]
 
     def hand_over(
         self,

@@ -70,6 +70,7 @@ class Intake:
         self._conditions = tables.conditions
         self._envs = tables.envs
         self._requests = tables.requests
+        self._record_of = tables.record_of
         self._layout = tables.layout
         self._supervisor = supervisor
         self._results = results
@@ -153,7 +154,7 @@ class Intake:
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
         """Make the error; `lost`: the loss that the result would have reported."""
         after = f" (its worker {lost.cause}, and was replaced)" if lost is not None else ""
-        after += without_terminal(error, self._supervisor.hosts[self._requests.hosts.item(slot)])
+        after += without_terminal(error, self._record_of(slot))
         op = self._requests.numbering.op(slot)
         doing = Operation(op).name.lower()
         go_on = "reset the env to go on"

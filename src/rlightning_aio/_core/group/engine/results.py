@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 import numpy as np
 
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS
+from rlightning_aio._core.group.state.slab_layout import rows_in
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import UNASKED, copied
 from rlightning_aio.outcomes import Outcome
@@ -242,7 +243,7 @@ class Results:
         """Copy the sums of the episodes that end in `part`; its rows are as they were."""
         slots, layout = part.slots, self._layout
         slab = layout.slabs[layout.slab.item(slots.item(0))]
-        rows = slice(0, len(slots)) if slots is self._envs.all else layout.row[slots]
+        rows = rows_in(layout, slots, self._envs.all)
         part.episode_return, part.episode_length = kernel.gather(
             (slab.episode_return, slab.episode_length), rows
         )

@@ -13,7 +13,7 @@ import numpy as np
 from rlightning_aio._core.hosts.messages import AttachOrder
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.columns import leaves
-from rlightning_aio.protocol.slab import RowLayout, Slab
+from rlightning_aio.protocol.slab import Slab, rows_for
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -83,17 +83,10 @@ class SlabLayout:
             started: the envs, in the order of their slots.
             arena: holds the memory of the slabs.
         """
-        keys: dict[tuple[object, ...], int] = {}
-        layouts: list[RowLayout] = []
-        rows_used: list[int] = []
-        for slot, env in enumerate(started):
-            slab = keys.setdefault(env.layout.key, len(keys))
-            if slab == len(layouts):
-                layouts.append(env.layout)
-                rows_used.append(0)
-            self.slab[slot], self.row[slot] = slab, rows_used[slab]
-            rows_used[slab] += 1
-        for layout, rows in zip(layouts, rows_used, strict=True):
+        sizes, places = rows_for([env.layout for env in started])
+        for slot, place in enumerate(places):
+            self.slab[slot], self.row[slot] = place
+        for layout, rows in sizes:
             size = layout.size(rows)
             offset = arena.append(size)
             self._places.append((offset, rows))

@@ -13,7 +13,6 @@ from rlightning_aio.protocol.entries import Operation
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.supervision.fault_messages import CrashLog
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import ErrorText
@@ -36,13 +35,10 @@ class EnvErrors:
         self._crash_log = crash_log
         self._on_count = on_count
 
-    def _record(self, slot: int) -> HostRecord:
-        return self._tables.records[self._tables.requests.hosts.item(slot)]
-
     def ends_env(self, slot: int, error: ErrorText) -> bool:
         """Return True if an env that has raised this is rebuilt before its next request."""
         op = self._tables.requests.numbering.op(slot)
-        return not self._record(slot).error_policy.raises and error.ends_env(op)
+        return not self._tables.record_of(slot).error_policy.raises and error.ends_env(op)
 
     def count_restart(self, slot: int, error: ErrorText, fault: EnvRaised) -> bool:
         """Count an exception that has ended an env; True if an episode begins at once for it.
@@ -52,7 +48,7 @@ class EnvErrors:
             error: what it has raised.
             fault: what the caller gets otherwise.
         """
-        tables, record = self._tables, self._record(slot)
+        tables, record = self._tables, self._tables.record_of(slot)
         policy, name = record.error_policy, record.config.name
         count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
         self._on_count()

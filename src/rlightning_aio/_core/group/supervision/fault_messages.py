@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
-from rlightning_aio._core.hosts.base import Killable
 from rlightning_aio._core.hosts.limits import hung
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 from rlightning_aio.outcomes import Loss
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
-    from rlightning_aio._core.hosts.base import Host
     from rlightning_aio._core.hosts.messages import Death, ErrorText
 
 __all__ = [
@@ -164,9 +162,9 @@ def _doing(requests: Requests, slot: int) -> str:
     return f"a call of {method}()" if method else "a call"
 
 
-def without_terminal(error: ErrorText, host: Host) -> str:
+def without_terminal(error: ErrorText, record: HostRecord) -> str:
     """A hint for the error of a debugger in a worker; empty for any other error."""
-    if error.type_name != "bdb.BdbQuit" or not isinstance(host, Killable):
+    if error.type_name != "bdb.BdbQuit" or record.killable is None:
         return ""
     return " (a worker has no terminal: debug with placement='inline')"
 

@@ -78,7 +78,7 @@ class Overdue:
         """Log that an env owes a result, and where it stands if its host can say so."""
         tables = self._tables
         warn_where(
-            tables.records[tables.requests.hosts.item(slot)],
+            tables.record_of(slot),
             slot,
             f"{tables.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
             f"what it does: set {setting} of its entry, in seconds, to have it replaced; ",

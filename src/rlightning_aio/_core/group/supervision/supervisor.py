@@ -275,7 +275,7 @@ class Supervisor:
             return
         fault = StartFailed(
             f"{self._envs.describe(slot)} could not be built: {error.summary}"
-            f"{without_terminal(error, record.host)}; its __cause__ is the remote traceback",
+            f"{without_terminal(error, record)}; its __cause__ is the remote traceback",
             env_id=self._envs.env_ids[slot],
         )
         fault.__cause__ = RemoteTraceback(error.traceback)
@@ -463,11 +463,11 @@ class Supervisor:
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""
-        for record in self.records:
-            if slot in record.slots and record.deaths:
-                record.deaths.pop(slot, None)
-                record.deaths.pop(None, None)
-                self._update_any_deaths()
+        deaths = self._tables.record_of(slot).deaths
+        if deaths:
+            deaths.pop(slot, None)
+            deaths.pop(None, None)
+            self._update_any_deaths()
 
     def _update_any_deaths(self) -> None:
         self._note_deaths(

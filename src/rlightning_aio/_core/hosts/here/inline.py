@@ -17,11 +17,10 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
-    NotBuilt,
     Result,
     Withdrawn,
 )
-from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
@@ -72,8 +71,7 @@ class InlineHost(Host):
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            index = min(len(self._runners), self.num_envs - 1)
-            self._post(NotBuilt(self.host_id, index, ErrorText.of(error)))
+            self._post(not_built(self.host_id, self._order, len(self._runners), error))
             return
         if self._shares_thread:
             self._threads = _Threads(self._runners, self._queue, self._driver)

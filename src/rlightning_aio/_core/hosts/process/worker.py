@@ -18,10 +18,10 @@ import traceback
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
-from rlightning_aio._core.hosts.completion_frames import frame_of
+from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
 from rlightning_aio._core.hosts.limits import limits_of
-from rlightning_aio._core.hosts.messages import Built, Closed, ErrorText, NotBuilt
-from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.messages import Built, Closed
+from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
 from rlightning_aio._core.hosts.spinner import Spinner
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import (
         AttachOrder,
         Completion,
+        ErrorText,
         StartOrder,
         WorkerPlace,
     )
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
 __all__ = ["Worker", "main"]
 
 _STEP: Final = int(Operation.STEP)
-_HOST_ID: Final = 0
-"""The host of its completions; the trainer knows which it is."""
 
 
 class TrainerGone(Exception):
@@ -129,7 +128,7 @@ class Worker:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:
             self._closing = True  # The event loop has closed them.
-        self._post(Closed(_HOST_ID, errors))
+        self._post(Closed(SENDER, errors))
 
     def _take_requests(self) -> bool:
         """Read requests and begin to execute them; return False to close."""
@@ -194,7 +193,7 @@ class Worker:
         error = outcome if isinstance(outcome, BaseException) else None
         self._on_end(error)
         runner = self._runners[slot_of(request) - self._first_slot]
-        completion = completion_of(_HOST_ID, runner, request, outcome, error)
+        completion = completion_of(SENDER, runner, request, outcome, error)
         if completion is not None:
             self._post(completion)
 
@@ -278,20 +277,17 @@ class Worker:
             self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
             started = [runner.started() for runner in self._runners]
         except BaseException as error:
-            index = len(self._runners)
-            if order is not None:
-                index = min(index, len(order.worker_indices) - 1)
-            self._post(NotBuilt(_HOST_ID, index, ErrorText.of(error)))
+            self._post(not_built(SENDER, order, len(self._runners), error))
             return
         # These objects stay. Without them the garbage collector saves time and copied pages.
         gc.collect()
         gc.freeze()
-        self._post(Built(_HOST_ID, started))
+        self._post(Built(SENDER, started))
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs from the inherited descriptor of the arena."""
         order: AttachOrder = pickle.loads(frame.payload)
-        attach_all(self._runners, order, self._map_part, _HOST_ID, self._post)
+        attach_all(self._runners, order, self._map_part, SENDER, self._post)
         self._steps = [runner.step for runner in self._runners]
         os.close(self._arena)
         self._attached = True
@@ -310,7 +306,7 @@ class Worker:
             return
         index = slot_of(request) - self._first_slot
         runner = self._runners[index]
-        completion = execute(_HOST_ID, runner, request, frame.payload, self._on_end)
+        completion = execute(SENDER, runner, request, frame.payload, self._on_end)
         self._steps[index] = runner.step  # A call may start or stop filming.
         if completion is None:
             self._rings.report(request, self._ring)
@@ -330,7 +326,7 @@ class Worker:
         self._rings.own[CAREFUL] = 1
         if self._awaits and self._attached:
             return  # The event loop closes them.
-        self._post(Closed(_HOST_ID, self._close_envs()))
+        self._post(Closed(SENDER, self._close_envs()))
 
     _handlers: ClassVar[dict[int, Callable[[Worker, Frame], None]]] = {
         FrameKind.START: _start,

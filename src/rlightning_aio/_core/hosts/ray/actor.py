@@ -14,19 +14,19 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from rlightning_aio._core.hosts.completion_frames import frame_of
+from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
 from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema, NotBuilt
 from rlightning_aio._core.hosts.ray.row_table import RowTable
-from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import close_all, give_rows, resume_all
 from rlightning_aio.protocol.entries import op_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
-from rlightning_aio.protocol.slab import Slab
+from rlightning_aio.protocol.slab import Slab, rows_for
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.frames import Frame
 
 __all__ = ["Batch", "EnvActor", "Late", "Reply"]
-
-_HOST_ID: Final = 0
-"""The host of its completions; the trainer knows which it is."""
 
 
 class Batch(NamedTuple):
@@ -139,21 +136,18 @@ class EnvActor:
             for runner in built_envs(given):
                 self._runners.append(runner)
             places = list(_placed_here(self._runners))
-            give_rows(places, _HOST_ID, self._post)
+            give_rows(places, SENDER, self._post)
             self._table = RowTable(self._first_slot, [(slab, row) for _, slab, row in places])
-            return frame_of(Built(_HOST_ID, [runner.started() for runner in self._runners]))
+            return frame_of(Built(SENDER, [runner.started() for runner in self._runners]))
         except BaseException as error:
-            index = len(self._runners)
-            if given is not None:
-                index = min(index, len(given.worker_indices) - 1)
-            return frame_of(NotBuilt(_HOST_ID, index, ErrorText.of(error)))
+            return frame_of(not_built(SENDER, given, len(self._runners), error))
 
     def resume(self, order: AttachOrder) -> Frame | None:
         """Seed a replacement and restore its envs; return `NotBuilt` if that fails."""
         try:
             resume_all(self._runners, order)
         except BaseException as error:
-            return frame_of(NotBuilt(_HOST_ID, 0, ErrorText.of(error)))
+            return frame_of(NotBuilt(SENDER, 0, ErrorText.of(error)))
         return None
 
     def execute(self, batch: Batch) -> Reply:
@@ -165,7 +159,7 @@ class EnvActor:
             self._executing = entry, time.monotonic_ns()
             runner = self._runners[slot_of(entry) - self._first_slot]
             given = None if arguments is None else arguments[position]
-            completion = execute(_HOST_ID, runner, entry, given)
+            completion = execute(SENDER, runner, entry, given)
             if completion is None:
                 in_rows.append(entry)
             else:
@@ -197,18 +191,10 @@ class EnvActor:
 
 def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[EnvRunner, Slab, int]]:
     """Yield each env with a row in memory of this process; equal layouts share a slab."""
-    counts: dict[tuple[object, ...], int] = {}
-    for runner in runners:
-        counts[runner.layout.key] = counts.get(runner.layout.key, 0) + 1
-    slabs: dict[tuple[object, ...], Slab] = {}
-    rows = dict.fromkeys(counts, 0)
-    for runner in runners:
-        layout = runner.layout
-        key, count = layout.key, counts[layout.key]
-        if key not in slabs:
-            slabs[key] = Slab(layout, memoryview(bytearray(layout.size(count))), count)
-        yield runner, slabs[key], rows[key]
-        rows[key] += 1
+    sizes, places = rows_for([runner.layout for runner in runners])
+    slabs = [Slab(one, memoryview(bytearray(one.size(rows))), rows) for one, rows in sizes]
+    for runner, (slab, row) in zip(runners, places, strict=True):
+        yield runner, slabs[slab], row
 
 
 def _stacks() -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium.error import UnregisteredEnv
 
+from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["build_env", "built_env", "built_envs"]
+__all__ = ["build_env", "built_env", "built_envs", "not_built"]
 
 
 def build_env(
@@ -46,6 +47,14 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
         seed_generators()
     for place in range(len(order.worker_indices)):
         yield built_env(order, place, inline=inline)
+
+
+def not_built(
+    host_id: int, order: StartOrder | None, num_built: int, error: BaseException
+) -> NotBuilt:
+    """Report that the env after so many, or the description of the last one, raised `error`."""
+    most = 1 if order is None else len(order.worker_indices)
+    return NotBuilt(host_id, min(num_built, most - 1), ErrorText.of(error))
 
 
 def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunner:
