@@ -21,9 +21,8 @@ from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.state.checked import CheckedRequests
-from rlightning_aio._core.group.state.conditions import Conditions, Lifetime
+from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
-from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision.supervisor import Supervisor

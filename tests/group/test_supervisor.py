@@ -11,10 +11,9 @@ import pytest
 from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
 
 from rlightning_aio._core.group.episodes.continuity import Continuity
-from rlightning_aio._core.group.state.conditions import Conditions, Lifetime
+from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.host_record import HostLoss
-from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout

@@ -10,10 +10,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rlightning_aio._core.group.episodes.continuity import Continuity
-    from rlightning_aio._core.group.state.conditions import Conditions, Lifetime
+    from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.observed import Observed
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.group.state.slab_layout import SlabLayout
     from rlightning_aio._core.group.state.stats import Stats

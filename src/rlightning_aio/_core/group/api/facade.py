@@ -15,7 +15,7 @@ from rlightning_aio._core.group.drivers.scope import Scope
 from rlightning_aio._core.group.drivers.wait import this_process
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
-from rlightning_aio._core.group.state.observed import NO_SPAN
+from rlightning_aio._core.group.state.conditions import NO_SPAN
 from rlightning_aio._core.group.timeline.trace import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction

@@ -13,9 +13,8 @@ from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.setup.plan import host_class, placement_for
 from rlightning_aio._core.group.setup.start_orders import start_orders
 from rlightning_aio._core.group.state.checked import DEBUG, CheckedRequests
-from rlightning_aio._core.group.state.conditions import Conditions, Lifetime
+from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
-from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.state.stats import Stats

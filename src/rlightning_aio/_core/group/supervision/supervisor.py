@@ -54,8 +54,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.group.state.conditions import Fate
     from rlightning_aio._core.group.state.host_record import HostLoss
-    from rlightning_aio._core.group.state.observed import Fate
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.config import EnvConfig
@@ -463,7 +463,7 @@ class Supervisor:
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""
-        deaths = self._tables.record_of(slot).deaths
+        deaths = self.records[self._requests.hosts.item(slot)].deaths
         if deaths:
             deaths.pop(slot, None)
             deaths.pop(None, None)

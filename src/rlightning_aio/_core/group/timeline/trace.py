@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.core import Core
+    from rlightning_aio._core.group.state.conditions import Fate
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.observed import Fate
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.outcomes import Outcome
 
