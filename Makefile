@@ -38,8 +38,10 @@ help: ## this list
 run: $(VENV)/installed ## three kinds of envs, by AsyncVectorEnv and here: how much faster on this machine
 	@$(PY) benchmarks/demo.py
 
-# Tests that run programs take a third of the time, so they have a target of their own.
-PROGRAMS := tests/benchmarks tests/cli tests/examples tests/legacy/test_scripts.py tests/peers tests/test_docs.py tests/test_examples.py
+# Tests that run programs take half of the time, so they have a target of their own.
+PROGRAMS := tests/attempts/test_killed.py tests/benchmarks tests/cli tests/examples tests/faults/test_shutdown.py \
+    tests/legacy/test_scripts.py tests/peers tests/platforms tests/simulator/test_simulator.py tests/test_docs.py \
+    tests/test_examples.py
 
 # Most tests wait for processes that they start, so four at a time keep two cores busy. A process
 # without tests takes some from another; until then it has whole files, whose tests share fixtures.
@@ -48,7 +50,7 @@ PYTEST = $(PY) -m pytest --numprocesses 4 --dist worksteal
 test: $(VENV)/installed-test ## the tests of the library
 	$(PYTEST) $(PROGRAMS:%=--ignore=%)
 
-test-programs: $(VENV)/installed-test ## the tests of the command line, benchmarks, examples and pages
+test-programs: $(VENV)/installed-test ## the tests of commands, benchmarks, examples, pages, random programs, ends of programs
 	$(PYTEST) $(PROGRAMS)
 
 # No stamp: what is newest changes every day.

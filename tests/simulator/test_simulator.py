@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from simulator.coverage import ROWS, row_key, rows
-from simulator.mutations import mutations
 from simulator.program import draw
 from simulator.runs import run, run_twice, shown, shrunk
 
@@ -98,10 +97,3 @@ def test_a_defect_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_row_of_the_page_of_faults_is_known() -> None:
     keys = [row_key(row) for row in rows()]
     assert len(set(keys)) == len(keys) == len(ROWS)
-
-
-def test_every_mutation_fits_the_package() -> None:
-    for mutation in mutations():
-        for change in mutation.changes:
-            text = (ROOT / "src" / "rlightning_aio" / change["file"]).read_text()
-            assert text.count(change["now"]) == 1, f"{mutation.name}: change it in mutations.toml"
