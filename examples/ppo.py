@@ -10,6 +10,7 @@ as a terminated one; ppo_async.py does better.
 
 from __future__ import annotations
 
+import pickle
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -156,13 +157,12 @@ def learn(
 
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
-    # MuJoCo's threads step its simulations in this process; this field adds a group, which records
-    # the timeline and saves the state.
-    entry: dict[str, Any] = {"placement": "inline"} if args.backend == "mujoco" else {}
     run = Run(args.total_steps, args.folder, args.resume)
-    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **entry)
+    # MuJoCo's envs are one batch in this process; a timeline needs a group, of separate envs.
+    fields: dict[str, Any] = {"placement": "process"} if args.trace else {}
+    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **fields)
     with closing(envs):
-        group = envs.group
+        group = envs.group if args.trace else None
         observations, actions = envs.single_observation_space, envs.single_action_space
         agent = Agent(observations, actions)
         optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
@@ -181,15 +181,15 @@ def train(args: Args) -> Run:
                 "optimizer": optimizer.state_dict(),
                 "normalizer": tensors(normalizer.state_dict()),
                 "random": torch.get_rng_state(),
-                "envs": group.snapshot(),
+                "envs": pickle.dumps(envs.save_state()),
                 "observation": observation,
                 "sums": torch.from_numpy(sums.copy()),
             }
 
         block = (args.num_steps, args.num_envs)
-        with run, group.trace(args.trace) if args.trace else nullcontext():
+        with run, group.trace(args.trace) if group else nullcontext():
             if run.saved:
-                group.restore(run.saved["envs"])
+                envs.load_state(pickle.loads(run.saved["envs"]))  # noqa: S301  # Of this program.
                 observation, sums = run.saved["observation"], run.saved["sums"].numpy().copy()
             else:
                 first, _ = envs.reset(seed=args.seed)
@@ -227,7 +227,7 @@ def train(args: Args) -> Run:
                         sums[over] = 0.0
                         shown[over] = normalizer.update_observations(over, first)
                     observation = torch.from_numpy(shown)
-                with run.learning(), group.span("learner"):
+                with run.learning(), group.span("learner") if group else nullcontext():
                     optimizer.param_groups[0]["lr"] = args.learning_rate * run.remaining
                     with torch.no_grad():
                         last = agent.value(observation)

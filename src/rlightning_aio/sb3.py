@@ -18,10 +18,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.contents import reported_info_list
 from rlightning_aio.batch.infos import listed
 from rlightning_aio.calling import collect_calls
+from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.envs.simulators.gymnasium import spec_of
-from rlightning_aio.envs.sub_envs.sub_envs import adapted
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.sync import EnvGroup, build_env_group
@@ -30,15 +31,13 @@ from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.deaths import cause_and_rest
 from rlightning_aio.vector.lazy_infos import LazyInfos
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.making import alone, imports_of, steps_together, together
-from rlightning_aio.vector.rows import rows_of
+from rlightning_aio.vector.making import batch_of, steps_together
+from rlightning_aio.vector.requests import send_call, send_resets, send_wrapper_question
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
     from numpy.typing import NDArray
-
-    from rlightning_aio.vector.rows import Singles
 
 __all__ = ["VecEnv", "make_vec_env"]
 
@@ -46,6 +45,8 @@ __all__ = ["VecEnv", "make_vec_env"]
 _Base: Any = import_module("stable_baselines3.common.vec_env.base_vec_env").VecEnv
 _OF_SINGLE_ENVS: Final = ("wrapper_class", "wrapper_kwargs", "monitor_dir", "monitor_kwargs")
 """Arguments of Stable-Baselines3's `make_vec_env` that keep envs from being stepped together."""
+_IGNORED: Final = {"start_method"}
+"""Arguments of `VecEnv` without a meaning."""
 
 
 def make_vec_env(
@@ -61,7 +62,7 @@ def make_vec_env(
 
     Envs of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped together, in
     threads of this process, inside a `VecMonitor`. Envs of any other task, and envs that need a
-    wrapper or a file each, are separate, each in a `Monitor`.
+    wrapper, a file or a worker each, are separate, each in a `Monitor`.
 
     Args:
         env_id: a registered name, or a callable that makes an env.
@@ -69,7 +70,7 @@ def make_vec_env(
         seed: env k gets ``seed + k`` at the next reset.
         env_kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads`` and
             ``randomize``.
-        vec_env_kwargs: of `VecEnv`: fields of a config entry.
+        vec_env_kwargs: of `VecEnv`: fields of a config entry. Envs with one are separate.
         vec_env_cls: ignored if it is `SubprocVecEnv` or `DummyVecEnv`.
         more: further arguments of Stable-Baselines3's function.
 
@@ -89,17 +90,12 @@ def make_vec_env(
     given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
     inspect.signature(make).bind(env_id, n_envs, seed, **given)
     fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
-    separate = any(more.get(name) for name in _OF_SINGLE_ENVS)
+    separate = any(more.get(name) for name in _OF_SINGLE_ENVS) or not fields.keys() <= _IGNORED
     if isinstance(env_id, str) and steps_together(
         spec := spec_of(env_id), kwargs, separate=separate
     ):
         kwargs = {"disable_env_checker": True, **kwargs}
-        if fields.keys() <= {"start_method"}:
-            made = VecEnv(alone(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
-        else:
-            fields = {**imports_of(spec), **fields}
-            makers, fields = together(spec, kwargs, n_envs, AutoresetMode.SAME_STEP, fields)
-            made = VecEnv(makers, **fields)
+        made = VecEnv(batch_of(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
         made.seed(seed)
         return vec_envs.VecMonitor(made)
     return make(env_id, n_envs, seed, vec_env_cls=VecEnv, **given)
@@ -109,8 +105,7 @@ class VecEnv(_Base):
     """Envs in worker processes, or a vector env, behind Stable-Baselines3's vector interface.
 
     Args:
-        env_fns: one callable for each env, or for each of several vector environments with the
-            same size and same-step autoreset. They are called only in the workers; lambdas and
+        env_fns: one callable for each env. They are called only in the workers; lambdas and
             functions of ``__main__`` are allowed. Or a `gymnasium.vector.VectorEnv` with same-step
             autoreset, Gymnasium's own included: it stays in this process, without a group.
         start_method: accepted and ignored.
@@ -122,7 +117,6 @@ class VecEnv(_Base):
     Raises:
         ConfigError: a callable can't be sent to a worker, `entry` is wrong, or spaces differ.
         StartFailed: a callable raised, or didn't return an env.
-        RuntimeError: the vector environments differ in size.
         TypeError: `env_fns` is no list of callables.
     """
 
@@ -135,8 +129,7 @@ class VecEnv(_Base):
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]]
-        | gym.vector.VectorEnv[Any, Any, Any],
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]] | gym.vector.VectorEnv[Any, Any, Any],
         start_method: str | None = None,
         **entry: Any,
     ) -> None:
@@ -147,9 +140,8 @@ class VecEnv(_Base):
         self.group: EnvGroup = build_env_group({"name": "env", "task": makers, **entry})
         metas = self.group.init()
         try:
-            self._rows = rows_of(self.group, metas)
-            first = self._rows.spaces[0]
-            for k, spaces in enumerate(self._rows.spaces):
+            first, *others = [(meta.observation_space, meta.action_space) for meta in metas]
+            for k, spaces in enumerate(others, 1):
                 if spaces is not first and spaces != first:
                     raise ConfigError(
                         f"the spaces of env {k} are not those of env 0; Stable-Baselines3 needs "
@@ -160,9 +152,8 @@ class VecEnv(_Base):
             self._unfinished = False
             # Results of a step or reset were not returned, so no episode can go on.
             self._has_lost = False
-            _Base.__init__(self, self._rows.num_envs, *first)
-            with contextlib.suppress(AttributeError):  # Some batches have none.
-                self.metadata: dict[str, Any] = {**self.get_attr("metadata", 0)[0], **self.metadata}
+            _Base.__init__(self, len(metas), *first)
+            self.metadata: dict[str, Any] = {**self.get_attr("metadata", 0)[0], **self.metadata}
         except BaseException:
             self.group.close()
             raise
@@ -179,9 +170,9 @@ class VecEnv(_Base):
         with self._exchange(), self._dropping_the_rest():
             self._has_lost = True
             options = [own or None for own in self._options]  # As Stable-Baselines3 does.
-            self._rows.send_resets(self._seeds, options, range(self.num_envs))
+            send_resets(self.group, self._seeds, options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True)
-        self.reset_infos = self._rows.info_list(batch)
+        self.reset_infos = reported_info_list(batch)
         self._reset_seeds()
         self._reset_options()
         found = self._copied_observations(batch)
@@ -203,12 +194,13 @@ class VecEnv(_Base):
                 "call reset(), or model.set_env(env), after which learn() begins with a reset"
             )
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
-            pairs = zip(self.group.env_ids, self._rows.action_list(actions), strict=True)
+            if len(actions) != self.num_envs:
+                raise ValueError(f"{len(actions)} actions for num_envs={self.num_envs}")
+            pairs = zip(self.group.env_ids, actions, strict=True)
             each = [PolicyResponse(env_id, action) for env_id, action in pairs]
             responses = BatchedData(self.group.env_ids, each)
         else:
-            columns = self._rows.actions(np.asarray(actions))
-            responses = self._answerable.respond(action=columns)
+            responses = self._answerable.respond(action=np.asarray(actions))
         self._has_lost = True  # Until they are returned.
         try:
             self.group.step_async(responses)
@@ -230,23 +222,22 @@ class VecEnv(_Base):
         with self._dropping_the_rest():
             batch, _ = self.group.collect_async(wait_all=True)
         self._answerable, self._unfinished = batch, False
-        rows = self._rows
-        done = rows.flat(batch.done)
-        infos = LazyInfos(lambda: _infos_of_step(rows, batch))
+        done = batch.done
+        infos = LazyInfos(lambda: _infos_of_step(batch))
         ended = np.flatnonzero(done).tolist()
-        lost = rows.flat(batch.restarted) if ended else done
+        lost = batch.restarted if ended else done
         for k in ended:
             cut = infos[k].pop("TimeLimit.truncated")
             returned = index(self._observations, k) if lost[k] else None
             infos[k], self.reset_infos[k] = _last_and_first(infos[k], returned)
             infos[k]["TimeLimit.truncated"] = cut
-        found = self._copied_observations(batch), rows.flat(batch.reward), done, infos
+        found = self._copied_observations(batch), batch.reward, done, infos
         self._has_lost = False
         return found
 
     def _copied_observations(self, batch: BatchedData) -> Any:
         """Copy the observations, and keep them: a death makes them an episode's last ones."""
-        self._observations = self._rows.observation(batch)
+        self._observations = batch.observation
         return copy.deepcopy(self._observations)
 
     def _begin(self) -> None:
@@ -290,13 +281,10 @@ class VecEnv(_Base):
         return all(self._call(None, "has_wrapper_attr", attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the outermost wrapper of envs.
-
-        Raises:
-            ValueError: only some of the envs that are stepped together are chosen.
-        """
+        """Set an attribute of the outermost wrapper of envs."""
         with self._exchange():
-            self._rows.set_outermost(attr_name, value, self._chosen(indices))
+            send_call(self.group, "__setattr__", (attr_name, value), {}, self._chosen(indices))
+            collect_calls(self.group)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
@@ -308,7 +296,8 @@ class VecEnv(_Base):
         """Return for each env whether `wrapper_class` is among its wrappers."""
         chosen = self._chosen(indices)
         with self._exchange():
-            each = dict(zip(chosen, self._rows.are_wrapped(wrapper_class, chosen), strict=True))
+            send_wrapper_question(self.group, wrapper_class, chosen)
+            each = dict(zip(chosen, collect_calls(self.group), strict=True))
         return [each[k] for k in self._places(indices)]
 
     def get_images(self) -> list[Any]:
@@ -327,8 +316,8 @@ class VecEnv(_Base):
 
     def _call_each(self, places: list[int], name: str, args: Any, kwargs: Any) -> Sequence[Any]:
         with self._exchange():
-            self._rows.call(name, args, kwargs, places)
-            return self._rows.values(collect_calls(self.group), places)
+            send_call(self.group, name, args, kwargs, places)
+            return collect_calls(self.group)
 
     def _places(self, indices: Any) -> list[int]:
         return [range(self.num_envs)[k] for k in self._get_indices(indices)]
@@ -431,12 +420,12 @@ class _OfVector(VecEnv):
         return [ask is not None and ask(wrapper_class)] * len(places)
 
     def _call_each(self, places: list[int], name: str, args: Any, kwargs: Any) -> Sequence[Any]:
-        if len(places) == self.num_envs:
-            values = self._inner.call(name, *args, **kwargs)
-            return [values[k] for k in places]
         if self._separate is not None:
             each = [self._separate[k].get_wrapper_attr(name) for k in places]
             return [one(*args, **kwargs) if callable(one) else one for one in each]
+        if len(places) == self.num_envs:
+            values = self._inner.call(name, *args, **kwargs)
+            return [values[k] for k in places]
         if not hasattr(self._inner, "envs"):
             raise ValueError(
                 f"{type(self._inner).__name__} can't call {name}() of only some of its envs"
@@ -453,9 +442,9 @@ def _with_cuts(each: list[dict[str, Any]], cuts: NDArray[np.bool_]) -> list[dict
     return each
 
 
-def _infos_of_step(rows: Singles, batch: BatchedData) -> list[dict[str, Any]]:
+def _infos_of_step(batch: BatchedData) -> list[dict[str, Any]]:
     """List the infos of a step, with ``TimeLimit.truncated``."""
-    return _with_cuts(rows.info_list(batch), rows.flat(batch.truncated & ~batch.terminated))
+    return _with_cuts(reported_info_list(batch), batch.truncated & ~batch.terminated)
 
 
 def _last_and_first(

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.sub_envs.same_step import SameStep
+from rlightning_aio.envs.adapted.same_step import SameStep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

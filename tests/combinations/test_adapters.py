@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -12,17 +11,17 @@ import numpy as np
 import pytest
 from combinations.options import HERE, PLACEMENTS, SEED, pairwise
 from combinations.played import TASKS, Transition, act, as_tuple, played
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+NUM_ENVS = 3
 FACTORS: dict[str, tuple[Any, ...]] = {
     "mode": ("next_step", "same_step", "disabled"),
     "placement": HERE,
-    "width": (0, 2),
     "copy": (True, False),
     "task": tuple(TASKS),
     "limit": (math.inf, 4),
@@ -32,11 +31,10 @@ FACTORS: dict[str, tuple[Any, ...]] = {
 
 @dataclass(frozen=True)
 class Row:
-    """What a row of envs is made with; `width` sub-environments are stepped together."""
+    """What a row of envs is made with."""
 
     mode: str
     placement: str
-    width: int
     copy: bool
     task: str
     limit: float
@@ -44,25 +42,16 @@ class Row:
 
     @property
     def fits(self) -> bool:
-        """Vector environments keep their own limits; in one process nothing can be resumed."""
-        limited = self.width and self.limit != math.inf
-        return not limited and not (self.snapshot_every and self.placement == "inline")
-
-    @property
-    def num_envs(self) -> int:
-        return 3 * max(self.width, 1)
+        """In one process nothing can be resumed."""
+        return not (self.snapshot_every and self.placement == "inline")
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
         return AutoresetMode[self.mode.upper()]
 
     def makers(self) -> list[Callable[[], Any]]:
-        """One callable for each env, or for as many together."""
-        one = TASKS[self.task]
-        if self.width:
-            several = [one] * self.width
-            return [partial(SyncVectorEnv, several, autoreset_mode=self.autoreset_mode)] * 3
-        return [one] * 3
+        """One callable for each env."""
+        return [TASKS[self.task]] * NUM_ENVS
 
     def entry(self) -> dict[str, Any]:
         """The fields of the group's entry."""
@@ -75,7 +64,7 @@ class Row:
 
     def check(self, lists: list[list[Transition]], at_least: int) -> None:
         """Compare lists with what the envs must have done, each in its own time."""
-        assert len(lists) == self.num_envs
+        assert len(lists) == NUM_ENVS
         assert min(map(len, lists)) >= at_least
         for k, own in enumerate(lists):
             (expected,) = played(self.task, "disabled", [SEED + k], self.limit, len(own))
@@ -92,8 +81,8 @@ def ids(row: Row) -> str:
 @pytest.mark.parametrize("row", ROWS, ids=ids)
 def test_vector_env(row: Row) -> None:
     """As a loop stores it that knows Gymnasium's modes, and nothing of groups."""
-    lists: list[list[Transition]] = [[] for _ in range(row.num_envs)]
-    first, over = np.ones((2, row.num_envs), np.bool_)
+    lists: list[list[Transition]] = [[] for _ in range(NUM_ENVS)]
+    first, over = np.ones((2, NUM_ENVS), np.bool_)
     over[:] = False
     envs = VectorEnv(row.makers(), copy=row.copy, autoreset_mode=row.autoreset_mode, **row.entry())
     try:
@@ -134,8 +123,8 @@ def test_vector_env(row: Row) -> None:
 @pytest.mark.parametrize("row", [row for row in ROWS if row.mode == "same_step"], ids=ids)
 def test_sb3_vec_env(row: Row) -> None:
     """As Stable-Baselines3 stores it: the last observation of an episode is in the info."""
-    lists: list[list[Transition]] = [[] for _ in range(row.num_envs)]
-    first = [True] * row.num_envs
+    lists: list[list[Transition]] = [[] for _ in range(NUM_ENVS)]
+    first = [True] * NUM_ENVS
     envs = import_module("rlightning_aio.sb3").VecEnv(row.makers(), **row.entry())
     try:
         envs.seed(SEED)

@@ -23,7 +23,7 @@ from rlightning_aio.envs.mujoco.batch import MujocoBatch
 from rlightning_aio.envs.mujoco.outputs import compiled, offset_of
 from rlightning_aio.envs.mujoco.threads import Simulations
 from rlightning_aio.envs.simulators.gymnasium import MujocoEnv, outdated_assets_accepted
-from rlightning_aio.errors import ConfigError, EnvRaised
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.vector import make_vec
 
 if TYPE_CHECKING:
@@ -396,21 +396,17 @@ def test_a_snapshot_has_the_randomized_fields() -> None:
         ({}, {"randomize": RANGES}, "randomize of the snapshot's simulations is None"),
     ],
 )
-def test_a_snapshot_of_other_simulations_is_refused(saved: Any, here: Any, message: str) -> None:
-    """Those of `make_vec` have no config to compare; nothing is changed."""
-    entry = {"placement": "inline"}
+def test_a_state_of_other_simulations_is_refused(saved: Any, here: Any, message: str) -> None:
+    """Nothing is changed."""
     actions = np.ones((2, 3), np.float32)
-    one, other = (make_vec("Hopper-v5", 2, None, entry, **given) for given in (saved, here))
-    one.reset(seed=0)
-    other.reset(seed=0)
-    with pytest.raises(EnvRaised, match=message):
-        other.group.restore(one.group.snapshot())
-    one.close()
-    alike = make_vec("Hopper-v5", 2, None, entry, **here)
-    alike.reset(seed=0)
+    one, other, alike = (make_vec("Hopper-v5", 2, **given) for given in (saved, here, here))
+    for envs in (one, other, alike):
+        envs.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        other.load_state(one.save_state())
     assert_alike(other.step(actions), alike.step(actions))
-    alike.close()
-    other.close()
+    for envs in (one, other, alike):
+        envs.close()
 
 
 @pytest.mark.parametrize(
@@ -439,8 +435,6 @@ def test_randomization_needs_simulations_that_are_stepped_together() -> None:
     )
     with pytest.raises(ConfigError, match="stepped together: num_envs above 1"):
         MujocoEnv(config)
-    with pytest.raises(ConfigError, match="several in each batch"):
-        make_vec("Hopper-v5", 1, None, {"max_concurrency": 1}, randomize=RANGES)
     for options in ({"randomize": RANGES}, {"num_threads": 2}):
         with pytest.raises(ConfigError, match=f"{next(iter(options))} needs envs that are stepped"):
             make_vec("Hopper-v5", 2, "async", **options)

@@ -239,7 +239,7 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
         {"rollout": (6, None), "learn": (2, None), "kill": (2, "die"), "client": (4, CLIENTS)},
     ),
     "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
-    "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls")}),
+    "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls"), "state": (2, "snapshots")}),
     "sb3": (2, ROWS),
     "attempts": (0, {"attempts": (6, None), "kill": (2, "die"), "client": (4, CLIENTS)}),
 }
@@ -303,14 +303,10 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
 
 def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozenset[str], list[Plan]]:
     """What a vector interface is made of: envs of one kind, in a synchronous group."""
-    features -= {"async", "base", "awaitable", "several entries"}
+    features -= {"async", "base", "awaitable", "several entries", "stacked"}
     if kind == "sb3":
         features -= {"out of band"}
     plan = _plan(rng, features, "env")
-    if plan.form == "stacked" and plan.mode == "next_step" and plan.on_death == "resume":
-        plan = replace(plan, on_death="restart", every=None)
-    if plan.form == "stacked" and kind == "sb3":
-        plan = replace(plan, mode="same_step")
     return features, [plan]
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from contextlib import contextmanager
+from copy import deepcopy
 from functools import partial
 from importlib import import_module
 from random import Random
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 from unittest import mock
 
 import numpy as np
@@ -16,19 +18,15 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import iterate
 from simulator.model import Env, Violation, require, same, sub_info
-from simulator.scripted import (
-    Scripted,
-    Stacked,
-    Words,
-    element,
-    encoded,
-    words_of,
-)
+from simulator.scripted import Scripted, Words, element, encoded, words_of
 from simulator.session import Session, stacked
 from simulator.trails import Trail, Transition, is_begun
 
-from rlightning_aio.errors import EnvFault, StartFailed, WorkerDied
+from rlightning_aio.errors import EnvFault, SnapshotError, StartFailed, WorkerDied
 from rlightning_aio.vector import VectorEnv
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 
 class Vectors(Session):
@@ -50,15 +48,11 @@ class Vectors(Session):
 
     async def start(self) -> bool:
         (plan,) = self.program.plans
-        self.mode = self.mode_of(plan.mode)
+        self.mode = self.mode_of()
         makers: list[Any] = []
         for worker in range(plan.num_workers):
-            codes = plan.codes(0, worker)
-            tail = plan.layout, plan.controls
-            if plan.form == "stacked":
-                makers.append(partial(Stacked, codes, plan.mode, plan.limit, *tail))
-            else:
-                makers.append(partial(Scripted, codes[0], *tail))
+            (code,) = plan.codes(0, worker)
+            makers.append(partial(Scripted, code, plan.layout, plan.controls))
         fields = plan.config(0)
         for name in ("name", "num_workers", "task"):
             fields.pop(name, None)
@@ -70,10 +64,8 @@ class Vectors(Session):
         self.group = self.rows.group
         return True
 
-    def mode_of(self, mode: str) -> str:
-        """The autoreset mode: that of several together, or any."""
-        if self.program.plans[0].form == "stacked":
-            return mode
+    def mode_of(self) -> str:
+        """The autoreset mode: any."""
         return Random(self.program.seed).choice(["next_step", "same_step", "disabled"])
 
     def close_group(self) -> None:
@@ -93,6 +85,7 @@ class Vectors(Session):
         self.lost = [False] * len(codes)
         self.breaks = 0
         self.kept: list[tuple[Any, Any]] = []
+        self.saved: Any = None
         self.is_whole = False
         require(self.rows.num_envs == len(codes), "as many rows", self.rows.num_envs)
 
@@ -178,11 +171,6 @@ class Vectors(Session):
         except EnvFault as fault:
             self.fail(fault)
             return
-        except ResetNeeded:
-            died = [env.losses > 0 for env in self.env_of]
-            require(any(died) and not mask[died].all(), "others were lost, and none has died")
-            self.counts["died beside a mask"] += 1
-            return
         self.breaks += 1
         self.is_whole = True
         for k, one in enumerate(self.words(observation)):
@@ -194,8 +182,6 @@ class Vectors(Session):
 
     async def op_call(self, rng: Random) -> None:
         """Call a method of all."""
-        if self.program.plans[0].form == "stacked":
-            return
         try:
             values = self.rows.call("peek", 7)
         except WorkerDied as fault:
@@ -207,6 +193,40 @@ class Vectors(Session):
             require(
                 died or not self.is_whole or tuple(words[0]) == self.shown[k], "state", k, words
             )
+
+    async def op_state(self, rng: Random) -> None:
+        """Save the state of all, or restore what was saved last."""
+        if self.saved is None or rng.random() < 0.5:
+            if not self.is_whole:
+                return
+            with self.perhaps_none():
+                state = self.rows.save_state()
+                self.saved = state, deepcopy((self.trails, self.shown, self.over, self.lost))
+            return
+        state, model = self.saved
+        is_restored, is_whole, self.is_whole = False, self.is_whole, False
+        with self.perhaps_none():
+            try:
+                self.rows.load_state(state)
+            except ResetNeeded:
+                require(any(env.losses for env in self.envs), "none has died")
+                return
+            is_restored = True
+        if not is_restored:
+            self.is_whole = is_whole
+            return
+        self.trails, self.shown, self.over, self.lost = deepcopy(model)
+        self.breaks += 1
+        self.is_whole = True
+
+    @contextmanager
+    def perhaps_none(self) -> Iterator[None]:
+        """Context in which there may be no state: of lost envs, or of one that keeps its own."""
+        try:
+            yield
+        except (EnvFault, SnapshotError) as fault:
+            lost = any(env.losses for env in self.envs)
+            require(lost or "keeps its state" in str(fault), "no state", repr(fault))
 
     # -- checks
 
@@ -267,9 +287,7 @@ class Vectors(Session):
         self.over[k] = any(ends) or (was_over and stays)
         self.shown[k] = now
         if self.mode == "next_step" and was_over:
-            # Several that are stepped together are reset together, once more.
-            again = died and env.entry.form == "stacked" and ends[1]
-            require((reward, ends) == (0.0, (False, again)), "a reset", k, reward, ends)
+            require((reward, ends) == (0.0, (False, False)), "a reset", k, reward, ends)
             begun = is_begun(now) or (trail.resumes and trail.has_shown(now))
             require(begun or died, "no reset", k, now)
             return
@@ -313,7 +331,7 @@ class Singles(Vectors):
         self.copies = True
         return VecEnv(makers, **fields)
 
-    def mode_of(self, mode: str) -> str:
+    def mode_of(self) -> str:
         return "same_step"
 
     def reset_rows(self, seed: int | None) -> tuple[Any, Any]:

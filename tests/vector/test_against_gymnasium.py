@@ -134,14 +134,13 @@ def test_it_does_the_same_as_gymnasiums(mode: AutoresetMode, did: list[Any], see
     ],
     seed=0,
 )
-@pytest.mark.parametrize("entry", [{}, {"placement": "inline"}], ids=["alone", "in a group"])
 @given(did=histories(PENDULUM), seed=st.integers(0, 99))
 def test_envs_that_are_stepped_together_do_the_same(
-    mode: AutoresetMode, entry: dict[str, Any], did: list[Any], seed: int
+    mode: AutoresetMode, did: list[Any], seed: int
 ) -> None:
     """Simulations of one model, whose Gymnasium env takes the state of each in turn."""
     arguments = {"autoreset_mode": mode}
     task, kwargs = "InvertedPendulum-v5", {"max_episode_steps": 7}
-    ours = make_vec(task, SIZE, vector_kwargs={**arguments, **entry}, **kwargs)
+    ours = make_vec(task, SIZE, vector_kwargs=arguments, **kwargs)
     theirs = gym.make_vec(task, SIZE, "sync", arguments, **kwargs)
     compare(ours, theirs, did, seed)

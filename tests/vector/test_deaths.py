@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 from kit.processes import kill, stop
-from vector.numbered import Walk, counted
+from vector.numbered import Counted
 from vector.toys import Mortal, assert_alike
 
-from rlightning_aio.errors import ConfigError, WorkerDied
+from rlightning_aio.errors import WorkerDied
 from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
@@ -29,8 +26,8 @@ LOST = [True, True, False, False]
 
 
 def made(**arguments: Any) -> VectorEnv:
-    """Two workers, each with two simulations that it steps together."""
-    entry = {"placement": "process", "max_concurrency": 2, **arguments}
+    """Two workers, each with two envs."""
+    entry = {"placement": "process", "envs_per_process": 2, **arguments}
     return make_vec(TASK, 4, vector_kwargs=entry)
 
 
@@ -252,8 +249,25 @@ def test_one_that_was_about_to_be_reset_has_lost_nothing() -> None:
     envs.close()
 
 
+def test_a_state_between_a_death_and_the_step_that_resets_is_restored() -> None:
+    makers = [Counted] * 4
+    envs = VectorEnv(makers, envs_per_process=2)
+    actions = np.zeros(4, np.int64)
+    envs.reset(seed=0)
+    envs.step(actions)
+    killed(envs.group, lambda: envs.step_async(actions))
+    assert envs.step_wait()[3].tolist() == LOST
+    kept = envs.save_state()
+    expected = [envs.step(actions) for _ in range(3)]
+    assert (expected[0][1] == 0).tolist() == LOST
+    for _ in range(2):
+        envs.load_state(kept)
+        assert_alike([envs.step(actions) for _ in range(3)], expected)
+    envs.close()
+
+
 def test_a_second_death_during_resets() -> None:
-    """The env that was stepped loses its new episode; the other one begins its episode."""
+    """The env that was stepped loses its new episode in this step, the other one in the next."""
     envs = made(max_restarts=5)
     due = step_until_one_has_ended(envs)
     lost = 1 - due
@@ -262,32 +276,17 @@ def test_a_second_death_during_resets() -> None:
     shown = envs._observations.copy()
     killed(envs.group, lambda: envs.step_async(ACTIONS))
     observations, rewards, _, truncated, infos = envs.step_wait()
-    assert infos["_worker_restarted"].tolist() == LOST
-    assert truncated[[due, lost]].tolist() == [True, False]
+    assert infos["_worker_restarted"].tolist() == truncated.tolist() == [k == due for k in range(4)]
     assert rewards[:2].tolist() == [0, 0]
     np.testing.assert_array_equal(observations[due], shown[due])
-    _, rewards, _, truncated, _ = envs.step(ACTIONS)
-    assert rewards[due] == 0 != rewards[lost]
-    assert not truncated.any()
-    envs.close()
-
-
-def test_envs_that_are_reset_together_lose_their_episodes_together() -> None:
-    """A task's vector environment without masks."""
-    entry = {"max_concurrency": 2, "autoreset_mode": "NextStep"}
-    envs = make_vec("CartPole-v1", 4, "vector_entry_point", entry)
-    step_until_one_has_ended(envs)
-    shown, actions = envs._observations.copy(), np.zeros(4, np.int64)
-    killed(envs.group, lambda: envs.step_async(actions))
-    observations, _, _, truncated, _ = envs.step_wait()
-    assert truncated[:2].tolist() == [True, True]
-    np.testing.assert_array_equal(observations[:2], shown[:2])
-    observations, rewards, terminated, truncated, _ = envs.step(actions)
+    _, rewards, _, truncated, infos = envs.step(ACTIONS)
+    assert (
+        infos["_worker_restarted"].tolist() == truncated.tolist() == [k == lost for k in range(4)]
+    )
     assert rewards[:2].tolist() == [0, 0]
-    assert not (terminated | truncated)[:2].any()
-    assert abs(observations[:2]).max() <= 0.05
-    # The poles of the other worker may have fallen meanwhile.
-    np.testing.assert_array_equal(envs.step(actions)[1], ~(terminated | truncated))
+    _, rewards, _, truncated, _ = envs.step(ACTIONS)
+    assert rewards[lost] == 0 != rewards[due]
+    assert not truncated.any()
     envs.close()
 
 
@@ -347,9 +346,6 @@ def test_resumed_episodes_continue_as_new_ones(mode: AutoresetMode) -> None:
         np.testing.assert_array_equal(again[0], before[0])
     np.testing.assert_array_equal(envs.step(actions)[0][0], observations[1])
     envs.close()
-    if mode == AutoresetMode.NEXT_STEP:
-        with pytest.raises(ConfigError, match=r"resume.*vectorization_mode='async'"):
-            made(on_worker_death="resume", snapshot_every=1)
 
 
 @pytest.mark.simulators
@@ -362,7 +358,7 @@ def test_stable_baselines3_gets_deaths_in_its_own_form() -> None:
     envs = make_vec_env(TASK, 4, vec_env_kwargs=entry)
     envs.seed(7)
     before = envs.reset()
-    killed(envs.venv.group, lambda: envs.step_async(ACTIONS))
+    killed(envs.group, lambda: envs.step_async(ACTIONS))
     observations, rewards, done, infos = envs.step_wait()
     assert done.tolist() == [info["TimeLimit.truncated"] for info in infos] == LOST
     assert ["worker_restarted" in info for info in infos] == LOST
@@ -435,46 +431,24 @@ def test_a_rollout_buffer_begins_an_episode_after_a_death(sb3_mortals: Any) -> N
     assert len(episodes) == ends
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-def test_a_masked_reset_is_refused_where_a_death_has_ended_other_episodes(
-    mode: AutoresetMode,
-) -> None:
-    """The envs of a batch die together, between two calls, and one of them is to be reset."""
-    entry = {"placement": "process", "max_concurrency": 1, "autoreset_mode": mode}
-    envs = make_vec("Hopper-v5", 3, vector_kwargs=entry)
-    envs.reset(seed=0)
-    envs.step(np.zeros((3, 3), np.float32))
-    (worker,) = envs.group.get_workers()
-    os.kill(worker["pid"], signal.SIGKILL)
-    with pytest.raises(ResetNeeded, match="reset_mask leaves out"):
-        envs.reset(options={"reset_mask": np.array([False, True, False])})
-    with pytest.raises(ResetNeeded):
-        envs.step(np.zeros((3, 3), np.float32))
-    envs.reset()
-    envs.step(np.zeros((3, 3), np.float32))
-    envs.close()
-
-
 @pytest.mark.parametrize("on_worker_death", ["restart", "resume"])
-def test_a_masked_reset_is_refused_where_a_neighbour_has_taken_the_worker_along(
-    on_worker_death: str,
+@pytest.mark.parametrize("mode", MODES)
+def test_a_masked_reset_leaves_it_to_the_next_step_to_tell_of_other_lost_episodes(
+    mode: AutoresetMode, on_worker_death: str
 ) -> None:
-    """The batch to be reset had answered the step in which the other batch died."""
-    off = AutoresetMode.DISABLED
-    maker = lambda: SyncVectorEnv([Walk] * 2, autoreset_mode=off)  # noqa: E731
-    config: Any = {"on_worker_death": on_worker_death, "envs_per_process": 2}
-    if on_worker_death == "resume":
-        config["snapshot_every"] = 1
-    envs = VectorEnv([maker] * 2, autoreset_mode=off, **config)
+    """Three envs of one worker, which dies between two calls; one of them is to be reset."""
+    entry = fields_of(on_worker_death) | {"envs_per_process": 3, "autoreset_mode": mode}
+    envs = VectorEnv([Counted] * 3, **entry)
+    nothing = np.zeros(3, np.int64)
     envs.reset(seed=0)
-    envs.step(np.zeros(4, np.int64))
-    _, _, terminated, truncated, _ = envs.step(np.array([2, 0, 0, 3]))
-    mask = terminated | truncated
-    assert mask.tolist() == [True, False, True, True]
-    with pytest.raises(ResetNeeded, match="reset_mask leaves out"):
-        envs.reset(options={"reset_mask": mask})
-    assert envs.reset()[0].tolist() == [[0.0]] * 4
-    assert envs.step(np.zeros(4, np.int64))[0].tolist() == [[1.0]] * 4
+    envs.step(nothing)
+    kill(envs.group.get_workers()[0]["pid"])
+    first, infos = envs.reset(options={"reset_mask": np.array([False, True, False])})
+    assert first[:, 1].tolist() == [1, 0, 1]
+    assert not infos.get("_worker_restarted", nothing)[[0, 2]].any()
+    _, rewards, _, truncated, infos = envs.step(nothing)
+    assert truncated.tolist() == infos["_worker_restarted"].tolist() == [True, False, True]
+    assert rewards.tolist() == [0, 1, 0]
     envs.close()
 
 
@@ -483,26 +457,15 @@ SAVED = {
     "a step": ([0, 0, 0], 2),
     "an end": ([0, 1], 2),
     "an end before the last step": ([1, 0], 1),
-    "an end of only one": ([0, 1], 2),
 }
 """Actions before a death, and the position of the result that was saved last, from the reset."""
 
 
-def fits(mode: AutoresetMode, on_worker_death: str, saved: str, width: int) -> bool:
-    """Return False if it is refused, or as in another case."""
-    if on_worker_death == "restart":
-        return saved in ("a reset", "an end")
-    if saved == "an end of only one":
-        return mode == AutoresetMode.SAME_STEP and width > 0
-    return mode != AutoresetMode.NEXT_STEP or not width
-
-
-CASES = [case for case in product(MODES, ["restart", "resume"], SAVED, [0, 2]) if fits(*case)]
-
-
-def ending(lost: Any, saved: str) -> Any:
-    """Mask of the envs whose episode the action 1 ends: of the worker that will die."""
-    return np.arange(len(lost)) == 0 if saved == "an end of only one" else lost
+CASES = [
+    (mode, on_worker_death, saved)
+    for mode, on_worker_death, saved in product(MODES, ["restart", "resume"], SAVED)
+    if on_worker_death == "resume" or saved in ("a reset", "an end")
+]
 
 
 def fields_of(on_worker_death: str) -> dict[str, Any]:
@@ -543,17 +506,17 @@ def closed_after() -> Iterator[list[Any]]:
         envs.close()
 
 
-@pytest.mark.parametrize(("mode", "on_worker_death", "saved", "width"), CASES)
+@pytest.mark.parametrize(("mode", "on_worker_death", "saved"), CASES)
 def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
-    mode: AutoresetMode, on_worker_death: str, saved: str, width: int, closed_after: list[Any]
+    mode: AutoresetMode, on_worker_death: str, saved: str, closed_after: list[Any]
 ) -> None:
     """Whatever the result was that was saved last."""
     resumes, at_once = on_worker_death == "resume", mode == AutoresetMode.SAME_STEP
-    envs = VectorEnv(counted(width, mode), autoreset_mode=mode, **fields_of(on_worker_death))
+    envs = VectorEnv([Counted] * 2, autoreset_mode=mode, **fields_of(on_worker_death))
     closed_after.append(envs)
-    size, (actions, place) = max(width, 1), SAVED[saved]
-    lost, nothing = np.arange(2 * size) < size, np.zeros(2 * size, int)
-    shown, due = observed(envs, actions, ending(lost, saved))
+    actions, place = SAVED[saved]
+    lost, nothing = np.array([True, False]), np.zeros(2, int)
+    shown, due = observed(envs, actions, lost)
     if due.any():
         killed(envs.group, lambda: envs.reset_async(options={"reset_mask": due}))
         observation, infos = envs.reset_wait()
@@ -566,16 +529,16 @@ def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
     assert all("was killed by SIGKILL" in cause for cause in infos["worker_restarted"][lost])
     if saved == "an end" and not at_once:  # It was about to be reset, and has lost nothing.
         assert (truncated.any(), "final_obs" in infos) == (False, False)
-        assert observation[lost].tolist() == [[2, 0] if resumes else [1, 0]] * size
+        assert observation[lost].tolist() == [[2, 0] if resumes else [1, 0]]
         return
     if saved == "an end before the last step" and not at_once:
         place = 2  # The last step was a reset, after which the state was saved.
-    first = shown[place][lost].tolist() if resumes else [[1, 0]] * size
+    first = shown[place][lost].tolist() if resumes else [[1, 0]]
     last, causes = shown[-1][lost].tolist(), causes_of(on_worker_death)
     causes |= {f"_{cause}" for cause in causes}
     assert truncated.tolist() == lost.tolist()
     if resumes:
-        assert infos["worker_resumed"][lost].tolist() == [len(actions) - place] * size
+        assert infos["worker_resumed"][lost].tolist() == [len(actions) - place]
     if at_once:
         assert observation[lost].tolist() == first
         assert infos["_final_obs"].tolist() == infos["_final_info"].tolist() == lost.tolist()
@@ -593,30 +556,27 @@ def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
 
 @pytest.mark.simulators
 @pytest.mark.parametrize(
-    ("on_worker_death", "saved", "width"),
+    ("on_worker_death", "saved"),
     [own for mode, *own in CASES if mode == AutoresetMode.SAME_STEP],
 )
 def test_what_a_lost_step_reports_to_stable_baselines3(
-    on_worker_death: str, saved: str, width: int, closed_after: list[Any]
+    on_worker_death: str, saved: str, closed_after: list[Any]
 ) -> None:
     pytest.importorskip("stable_baselines3")
     from rlightning_aio.sb3 import VecEnv
 
     resumes, (actions, place) = on_worker_death == "resume", SAVED[saved]
-    size = max(width, 1)
-    makers = counted(width, AutoresetMode.SAME_STEP)
-    envs = VecEnv(makers, **fields_of(on_worker_death))
+    envs = VecEnv([Counted] * 2, **fields_of(on_worker_death))
     closed_after.append(envs)
-    lost = np.arange(2 * size) < size
-    shown = [envs.reset(), *(envs.step(action * ending(lost, saved))[0] for action in actions)]
-    killed(envs.group, lambda: envs.step_async(np.zeros(2 * size, int)))
+    lost = np.array([True, False])
+    shown = [envs.reset(), *(envs.step(action * lost)[0] for action in actions)]
+    killed(envs.group, lambda: envs.step_async(np.zeros(2, int)))
     observation, reward, done, infos = envs.step_wait()
     assert (done.tolist(), reward.tolist()) == (lost.tolist(), (~lost).tolist())
-    first = shown[place].tolist() if resumes else [[1, 0]] * size
+    first = shown[place].tolist() if resumes else [[1, 0]]
     causes = causes_of(on_worker_death)
-    for k in range(size):
-        assert infos[k].keys() == causes | {"terminal_observation", "TimeLimit.truncated"}
-        assert infos[k]["TimeLimit.truncated"]
-        assert infos[k]["terminal_observation"].tolist() == shown[-1][k].tolist()
-        assert observation[k].tolist() == first[k]
-        assert not envs.reset_infos[k].keys() & {"final_obs", "final_info", *causes}
+    assert infos[0].keys() == causes | {"terminal_observation", "TimeLimit.truncated"}
+    assert infos[0]["TimeLimit.truncated"]
+    assert infos[0]["terminal_observation"].tolist() == shown[-1][0].tolist()
+    assert observation[0].tolist() == first[0]
+    assert not envs.reset_infos[0].keys() & {"final_obs", "final_info", *causes}

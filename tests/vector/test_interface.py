@@ -26,6 +26,7 @@ from patience import HANG
 from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
+from rlightning_aio import sync
 from rlightning_aio.errors import BadAction, EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
 
@@ -210,24 +211,28 @@ class Old(gym.vector.VectorEnv[Any, Any, Any]):
     num_envs = 2
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_metadata_must_be_a_dict(mode: str) -> None:
+    with pytest.raises(StartFailed, match="the metadata of Unsaid must be a dict, not None"):
+        VectorEnv([Unsaid], autoreset_mode=mode, placement="inline")
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Unsaid, "the metadata of Unsaid must be a dict, not None"),
         (without_mode, r"CartPoleVectorEnv has no autoreset_mode.*env\.metadata = "),
         (Old, "Old is no vector environment.*single_observation_space.*backend: pettingzoo"),
     ],
 )
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_incomplete_metadata_raise_with_the_fix(make: Any, message: str, mode: str) -> None:
+def test_an_incomplete_vector_environment_raises_with_the_fix(make: Any, message: str) -> None:
     with pytest.raises(StartFailed, match=message):
-        VectorEnv([make], autoreset_mode=mode, placement="inline")
+        sync.build_env_group({"name": "e", "task": make, "placement": "inline"}).init()
 
 
 def test_a_vector_env_with_a_declared_mode_is_accepted() -> None:
-    with contextlib.closing(VectorEnv([with_mode] * 2, placement="inline")) as env:
-        assert env.num_envs == 4
-        env.reset()
+    with sync.build_env_group({"name": "e", "task": with_mode, "placement": "inline"}) as group:
+        batch, _ = group.reset()
+        assert batch.observation.shape == (1, 2, 4)
 
 
 class Late(Plain):
@@ -350,22 +355,22 @@ def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:
 
 @pytest.mark.parametrize(
     ("task", "mode"),
-    [("CartPole-v1", None), (POLE, None), (POLE, "async"), ("CartPole-v1", "vector_entry_point")],
+    [("CartPole-v1", None), (POLE, None), (POLE, "async")],
 )
 def test_make_vec_passes_on_what_the_runtime_needs(task: str, mode: Any) -> None:
     """Whatever makes the envs; what the task needs goes to the task."""
     fields: dict[str, Any] = {"envs_per_process": 1, "step_timeout": HANG, "max_restarts": 0}
     rendered = {"render_mode": "rgb_array"}
-    modes = {"autoreset_mode": AutoresetMode.SAME_STEP} if mode != "vector_entry_point" else {}
-    env = make_vec(task, 2, mode, vector_kwargs={"max_restarts": 7}, **fields, **modes, **rendered)
+    fields["autoreset_mode"] = AutoresetMode.SAME_STEP
+    env = make_vec(task, 2, mode, vector_kwargs={"max_restarts": 7}, **fields, **rendered)
     with contextlib.closing(env):
         config = env.group._core.envs.configs[0]
         assert (config.envs_per_process, config.step_timeout) == (1, HANG)
         assert config.max_restarts == 0
-        assert env.autoreset_mode == modes.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        assert env.autoreset_mode == AutoresetMode.SAME_STEP
         assert env.render_mode == "rgb_array"
         assert env.spec is not None
-        assert env.spec.kwargs.keys() & {*fields, "autoreset_mode"} == set()
+        assert env.spec.kwargs.keys() & fields.keys() == set()
 
 
 def test_errors_name_what_the_user_has_given() -> None:
@@ -480,9 +485,8 @@ def test_make_vec_takes_gymnasiums_modes() -> None:
     inline = {"placement": "inline"}
     for mode in (gym.VectorizeMode.ASYNC, "async", None):
         make_vec("Pendulum-v1", 1, mode, inline).close()
-    make_vec("CartPole-v1", 2, gym.VectorizeMode.VECTOR_ENTRY_POINT, inline).close()
     for mode in (gym.VectorizeMode.SYNC, "sync"):
-        with pytest.raises(ValueError, match="not 'sync'; placement='inline'"):
+        with pytest.raises(ValueError, match="not 'sync': placement='inline'"):
             make_vec("Pendulum-v1", 1, mode)  # pyright: ignore[reportArgumentType]
 
 

@@ -143,13 +143,11 @@ def test_in_workers(mode: AutoresetMode) -> None:
 
 
 def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limit: int) -> None:
-    """Four simulations that are one batch, and in two workers, each stepping two together."""
+    """Four simulations that are one batch."""
     kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
-    for entry in ({}, {"max_concurrency": 2}):
-        ours: Any = make_vec(task, 4, vector_kwargs={**arguments, **entry}, **kwargs)
-        assert not entry or len(ours.group.env_ids) == 2
-        theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
-        compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
+    ours: Any = make_vec(task, 4, vector_kwargs=arguments, **kwargs)
+    theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
+    compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -213,18 +211,14 @@ def test_beside_stable_baselines3s_processes(task: str) -> None:
 @pytest.mark.simulators
 @pytest.mark.parametrize("task", TOGETHER)
 def test_together_beside_stable_baselines3s_processes(task: str) -> None:
-    """The same with two workers that step two simulations each."""
     vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
     from rlightning_aio.sb3 import make_vec_env
 
     makers = [functools.partial(gym.make, task, max_episode_steps=150, render_mode="rgb_array")] * 4
     theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
     # Monitors round their infos differently, so compare the envs without them.
-    ours = make_vec_env(
-        task, 4, env_kwargs={"max_episode_steps": 150}, vec_env_kwargs={"envs_per_process": 2}
-    ).venv
+    ours = make_vec_env(task, 4, env_kwargs={"max_episode_steps": 150}).venv
     with closing(theirs), closing(ours):
-        assert len(ours.group.env_ids) == 2
         compare_with_stable_baselines3(ours, theirs, task, makers)
 
 
@@ -236,7 +230,7 @@ def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: list[Any]) -> None:
     """A thousand steps of both, and of a plain loop."""
-    together = len(ours.group.env_ids) < ours.num_envs
+    together = hasattr(ours, "envs")  # A batch.
     actions = actions_for(theirs.action_space, 1000, len(makers))
     for env in (ours, theirs):
         env.seed(SEED)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.batch.endings import all_agents, summed_rewards
-from rlightning_aio.batch.infos import joined_infos, sub_env_infos_of_rows
 from rlightning_aio.batch.parts import (
     column_of_parts,
     infos_of_parts,
@@ -47,7 +46,6 @@ __all__ = [
     "plain_columns",
     "reported_info_list",
     "reported_infos",
-    "reported_sub_env_infos",
     "slots_of",
     "slots_of_results",
     "sources_of",
@@ -58,17 +56,6 @@ __all__ = [
 def reported_infos(batch: BatchedData) -> dict[str, Any]:
     """`BatchedData.infos` of a batch of results, without the sums of episodes."""
     return infos_of_parts(batch._parts, episodes=False)
-
-
-def reported_sub_env_infos(batch: BatchedData, num_envs: int) -> dict[str, Any]:
-    """`reported_infos` over all sub-environments, of envs with `num_envs` each.
-
-    The batch must be in the order of the group.
-    """
-    parts = batch._parts
-    if len(parts) == 1:
-        return sub_env_infos_of_rows(parts[0], num_envs)
-    return joined_infos(reported_info_list(batch), num_envs)
 
 
 def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:

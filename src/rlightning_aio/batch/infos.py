@@ -23,10 +23,9 @@ if TYPE_CHECKING:
 __all__ = [
     "columns_of_infos",
     "info_list_of_rows",
+    "infos_of_each",
     "infos_of_rows",
-    "joined_infos",
     "listed",
-    "sub_env_infos_of_rows",
     "vector_infos",
 ]
 
@@ -155,59 +154,22 @@ def info_list_of_rows(part: ResultColumns) -> list[dict[str, Any]]:
     return infos
 
 
-def sub_env_infos_of_rows(part: ResultColumns, num_envs: int) -> dict[str, Any]:
-    """Convert infos of rows with sub-environments to columns ``[n * num_envs, ...]``.
+def infos_of_each(info: dict[str, Any], num_envs: int) -> dict[str, Any]:
+    """Columns with masks of the info of a vector environment with `num_envs` envs.
 
-    A value of a whole env is repeated for each sub-environment.
+    A value of the whole environment is repeated for each env.
     """
-    columns = None
-    if not part.out_of_band:
-        schema = _schema_of_all(part)
-        # Views suffice, because flattening several rows makes a copy.
-        columns = _columns_of_rows(part) if schema is None else _fields(part, schema)
-    if columns is None:
-        return joined_infos([part.reported_info_of(row) for row in range(len(part))], num_envs)
-    flat: dict[str, Any] = {}
-    for key, column in columns.items():
-        if column.shape[1:2] == (num_envs,):
-            flat[key] = column.reshape(-1, *column.shape[2:])
-        else:
-            flat[key] = column.repeat(num_envs, axis=0)
-    return flat
-
-
-def joined_infos(infos: Sequence[dict[str, Any]], num_envs: int) -> dict[str, Any]:
-    """Concatenate the infos of vector environments with `num_envs` envs each."""
-    if len(infos) == 1 and _is_of_each(infos[0], num_envs):
-        return infos[0]
-    joined: dict[str, Any] = {}
-    for key in dict.fromkeys(key for info in infos for key in info):
-        given = {k: info[key] for k, info in enumerate(infos) if key in info}
-        if all(isinstance(value, dict) for value in given.values()):
-            joined[key] = joined_infos([given.get(k, {}) for k in range(len(infos))], num_envs)
-        else:
-            arrays = {k: _of_each(value, num_envs) for k, value in given.items()}
-            joined[key] = _joined_column(arrays, len(infos) * num_envs, num_envs)
-    for key in [key for key in joined if not has_mask(key, joined)]:
-        mask = np.array([key in info for info in infos])
-        joined[f"_{key}"] = mask.repeat(num_envs)
-    return joined
-
-
-def _joined_column(arrays: Mapping[int, Any], total: int, num_envs: int) -> NDArray[Any]:
-    """Column of `total` rows from arrays of `num_envs` rows, by number of their env."""
-    dtype, shape = _type_of_all(list(arrays.values()))
-    if dtype is None or dtype.hasobject:
-        rows = {
-            k * num_envs + place: value
-            for k, values in arrays.items()
-            for place, value in enumerate(values)
-        }
-        return _filled(rows, total, *_NOT_TYPED)
-    column = np.zeros((total, *shape[1:]), dtype)
-    for k, values in arrays.items():
-        column[k * num_envs : (k + 1) * num_envs] = values
-    return column
+    if _is_of_each(info, num_envs):
+        return info
+    columns: dict[str, Any] = {
+        key: infos_of_each(cast("dict[str, Any]", value), num_envs)
+        if isinstance(value, dict)
+        else _of_each(value, num_envs)
+        for key, value in info.items()
+    }
+    for key in [key for key in columns if not has_mask(key, columns)]:
+        columns[f"_{key}"] = np.ones(num_envs, np.bool_)
+    return columns
 
 
 def _is_of_each(info: dict[Any, Any], num_envs: int) -> bool:

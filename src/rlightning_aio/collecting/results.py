@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from rlightning_aio.batch.contents import all_agents, ended_episodes, plain_columns
-from rlightning_aio.batch.infos import joined_infos, listed
+from rlightning_aio.batch.infos import infos_of_each, listed
 from rlightning_aio.collecting.trees import rows_of
 from rlightning_aio.trees import Tree, mapped
 
@@ -105,7 +105,7 @@ class ResultRows:
             if several:
                 sub_env = row % count
                 total, length = total[sub_env], length[sub_env]
-                own = listed(joined_infos([info], count), count)[sub_env]
+                own = listed(infos_of_each(info, count), count)[sub_env]
             own = own.get("final_info", own)
             found.append((int(self.index[row]), float(total), int(length), own))
         return found

@@ -2,5 +2,5 @@
 
 `base` is what authors derive from, `contract` checks their envs, `state` saves them. The folders
 are `simulators` (one module each), `mujoco` (many simulations stepped together), `openenv`, and
-`sub_envs` (an env of several). Nothing here knows workers or groups.
+`adapted` (around the envs of callables). Nothing here knows workers or groups.
 """

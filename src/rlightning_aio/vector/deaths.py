@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.batch.infos import listed, vector_infos
 from rlightning_aio.batch.joining import joined
-from rlightning_aio.trees import index, mapped
-from rlightning_aio.vector.batching import merged, replaced
+from rlightning_aio.trees import index
+from rlightning_aio.vector.batching import replaced
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.sync import EnvGroup
-    from rlightning_aio.vector.rows import Singles
 
 __all__ = ["Deaths", "Stepped", "cause_and_rest"]
 
@@ -52,7 +51,6 @@ class Deaths:
 
     Args:
         group: the group of the envs.
-        rows: the layout of envs in the group's results.
         mode: when an env is reset after the end of its episode.
         collect: returns the results of all outstanding requests, in order, within a deadline.
     """
@@ -60,17 +58,15 @@ class Deaths:
     def __init__(
         self,
         group: EnvGroup,
-        rows: Singles,
         mode: AutoresetMode,
         collect: Callable[[float | None], BatchedData],
     ) -> None:
-        self._group, self._rows, self._mode, self._collect = group, rows, mode, collect
+        self._group, self._mode, self._collect = group, mode, collect
         # Envs whose next step is a reset, and those of them that have lost their workers. The
         # latter have already been reset, with the results `_held`.
-        self._due = np.zeros(rows.num_envs, np.bool_)
-        self._lost = np.zeros(rows.num_envs, np.bool_)
+        self._due = np.zeros(len(group.env_ids), np.bool_)
+        self._lost = np.zeros(len(group.env_ids), np.bool_)
         self._held: BatchedData | None = None
-        self._resets: BatchedData | None = None
 
     def concern(self, batch: BatchedData) -> bool:
         """Return True if `settle` has anything to do for the results of a step."""
@@ -95,37 +91,30 @@ class Deaths:
         if self._mode == AutoresetMode.NEXT_STEP:
             self._due = stepped.terminated | stepped.truncated
 
-    # -- a step that resets envs of lost workers ----------------------------------------
+    def save_state(self) -> dict[str, Any]:
+        """Return masks: of the envs that are due for a reset, and that have had theirs."""
+        return {"due": self._due.copy(), "lost": self._lost.copy()}
 
-    def with_valid(self, actions: Any) -> Any:
-        """Replace ignored actions by valid ones of the same batch."""
-        return self._rows.with_valid(actions, self._lost)
+    def load_state(self, state: dict[str, Any], batch: BatchedData) -> None:
+        """Restore the masks; `batch` has the last results of all envs at that time."""
+        self._due, self._lost = state["due"].copy(), state["lost"].copy()
+        self._held = batch if self._lost.any() else None
+
+    # -- a step that resets envs of lost workers ----------------------------------------
 
     def send(self, responses: BatchedData) -> None:
         """Step all envs except those whose results are held."""
-        (rest,) = np.nonzero(~self._rows.whole(self._lost))
+        (rest,) = np.nonzero(~self._lost)
         if len(rest):
             self._group.step_async(responses.take(rest.tolist()))
 
     def collect(self, deadline: float | None) -> BatchedData:
-        """Wait for the steps, and return the results of all envs in order, held ones included.
-
-        If only some envs of a batch have lost their worker, all were stepped: reset the former.
-        """
+        """Wait for the steps, and return the results of all envs in order, held ones included."""
         assert self._held is not None
-        whole = self._rows.whole(self._lost)
-        (rest,), (held,) = np.nonzero(~whole), np.nonzero(whole)
+        (rest,), (held,) = np.nonzero(~self._lost), np.nonzero(self._lost)
         parts = [self._collect(deadline)] if len(rest) else []
-        if len(held):
-            parts.append(self._held.take(held.tolist()))
-        batch = joined(parts).take(np.argsort(np.concatenate([rest, held])).tolist())
-        partly = self._lost & ~self._rows.places(whole)
-        self._resets = None
-        if partly.any():
-            nothing = [None] * self._rows.num_envs
-            self._rows.send_resets(nothing, nothing, np.flatnonzero(partly).tolist())
-            self._resets = self._collect(deadline)
-        return batch
+        parts.append(self._held.take(held.tolist()))
+        return joined(parts).take(np.argsort(np.concatenate([rest, held])).tolist())
 
     # -- what the program sees ----------------------------------------------------------
 
@@ -137,14 +126,11 @@ class Deaths:
             stepped: their contents.
             last: the observations that were returned last.
         """
-        rows, count = self._rows, self._rows.num_envs
-        each = listed(stepped.infos, count)
-        for k in np.flatnonzero(rows.places(rows.whole(self._lost))).tolist():
+        observations, each = stepped.observations, listed(stepped.infos, len(self._lost))
+        for k in np.flatnonzero(self._lost).tolist():
             _, each[k] = cause_and_rest(each[k])
-        restarted = rows.flat(batch.restarted).copy()
-        observations, reset = self._with_resets(stepped.observations, each, restarted)
-        reset |= restarted
-        lost = rows.lost(restarted, self._due)
+        restarted = batch.restarted
+        lost = restarted & ~self._due
         (chosen,) = np.nonzero(lost)
         for k in chosen.tolist():
             cause, first = cause_and_rest(each[k])
@@ -157,40 +143,14 @@ class Deaths:
             observations = replaced(observations, last, chosen)
         next_step = self._mode == AutoresetMode.NEXT_STEP and len(chosen) > 0
         self._lost = lost if next_step else np.zeros_like(lost)
-        self._held, self._resets = batch if next_step else None, None
+        self._held = batch if next_step else None
         return Stepped(
             observations,
-            np.where(reset, 0.0, stepped.rewards),
-            stepped.terminated & ~reset,
-            (stepped.truncated & ~reset) | lost,
+            np.where(restarted, 0.0, stepped.rewards),
+            stepped.terminated & ~restarted,
+            (stepped.truncated & ~restarted) | lost,
             vector_infos(each),
         )
-
-    def _with_resets(
-        self, observations: Any, each: list[dict[str, Any]], restarted: NDArray[np.bool_]
-    ) -> tuple[Any, NDArray[np.bool_]]:
-        """Put the resets of `collect` into `observations` and, in place, into the infos.
-
-        Returns the observations and a mask of the envs that were reset. A worker that died during
-        these resets has also lost the other envs of its batch.
-        """
-        reset = np.zeros(len(each), np.bool_)
-        if self._resets is None:
-            return observations, reset
-        rows, places = self._rows, self._rows.flat(self._resets.index)
-        died = rows.flat(self._resets.restarted)
-        taken = self._lost[places] | died
-        restarted[places[died]] = True
-        reset[places[taken]] = True
-        infos = listed(rows.infos(self._resets), len(places))
-        for k in np.flatnonzero(taken).tolist():
-            place = int(places[k])
-            if restarted[place]:
-                cause, _ = cause_and_rest(each[place])
-                infos[k] = {**cause, **infos[k]}
-            each[place] = infos[k]
-        first = mapped(lambda column: column[taken], rows.observation(self._resets))
-        return merged(observations, first, places[taken], len(each)), reset
 
 
 def cause_and_rest(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -17,9 +17,10 @@ from gymnasium.vector import AutoresetMode, utils
 from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.contents import reported_infos
 from rlightning_aio.calling import collect_calls
-from rlightning_aio.envs.sub_envs.sub_envs import adapted
-from rlightning_aio.errors import BadAction, ConfigError, EnvFault
+from rlightning_aio.envs.adapted.makers import adapted
+from rlightning_aio.errors import BadAction, EnvFault
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
@@ -28,8 +29,14 @@ from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
 from rlightning_aio.vector.pending import check_free, check_running, check_sent
 from rlightning_aio.vector.proxies import CalledEnvs, check_name
+from rlightning_aio.vector.requests import (
+    send_call,
+    send_look_up,
+    send_resets,
+    send_values,
+    send_wrapper_question,
+)
 from rlightning_aio.vector.reset_arguments import checked_mask, checked_mode, seeds_of_envs
-from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
 
 if TYPE_CHECKING:
@@ -38,7 +45,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.types import EnvMeta
-    from rlightning_aio.vector.rows import Singles
 
 __all__ = ["VectorEnv", "per_worker"]
 
@@ -51,8 +57,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
     """Envs in worker processes behind Gymnasium's vector interface.
 
     Args:
-        env_fns: one callable for each env, or for each of several vector environments with the
-            same size and this `autoreset_mode`. They are called only in the workers; lambdas and
+        env_fns: one callable for each env. They are called only in the workers; lambdas and
             functions of ``__main__`` are allowed.
         shared_memory: accepted and ignored.
         copy: return observations that the caller owns. False saves a copy, but writing to them
@@ -74,13 +79,13 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
     Raises:
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
         StartFailed: a callable raised, or didn't return an env.
-        RuntimeError: spaces or numbers of envs don't match.
+        RuntimeError: the spaces don't match.
         TypeError: `env_fns` is no list of callables.
     """
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]],
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
         shared_memory: bool = True,
         copy: bool = True,
         context: str | None = None,
@@ -122,38 +127,32 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         metas = self.group.init()
         self.closed = False
         try:
-            self._adopt(metas, resumes=entry.get("on_worker_death") == "resume")
+            self._adopt(metas)
         except BaseException:
             self.close()
             raise
 
-    def _adopt(self, metas: list[EnvMeta], *, resumes: bool) -> None:
-        """Set up what depends on the envs: spaces, metadata, rows, deaths, resets."""
-        self._rows = rows_of(self.group, metas)
-        self.num_envs = self._rows.num_envs
+    def _adopt(self, metas: list[EnvMeta]) -> None:
+        """Set up what depends on the envs: spaces, metadata, deaths, resets."""
+        self.num_envs = len(metas)
         (
             self.single_observation_space,
             self.observation_space,
             self.single_action_space,
             self.action_space,
-        ) = adopted_spaces(self._rows.spaces, self.observation_mode)
+        ) = adopted_spaces(
+            [(meta.observation_space, meta.action_space) for meta in metas], self.observation_mode
+        )
         for name in ("metadata", "render_mode"):
             (value,) = self.group.call("call_wrapped", name, env_ids=self.group.env_ids[:1])
             setattr(self, name, value)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self._fits_rows = leaves(self.single_action_space) is not None
-        self._deaths = Deaths(self.group, self._rows, self.autoreset_mode, self._collect)
+        self._deaths = Deaths(self.group, self.autoreset_mode, self._collect)
         self._observations: Any = None
         # The last results of all envs, in order; actions respond to them.
         self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
-        reset_themselves = metas[0].num_envs > 1
-        if resumes and reset_themselves and self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            raise ConfigError(
-                "on_worker_death='resume' may resume envs that are stepped together at a step "
-                "where some of them need a reset; make separate envs (vectorization_mode='async'), "
-                "or use AutoresetMode.SAME_STEP"
-            )
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP and not reset_themselves:
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # No step limit: the envs have their own.
             self.group.auto_reset(math.inf).__enter__()
 
@@ -198,7 +197,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             self._check_whole()
         # A reset that can't be sent leaves those before it outstanding.
         self._has_leftovers = self._has_lost = True
-        self._rows.send_resets(seeds, [options] * self.num_envs, which)
+        send_resets(self.group, seeds, [options] * self.num_envs, which)
         self._pending, self._arguments, self._has_leftovers = "reset", mask, False
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
@@ -212,16 +211,14 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         batch = self._finish("reset", timeout, self._collect)
         mask = self._arguments
         self._deaths.note_reset(... if mask is None else mask)
-        if mask is None or mask.all():
-            found = self._observed(self._rows.observation(batch)), self._rows.infos(batch)
-        else:
-            _check_spared(self._rows, batch, mask)
+        found, infos = batch.observation, reported_infos(batch)
+        if mask is not None and not mask.all():
             chosen = np.flatnonzero(mask)
-            observations, infos = self._rows.of_mask(batch, mask)
-            observations = merged(self._observations, observations, chosen, self.num_envs)
-            found = self._observed(observations), spread(infos, chosen, self.num_envs)
+            found = merged(self._observations, found, chosen, self.num_envs)
+            infos = spread(infos, chosen, self.num_envs)
+        found = self._observed(found)
         self._has_lost = False
-        return found
+        return found, infos
 
     # -- steps ------------------------------------------------------------------------
 
@@ -298,24 +295,15 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
                     f"there must be as many actions as envs, {self.num_envs}, not a scalar"
                 )
         if self._fits_rows:
-            columns = self._rows.actions(actions)
-            if self._deaths.unfinished:
-                columns = self._deaths.with_valid(columns)
-            return self._answerable.respond(action=columns)
+            return self._answerable.respond(action=actions)
         env_ids = self.group.env_ids
         each = list(utils.iterate(self.action_space, actions))
         pairs = zip(env_ids, each, strict=True)
         return BatchedData(env_ids, [PolicyResponse(id_, action) for id_, action in pairs])
 
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
-        rows = self._rows
-        stepped = Stepped(
-            rows.observation(batch),
-            rows.flat(batch.reward),
-            rows.flat(batch.terminated),
-            rows.flat(batch.truncated),
-            rows.infos(batch),
-        )
+        ends = batch.terminated, batch.truncated
+        stepped = Stepped(batch.observation, batch.reward, *ends, reported_infos(batch))
         if self._deaths.concern(batch):
             stepped = self._deaths.settle(batch, stepped, self._observations)
         self._deaths.note_step(stepped)
@@ -378,7 +366,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._begin("call_async")
         check_name(name)
         self._has_leftovers = True  # Until all are sent.
-        self._rows.call(name, args, kwargs)
+        send_call(self.group, name, args, kwargs)
         self._pending = "call"
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
@@ -389,22 +377,23 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             NoAsyncCallError: no call was sent.
         """
         collect = partial(collect_calls, self.group)
-        return tuple(self._rows.values(self._finish("call", timeout, collect)))
+        return tuple(self._finish("call", timeout, collect))
 
     def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env at `place`, or get its attribute."""
         check_name(name)
-        send = partial(self._rows.call, name, args, kwargs, [place])
-        return self._rows.values(self._answered("call_async", send), [place])[0]
+        send = partial(send_call, self.group, name, args, kwargs, [place])
+        return self._answered("call_async", send)[0]
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of any env."""
-        self._begin("call_async")
-        return any(self._rows.are_wrapped(wrapper_class, range(self.num_envs)))
+        places = range(self.num_envs)
+        send = partial(send_wrapper_question, self.group, wrapper_class, places)
+        return any(self._answered("call_async", send))
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
-        send = partial(self._rows.look_up, name, place)
-        return self._rows.values(self._answered("call_async", send), [place])[0]
+        send = partial(send_look_up, self.group, name, place)
+        return self._answered("call_async", send)[0]
 
     def _answered(self, what: str, send: Callable[[], None]) -> Any:
         """Return what comes of calls that `send` sends."""
@@ -428,11 +417,52 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
                 f"{len(each)} values for num_envs={self.num_envs}; give one for each, or a single "
                 "one that is not a list or tuple"
             )
-        self._answered("set_attr", partial(self._rows.set_attr, name, each))
+        self._answered("set_attr", partial(send_values, self.group, name, each))
 
     def render(self) -> tuple[Any, ...]:
         """Return one rendered frame of each env."""
         return self.call("render")
+
+    # -- state ------------------------------------------------------------------------
+
+    def save_state(self) -> dict[str, Any]:
+        """Return the state of all envs, as a copy that can be pickled; see `EnvGroup.snapshot`.
+
+        Raises:
+            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`.
+            ResetNeeded: the results of the last step or reset were lost.
+            AlreadyPendingCallError: another call is pending.
+        """
+        self._begin("save_state")
+        self._check_whole()
+        return {
+            "group": self.group.snapshot(),
+            "observations": copying.deepcopy(self._observations),
+            "deaths": self._deaths.save_state(),
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restore the state of all envs, of this vector env or of another one of equal envs.
+
+        Raises:
+            ValueError: it is the state of envs that are stepped together; nothing was changed.
+            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.restore`.
+            ResetNeeded: a worker died in the end of it, with the state of its envs.
+            AlreadyPendingCallError: another call is pending.
+        """
+        self._begin("load_state")
+        if "group" not in state:
+            raise ValueError("this is the state of envs that are stepped together, without a group")
+        self._answerable, _ = self.group.restore(state["group"])
+        if self._answerable.restarted.any():
+            self._has_lost = True
+            raise ResetNeeded(
+                "a worker died before its envs showed what was restored; load the state again, or "
+                "call reset() without a mask"
+            )
+        self._observations = copying.deepcopy(state["observations"])
+        self._deaths.load_state(state["deaths"], self._answerable)
+        self._has_lost = False
 
     # -- the end ----------------------------------------------------------------------
 
@@ -469,16 +499,6 @@ def per_worker(max_concurrency: Any, num_envs: int) -> int:
     if count is None or count < 1:
         raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")
     return -(-num_envs // count)
-
-
-def _check_spared(rows: Singles, batch: BatchedData, mask: NDArray[np.bool_]) -> None:
-    """Check that a reset of `mask` has not come with the loss of other envs of a batch."""
-    restarted = rows.flat(batch.index)[rows.flat(batch.restarted)]
-    if not mask[restarted].all():
-        raise ResetNeeded(
-            "a worker has died, and with it the episodes of envs that reset_mask leaves out; "
-            "call reset() without a mask to begin new episodes"
-        )
 
 
 def _seconds(timeout: float | None) -> float | None:

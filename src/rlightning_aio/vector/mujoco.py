@@ -53,8 +53,8 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         """There is none; the error says how to get one."""
         raise AttributeError(
             "group: the envs of this task are stepped together in this process, without a group. "
-            "Pass placement='process' or another field of a config entry to make_vec, or make an "
-            "EnvGroup with EnvConfig(num_envs=...)"
+            "EnvGroup with EnvConfig(num_envs=...) has groups of such batches; make_vec with "
+            "placement='process', or another field of a config entry, has one of separate envs"
         )
 
     def _infos(self, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
@@ -176,6 +176,8 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
                 was changed.
         """
         check_running(self)
+        if "simulations" not in state:
+            raise ValueError("this is the state of a group of separate envs")
         super().load_state(copy.deepcopy(state))
 
     def render_one(self, k: int) -> Any:

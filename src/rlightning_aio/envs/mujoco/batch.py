@@ -82,7 +82,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     Attributes:
         env: the unwrapped env, in the state of the simulation that used it last.
-        takes_masks: True, as it can reset only some simulations.
         fresh_results: see `FastPath`.
         releases_gil: True, as steps may be computed in a thread.
         steps_briefly: see `FastPath`.
@@ -93,7 +92,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         ConfigError: `randomize` is wrong.
     """
 
-    takes_masks = True
     fresh_results = True
     releases_gil = True
 

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from rlightning_aio.envs.adapted.only_sub_env import OnlySubEnv
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.fast_path import FastPath
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, outdated_assets_accepted
-from rlightning_aio.envs.sub_envs.only_sub_env import OnlySubEnv
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import load
 from rlightning_aio.spaces import Anything

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import utils
 
-from rlightning_aio.batch.infos import joined_infos, listed
+from rlightning_aio.batch.infos import infos_of_each, listed
 
 __all__ = ["OnlySubEnv"]
 
@@ -67,5 +67,5 @@ class OnlySubEnv(gym.Env[Any, Any]):
 
 
 def _only_info(infos: dict[str, Any]) -> dict[str, Any]:
-    (info,) = listed(joined_infos([infos], 1), 1)
+    (info,) = listed(infos_of_each(infos, 1), 1)
     return info
