@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import msgspec
@@ -57,6 +58,12 @@ class Sample(msgspec.Struct):
     needed: int
 
 
+# Getters, so that no loop of Python's puts samples together.
+_SLOTS, _TIMES, _RESETS, _NUM_ENVS, _SENT, _AT = map(
+    attrgetter, ("slots", "times", "resets", "num_envs", "sent_ns", "at_ns")
+)
+
+
 class Rows(NamedTuple):
     """Results as columns. `steps` is the number of env steps in each, other columns are in ns."""
 
@@ -73,19 +80,19 @@ def rows_of(samples: Sequence[Sample]) -> Rows:
     if not samples:
         nothing = np.zeros(0, np.int64)
         return Rows(np.zeros(0, np.intp), *[nothing] * 5)
-    lengths = np.array([len(one.slots) for one in samples])
-    steps = np.array([one.num_envs for one in samples]).repeat(lengths)
-    resets = [one.resets for one in samples if one.resets is not None]
-    if resets:
-        has_resets = np.array([one.resets is not None for one in samples]).repeat(lengths)
-        steps[has_resets] -= np.concatenate([*map(_by_env, resets)])
-    times = np.concatenate([one.times for one in samples])
+    slots, times, resets = ([*map(of, samples)] for of in (_SLOTS, _TIMES, _RESETS))
+    lengths = np.array([*map(len, slots)])
+    steps = np.array([*map(_NUM_ENVS, samples)]).repeat(lengths)
+    if found := [one for one in resets if one is not None]:
+        has_resets = np.array([one is not None for one in resets]).repeat(lengths)
+        steps[has_resets] -= np.concatenate([*map(_by_env, found)])
+    together = np.concatenate(times)
     return Rows(
-        slots=np.concatenate([one.slots for one in samples]),
-        sent=np.concatenate([one.sent_ns for one in samples]),
-        done=times[:, 0],
-        busy=times[:, 1],
-        taken=np.array([one.at_ns for one in samples]).repeat(lengths),
+        slots=np.concatenate(slots),
+        sent=np.concatenate([*map(_SENT, samples)]),
+        done=together[:, 0],
+        busy=together[:, 1],
+        taken=np.array([*map(_AT, samples)]).repeat(lengths),
         steps=steps,
     )
 

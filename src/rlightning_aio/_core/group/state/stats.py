@@ -143,21 +143,22 @@ class Stats:
     def _note_episodes(
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
-        flags = part.flags
-        ended = flags[..., TERMINATED] | flags[..., TRUNCATED]
+        terminated = part.flags[..., TERMINATED]
+        ended = terminated | part.flags[..., TRUNCATED]
+        if part.restarted is None and not np.count_nonzero(ended):
+            return  # As in most steps.
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
-        # The outcomes that `BatchedData.outcome` has; the first two are terminated, truncated.
-        over, codes = ended, (~flags[..., TERMINATED]).astype(np.int64)
-        if part.info_marks is not None or part.out_of_band or part.agents:
-            over, codes = self._as_reported(part, ended, codes)
-        entries = self._envs.names.entries[part.slots[over.nonzero()[0]]]
-        np.add.at(self._outcomes, (entries, codes[over]), 1)
         rows: NDArray[np.intp] = ended.nonzero()[0]
+        slots = part.slots[rows]
+        # The outcomes that `BatchedData.outcome` has; the first two are terminated, truncated.
+        where, codes = slots, 1 - terminated[ended]
+        if part.info_marks is not None or part.out_of_band or part.agents:
+            where, codes = self._as_reported(part, ended, 1 - terminated)
+        np.add.at(self._outcomes, (self._envs.names.entries[where], codes), 1)
         if not len(rows):
             return
-        slots = part.slots[rows]
         sums = np.empty((len(rows), 3))
         sums[:, 0], sums[:, 1], sums[:, 2] = 1, returns[ended], lengths[ended]
         with np.errstate(over="ignore", invalid="ignore"):  # The means show them.
@@ -173,8 +174,8 @@ class Stats:
 
     def _as_reported(
         self, part: ResultColumns, over: NDArray[np.bool_], codes: NDArray[np.int64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return which episodes of unusual results are over, and their outcomes.
+    ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
+        """Return the slots whose episodes are over, of unusual results, and their outcomes.
 
         Args:
             part: of results that have agents, infos, or were marked as restarted.
@@ -194,7 +195,7 @@ class Stats:
                     reported: Any = part.reported_info_of(row).get("outcome")
                     if isinstance(reported, Outcome):
                         codes[row] = _CODE_OF[reported.kind]
-        return over, codes
+        return part.slots[over.nonzero()[0]], codes[over]
 
     def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> None:
         """Count steps and resets of `slots` that end without a result; other requests don't."""
