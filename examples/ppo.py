@@ -212,6 +212,7 @@ def train(args: Args) -> Run:
                     if isinstance(actions, Box):
                         chosen = chosen.clip(actions.low, actions.high)
                     result, reward, terminated, truncated, infos = envs.step(chosen)
+                    result = result.copy()  # The batch shows what it returned again.
                     done = terminated | truncated
                     over = np.flatnonzero(done)
                     first = result[over]

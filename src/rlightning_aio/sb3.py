@@ -406,8 +406,8 @@ class _OfVector(VecEnv):
             return
         if len(chosen) < self.num_envs:
             raise ValueError(
-                f"{attr_name} can't be set for only some of the envs that are stepped together; "
-                "make separate envs, each with its own callable"
+                f"{attr_name} can't be set for only some envs of a {type(self._inner).__name__}: "
+                "give VecEnv a list of callables, one for each env"
             )
         self._inner.set_attr(attr_name, [value] * self.num_envs)
 

@@ -609,8 +609,6 @@ class Awaitable(_Single):
 class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
     """Several scripts as a vector env of Gymnasium, which cuts their episodes itself."""
 
-    takes_masks = True
-
     def __init__(
         self, codes: Sequence[int], mode: str, limit: int | None, layout: str, controls: str
     ) -> None:

@@ -305,7 +305,7 @@ def test_a_vector_env_in_another_mode_is_refused() -> None:
         _ = envs.venv.group
     with pytest.raises(ConfigError, match="step_timeout: a vector env has no workers"):
         VecEnv(envs.venv.envs, step_timeout=3.0)
-    with pytest.raises(ValueError, match="can't be set for only some"):
+    with pytest.raises(ValueError, match="can't be set for only some envs of a MujocoVectorEnv"):
         envs.set_attr("frame_skip", 2, indices=[1])
     envs.set_options([{"a": 1}, {}])
     with pytest.raises(ValueError, match="options differ"):

@@ -24,7 +24,7 @@ from vector.toys import Toy, assert_alike
 from rlightning_aio import sync
 from rlightning_aio.batch.infos import infos_of_each
 from rlightning_aio.envs.mujoco import tasks as mujoco_tasks
-from rlightning_aio.errors import ConfigError, StartFailed
+from rlightning_aio.errors import ConfigError, SnapshotError, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
 from rlightning_aio.vector.making import steps_together
 from rlightning_aio.vector.mujoco import MujocoVectorEnv
@@ -42,13 +42,12 @@ PENDULUM = "InvertedPendulum-v5"
         {"vectorization_mode": "async"},
         {"wrappers": [gym.wrappers.ClipAction]},
         {"disable_env_checker": False},
-        {"vector_kwargs": INLINE},
+        INLINE,
         {"placement": "process", "envs_per_process": 2},
         {"max_concurrency": 2, "placement": "process"},
     ],
 )
 def test_arguments_that_need_a_group_make_separate_envs(arguments: dict[str, Any]) -> None:
-    arguments = {"vector_kwargs": INLINE} | arguments if len(arguments) == 1 else arguments
     ours, theirs = make_vec(PENDULUM, 4, **arguments), make_vec(PENDULUM, 4)
     assert isinstance(ours, VectorEnv)
     assert isinstance(theirs, MujocoVectorEnv)
@@ -134,6 +133,65 @@ def test_a_state_can_be_restored_again(
     assert_alike(found, copies)
     one.close()
     other.close()
+
+
+OTHERS: dict[str, Any] = {
+    "num_envs": {"num_envs": 3},
+    "mode": {"autoreset_mode": "SameStep"},
+    "limit": {"max_episode_steps": 7},
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_a_batch_refuses_the_state_of_another_one(other: str) -> None:
+    """And goes on as if nothing had been."""
+    fields = {"num_envs": 2, "autoreset_mode": "NextStep", "max_episode_steps": 3}
+    theirs = make_vec(PENDULUM, **fields | OTHERS[other])
+    ours, alike = make_vec(PENDULUM, **fields), make_vec(PENDULUM, **fields)
+    for env in (theirs, ours, alike):
+        env.reset(seed=0)
+    with pytest.raises(ValueError, match="the state is of a batch with"):
+        ours.load_state(theirs.save_state())
+    actions = np.zeros((2, 1), np.float32)
+    for _ in range(5):
+        assert_alike(ours.step(actions), alike.step(actions))
+    assert_alike(ours.reset(seed=5), alike.reset(seed=5))
+    for env in (theirs, ours, alike):
+        env.close()
+
+
+@pytest.mark.parametrize("other", ["mode", "limit"])
+def test_separate_envs_refuse_the_state_of_another_mode_or_limit(other: str) -> None:
+    fields = {"num_envs": 2, "autoreset_mode": "Disabled", "placement": "inline"}
+    theirs, ours = (
+        VectorEnv([Toy] * 2, autoreset_mode=one["autoreset_mode"], **INLINE, **limit)
+        for one, limit in (
+            (fields | OTHERS["mode"], {}) if other == "mode" else (fields, OTHERS["limit"]),
+            (fields, {}),
+        )
+    )
+    for env in (theirs, ours):
+        env.reset(seed=0)
+    with pytest.raises(ValueError, match="the state is of envs with"):
+        ours.load_state(theirs.save_state())
+    ours.step(np.zeros(2, np.int64))
+    for env in (theirs, ours):
+        env.close()
+
+
+def test_nothing_is_saved_before_a_reset_or_while_a_step_is_pending() -> None:
+    for env in (make_vec(PENDULUM, 2), make_vec(PENDULUM, 2, vector_kwargs=INLINE)):
+        with pytest.raises((ResetNeeded, SnapshotError)):
+            env.save_state()
+        env.reset(seed=0)
+        state = env.save_state()
+        env.step_async(np.zeros((2, 1), np.float32))
+        with pytest.raises(AlreadyPendingCallError):
+            env.save_state()
+        with pytest.raises(AlreadyPendingCallError):
+            env.load_state(state)
+        env.step_wait()
+        env.close()
 
 
 def test_the_state_of_another_kind_of_vector_env_is_refused() -> None:

@@ -423,13 +423,14 @@ class Collector(Generic[G, R]):
         """Begin episodes of idle envs, except of those that are given up.
 
         Raises:
-            WorkerDied, EnvHung: all envs are given up.
+            WorkerDied, EnvHung: all envs are given up, and no client can come.
             RLightningError: an env may move something real.
         """
         gone = {env_id for worker in self._group.get_workers() for env_id in worker["given_up"]}
         left = [env_id for env_id in idle if env_id not in gone]
         self._newest.check_resettable(left)
-        if left or not (self._expecting or self._unanswered):
+        others = self._expecting or self._unanswered or any(map(_is_server, self._group.metas))
+        if left or not others:
             self._group.reset_async(env_ids=left or idle)
             self._expecting = True
 

@@ -68,8 +68,7 @@ def autoreset_mode_of(env: Any) -> AutoresetMode:
     raise TypeError(
         f"the metadata of {name} has no autoreset_mode, which says when an env is reset after "
         "its episode. Set it in the callable, before it returns env: env.metadata = "
-        "{**env.metadata, 'autoreset_mode': AutoresetMode.SAME_STEP}, or NEXT_STEP or DISABLED; "
-        "ask for the same autoreset_mode"
+        "{**env.metadata, 'autoreset_mode': AutoresetMode.SAME_STEP}, or NEXT_STEP or DISABLED"
     )
 
 

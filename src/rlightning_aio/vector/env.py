@@ -14,13 +14,12 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
-from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import reported_infos
-from rlightning_aio.calling import collect_calls
+from rlightning_aio.calling import collect_calls, in_one_call
 from rlightning_aio.envs.adapted.makers import adapted
-from rlightning_aio.errors import BadAction, EnvFault
+from rlightning_aio.errors import BadAction, EnvFault, SnapshotError
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
@@ -117,7 +116,10 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._has_leftovers = False
         # Results of a step or reset were not returned, so no episode can go on.
         self._has_lost = False
-        makers = adapted(env_fns, self.autoreset_mode, entry.pop("max_episode_steps", None))
+        limit = entry.pop("max_episode_steps", None)
+        # What a state is of, besides the envs of the group.
+        self._kind = {"autoreset_mode": self.autoreset_mode.value, "max_episode_steps": limit}
+        makers = adapted(env_fns, self.autoreset_mode, limit)
         if max_concurrency is not None:
             entry = {"envs_per_process": per_worker(max_concurrency, len(makers)), **entry}
         self.group: EnvGroup = build_env_group(
@@ -436,6 +438,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._begin("save_state")
         self._check_whole()
         return {
+            "kind": self._kind,
             "group": self.group.snapshot(),
             "observations": copying.deepcopy(self._observations),
             "deaths": self._deaths.save_state(),
@@ -445,7 +448,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Restore the state of all envs, of this vector env or of another one of equal envs.
 
         Raises:
-            ValueError: it is the state of envs that are stepped together; nothing was changed.
+            ValueError: it is the state of envs that are stepped together, or with another mode or
+                step limit; nothing was changed.
             SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.restore`.
             ResetNeeded: a worker died in the end of it, with the state of its envs.
             AlreadyPendingCallError: another call is pending.
@@ -453,9 +457,17 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._begin("load_state")
         if "group" not in state:
             raise ValueError("this is the state of envs that are stepped together, without a group")
-        self._answerable, _ = self.group.restore(state["group"])
+        if state["kind"] != self._kind:
+            raise ValueError(f"the state is of envs with {state['kind']}, not {self._kind}")
+        had_lost, self._has_lost, self._has_leftovers = self._has_lost, True, True
+        try:
+            self._answerable, _ = self.group.restore(state["group"])
+        except (SnapshotError, EnvFault) as error:
+            if getattr(error, "results", None) is None:  # All envs are as they were.
+                self._has_lost, self._has_leftovers = had_lost, False
+            raise
+        self._has_leftovers = False
         if self._answerable.restarted.any():
-            self._has_lost = True
             raise ResetNeeded(
                 "a worker died before its envs showed what was restored; load the state again, or "
                 "call reset() without a mask"
@@ -490,7 +502,7 @@ def _in_one_call(group: EnvGroup, send: Callable[[], None], wait: Callable[[], T
         send()
         return wait()
 
-    return driver_of(group).call(ask)
+    return in_one_call(group, ask)
 
 
 def per_worker(max_concurrency: Any, num_envs: int) -> int:

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ResetNeeded
 
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.vector.lazy_infos import LazyColumns
-from rlightning_aio.vector.pending import check_free, check_running, check_sent
+from rlightning_aio.vector.pending import check_free, check_sent
 from rlightning_aio.vector.proxies import CalledEnvs, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 
@@ -144,7 +145,7 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value, or to equal values in a list or tuple."""
-        check_running(self)
+        check_free(self, self._pending, "set_attr")
         super().set_attr(name, values)
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
@@ -159,28 +160,35 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
+        check_free(self, self._pending, "call_async")
         return self.is_wrapped(name_of(wrapper_class))
 
     # -- state and rendering ---------------------------------------------------------------
 
     def save_state(self) -> dict[str, Any]:
-        """Return the state of all envs, as a copy that can be pickled."""
-        check_running(self)
+        """Return the state of all envs, as a copy that can be pickled.
+
+        Raises:
+            ResetNeeded: there was no reset yet, or a step or reset was interrupted.
+        """
+        check_free(self, self._pending, "save_state")
+        if self._ended is None or not self._is_whole:
+            raise ResetNeeded("there is no state to save before reset()")
         return copy.deepcopy(super().save_state())
 
     def load_state(self, state: dict[str, Any]) -> None:
         """Restore the state of all envs, of this vector env or of another one of the same task.
 
         Raises:
-            ValueError: it is that of another model, or of envs with another `randomize`; nothing
-                was changed.
+            ValueError: it is that of another model, number of envs, mode or step limit, of envs
+                with another `randomize`, or of separate envs; nothing was changed.
         """
-        check_running(self)
+        check_free(self, self._pending, "load_state")
         if "simulations" not in state:
             raise ValueError("this is the state of a group of separate envs")
         super().load_state(copy.deepcopy(state))
 
     def render_one(self, k: int) -> Any:
         """Render a frame of env k in the render mode of the task."""
-        check_running(self)
+        check_free(self, self._pending, "render_one")
         return super().render_one(k)

@@ -487,6 +487,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def save_state(self) -> dict[str, Any]:
         """Save the state of all simulations; see `BaseEnv.save_state`."""
         return {
+            "kind": self._kind,
             # With the model and all options.
             "env": save_state(self._made),
             "simulations": self._simulations.save_state(),
@@ -500,15 +501,23 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         """Restore the state of all simulations.
 
         Raises:
-            ValueError: it is that of another model, or of simulations with another `randomize`;
-                nothing was changed.
+            ValueError: it is that of another model, another number of simulations, another mode or
+                step limit, or of simulations with another `randomize`; nothing was changed.
         """
+        if state["kind"] != self._kind:
+            raise ValueError(f"the state is of a batch with {state['kind']}, not {self._kind}")
         drawn = state["randomizer"]
         if self._randomizer is not None:
             self._randomizer.check_fits(drawn)
         elif drawn is not None:
             raise ValueError("the snapshot's simulations are randomized, and this env's are not")
-        load_state(self._made, state["env"])
+        was_whole, self._is_whole = self._is_whole, False
+        try:
+            load_state(self._made, state["env"])
+        except ValueError:
+            self._is_whole = was_whole
+            raise
+        self._note_options(state["place"])
         self._simulations.load_state(state["simulations"])
         self._own = [dict(own) for own in state["own"]]
         self._unknown.update(range(self.num_envs))
@@ -516,8 +525,13 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._randomizer.load_state(drawn)
         for name in _STATE:
             setattr(self, name, state[name])
-        self._note_options(state["place"])
         self._is_whole = True
+
+    @property
+    def _kind(self) -> dict[str, Any]:
+        """Facts besides the model that a state must share."""
+        mode = self.metadata["autoreset_mode"].value
+        return {"num_envs": self.num_envs, "autoreset_mode": mode, "max_episode_steps": self._limit}
 
     def render(self) -> tuple[Any, ...]:
         """Render a frame of each simulation."""
