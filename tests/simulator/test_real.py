@@ -39,9 +39,9 @@ def deadly_program(kind: str, *, is_async: bool) -> Program:
     ("kind", "is_async"), [("group", False), ("group", True), ("evaluations", False)]
 )
 def test_real_processes_do_what_the_model_says(
-    kind: str, is_async: bool, monkeypatch: pytest.MonkeyPatch
+    kind: str, is_async: bool, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Groups and evaluations, with workers that die."""
-    monkeypatch.setattr(logging.getLogger("rlightning_aio"), "level", logging.CRITICAL)
+    caplog.set_level(logging.CRITICAL, "rlightning_aio")  # A logger keeps what it enables.
     found = run(deadly_program(kind, is_async=is_async), real=True)
     assert not found.error, shown(found)
