@@ -40,22 +40,26 @@ def send_call(
     group: EnvGroup, name: str, args: Any, kwargs: Any, places: Sequence[int] | None = None
 ) -> None:
     """Call a method, found through wrappers, or get an attribute, of all envs or at `places`."""
-    ids = None if places is None else [group.env_ids[k] for k in places]
+    ids = None if places is None else _ids(group, places)
     send_calls(group, "call_wrapped", name, *args, env_ids=ids, **kwargs)
 
 
 def send_look_up(group: EnvGroup, name: str, place: int) -> None:
     """Ask an env for attribute `name`, or whether it is a method."""
-    send_calls(group, "look_up", name, env_ids=[group.env_ids[place]])
+    send_calls(group, "look_up", name, env_ids=_ids(group, [place]))
 
 
 def send_wrapper_question(group: EnvGroup, wrapper: type[Any], places: Sequence[int]) -> None:
     """Ask the envs at `places` whether they have a wrapper of that class."""
-    env_ids = [group.env_ids[k] for k in places]
-    send_calls(group, "is_wrapped", name_of(wrapper), env_ids=env_ids)
+    send_calls(group, "is_wrapped", name_of(wrapper), env_ids=_ids(group, places))
 
 
 def send_values(group: EnvGroup, name: str, each: Sequence[Any]) -> None:
     """Set attribute `name` of each env to its own value."""
     for env_id, value in zip(group.env_ids, each, strict=True):
         send_calls(group, "call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id])
+
+
+def _ids(group: EnvGroup, places: Sequence[int]) -> list[str]:
+    env_ids = group.env_ids  # Each look makes a list.
+    return [env_ids[k] for k in places]

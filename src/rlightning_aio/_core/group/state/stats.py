@@ -153,9 +153,10 @@ class Stats:
         rows: NDArray[np.intp] = ended.nonzero()[0]
         slots = part.slots[rows]
         # The outcomes that `BatchedData.outcome` has; the first two are terminated, truncated.
-        where, codes = slots, 1 - terminated[ended]
         if part.info_marks is not None or part.out_of_band or part.agents:
             where, codes = self._as_reported(part, ended, 1 - terminated)
+        else:
+            where, codes = slots, 1 - terminated[ended]
         np.add.at(self._outcomes, (self._envs.names.entries[where], codes), 1)
         if not len(rows):
             return
