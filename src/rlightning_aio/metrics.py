@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.group.state.stats import OUTCOMES
+from rlightning_aio._core.group.state.episode_counts import OUTCOMES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping

@@ -24,7 +24,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
-from rlightning_aio._core.group.state import samples
+from rlightning_aio._core.group.state import stats
 from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window
 from rlightning_aio.metrics import FIGURES, _Reader
 
@@ -148,6 +148,13 @@ def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
     requests: Any = SimpleNamespace(state=np.zeros(size, np.int8), sent_ns=np.zeros(size, int))
     times = EnvTimes(envs_type(**vars(envs)), requests)
     most_kept = rng.randint(1, 20)
+    kept: list[Sample] = []
+
+    def settle() -> None:
+        if kept:
+            times.add(kept)
+            kept.clear()
+
     expected = np.zeros((num_entries, 5))
     taken: dict[int, int] = {}
     now = 10**12
@@ -157,9 +164,9 @@ def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
         requests.sent_ns[slots], requests.state[slots] = sent, 1
         now += 2000
         one = sample(rng, now, slots, sent)
-        times.kept.append(one)
-        if len(times.kept) >= most_kept:
-            times.sum_up()
+        kept.append(one)
+        if len(kept) >= most_kept:
+            settle()
         requests.state[slots] = 0
         for k, (slot, s) in enumerate(zip(slots, sent, strict=True)):
             done, busy = one.times[k].tolist()
@@ -174,8 +181,11 @@ def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
             until_now = expected.copy()
             for slot, at in taken.items():
                 until_now[entries[slot], 4] += (now + 500 - at) / 1e9
-            np.testing.assert_allclose(times.so_far(now + 500), until_now, atol=1e-12)
+            until = times.waiting_until(now + 500)
+            settle()
+            np.testing.assert_allclose(times.so_far(until), until_now, atol=1e-12)
         if rng.random() < 0.05:
+            settle()
             times.forget(slot := rng.randrange(size))
             taken.pop(slot, None)
     assert len(taken) > 0
@@ -317,7 +327,7 @@ def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None
 
 def test_other_threads_may_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """At any time; no result is counted twice or left out, and counters that are exported grow."""
-    monkeypatch.setattr(samples, "_MOST_ROWS", 3 * samples.LEAST_ROWS)
+    monkeypatch.setattr(stats, "_MOST_ROWS", 3 * 16)
     entry = {**ENTRY, "envs_per_process": 4}
     with sync.build_env_group([entry, {**entry, "name": "more"}]) as group:
         group.reset()
@@ -338,12 +348,14 @@ def test_other_threads_may_read(monkeypatch: pytest.MonkeyPatch) -> None:
         readers = [threading.Thread(target=read) for _ in range(2)]
         for reader in readers:
             reader.start()
-        for _ in range(300):
-            group.step(responses(group.env_ids, *[1.0] * 8))
+        with group.auto_reset(4):
+            for _ in range(300):
+                group.step(responses(group.env_ids, *[1.0] * 8))
         ended.set()
         for reader in readers:
             reader.join()
         assert wrong == []
         found = numbers(group)
-        assert found.steps == 2400
+        assert (found.steps, found.outcomes_truncated) == (1920, 480)
+        assert found.episode_length_mean == 4
         assert_adds_up(found, envs=8)

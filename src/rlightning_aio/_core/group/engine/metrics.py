@@ -71,7 +71,7 @@ class _Reading:
         self._tables = tables
         self._now_ns = now_ns
         self._entries = envs.names.entries
-        self._sums = stats.times.so_far(now_ns)
+        self._sums = stats.times_so_far(now_ns)  # Settles them.
         self._is_there = np.array([bool(env_id) for env_id in envs.env_ids], np.bool_)
         state, self._sent_ns = requests.state.copy(), requests.sent_ns.copy()
         self._idle = self._is_there & (state == int(State.IDLE))
@@ -114,7 +114,7 @@ class _Reading:
             **numbers,
             **self._step_times(own),
             "restarts": sum(restarts),
-            **{f"outcomes_{kind}": n for kind, n in self._stats.outcomes(entries).items()},
+            **{f"outcomes_{kind}": n for kind, n in self._stats.episodes.outcomes(entries).items()},
             **self._stats.mean_episode(entries),
         }
 

@@ -272,11 +272,11 @@ class Waiting:
             self._driver.wake()
 
     def _next(self, ticket: Ticket, wanted: int) -> Procedure[float]:
-        """Wait once for `wanted` replies to a ticket, as the leader or not; return the time."""
+        """Return the wait for `wanted` replies to a ticket, once, as the leader or not."""
         if self._leader in (0, ticket.owner) or not self._shares_thread:
             self._leader = ticket.owner
-            return (yield from self.turn(wanted, None))
-        return (yield from self._park(ticket, wanted))
+            return self.turn(wanted, None)
+        return self._park(ticket, wanted)
 
     def _leave(self, ticket: Ticket) -> None:
         """End the wait of a call, which no longer leads."""

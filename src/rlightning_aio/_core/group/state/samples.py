@@ -8,8 +8,6 @@ Rule: the hot path only appends. Whatever is computed is computed from many samp
 from __future__ import annotations
 
 import math
-import threading
-from collections import deque
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -25,13 +23,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.requests import Requests
 
-__all__ = ["LEAST_ROWS", "EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
+__all__ = ["EnvTimes", "Rows", "Sample", "Window", "percentiles", "rows_of"]
 
 WINDOW_SECONDS: Final = 10.0
-_MOST_ROWS: Final = 1 << 12
-"""The number of results that are summed at once: their columns still fit into a core's cache."""
-LEAST_ROWS: Final = 16
-"""For how many results each sample counts: to sum them one by one would take longer than a step."""
 
 
 class Sample(msgspec.Struct):
@@ -44,6 +38,7 @@ class Sample(msgspec.Struct):
         since_ns: when the call began that has returned the batch.
         needed: the number of results of the whole batch that it waited for; 0 if others may have
             been waited for, too.
+        episodes: flags, returns and lengths of ordinary results; None if no episode ends in any.
     """
 
     batch: int
@@ -56,6 +51,7 @@ class Sample(msgspec.Struct):
     synchronous: bool
     since_ns: int
     needed: int
+    episodes: tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.int64]] | None = None
 
 
 # Getters, so that no loop of Python's puts samples together.
@@ -180,75 +176,62 @@ class EnvTimes:
     """Where the time of envs has gone: sums by config entry.
 
     From one result to the next, an env waits for an action; then its request waits until the env
-    begins, the env executes it, and its result waits to be collected. Any thread may read this.
-
-    Attributes:
-        kept: samples that are not in the sums yet.
-        room: for how many results more. A caller that adds a sample takes its results off,
-            `LEAST_ROWS` at least, and calls `sum_up` where no room is left.
+    begins, the env executes it, and its result waits to be collected.
     """
 
     def __init__(self, envs: EnvTable, requests: Requests) -> None:
         self._envs = envs
         self._requests = requests
-        self.kept: deque[Sample] = deque()
-        self.room = _MOST_ROWS
         # Columns as in `so_far`; times in ns.
         self._sums = np.zeros((len(envs.names.entry_names), 5))
         # When each slot's last result was returned; 0 before the first one.
         self._taken_ns = np.zeros(len(envs), np.int64)
-        self._lock = threading.Lock()
 
     def forget(self, slot: int) -> None:
         """Another env takes `slot`: the time before its first result is nobody's."""
-        self.sum_up()
         self._taken_ns[slot] = 0
 
-    def sum_up(self) -> None:
-        """Add to the sums what is kept."""
-        kept: list[Sample] = []
-        with self._lock:
-            self.room = _MOST_ROWS
-            while self.kept:  # The trainer may append meanwhile.
-                kept.append(self.kept.popleft())
-            if not kept:
-                return
-            rows = rows_of(kept)
-            # The waits of a slot for actions are the times that it was sent requests, without the
-            # first one, minus the times that results of it were taken, without the last one.
-            before = self._taken_ns.copy()
-            first = np.flatnonzero(before[rows.slots] == 0)[::-1]
-            before[rows.slots[first]] = rows.sent[first]
-            self._taken_ns[rows.slots] = rows.taken
-            columns = (
-                rows.steps,
-                rows.busy,
-                np.maximum(rows.done - rows.busy - rows.sent, 0),
-                rows.taken - rows.done,
-                rows.sent - rows.taken,
-            )
-            entries, size = self._envs.names.entries, len(self._sums)
-            own = entries[rows.slots] if size > 1 else None
-            for k, column in enumerate(columns):
-                summed = column.sum() if own is None else np.bincount(own, column, size)
-                self._sums[:, k] += summed
-            self._sums[:, 4] += np.bincount(entries, self._taken_ns - before, size)
+    def add(self, samples: Sequence[Sample]) -> None:
+        """Add the results of samples to the sums."""
+        rows = rows_of(samples)
+        # The waits of a slot for actions are the times that it was sent requests, without the
+        # first one, minus the times that results of it were taken, without the last one.
+        before = self._taken_ns.copy()
+        first = np.flatnonzero(before[rows.slots] == 0)[::-1]
+        before[rows.slots[first]] = rows.sent[first]
+        self._taken_ns[rows.slots] = rows.taken
+        columns = (
+            rows.steps,
+            rows.busy,
+            np.maximum(rows.done - rows.busy - rows.sent, 0),
+            rows.taken - rows.done,
+            rows.sent - rows.taken,
+        )
+        entries, size = self._envs.names.entries, len(self._sums)
+        own = entries[rows.slots] if size > 1 else None
+        for k, column in enumerate(columns):
+            summed = column.sum() if own is None else np.bincount(own, column, size)
+            self._sums[:, k] += summed
+        self._sums[:, 4] += np.bincount(entries, self._taken_ns - before, size)
 
-    def so_far(self, now_ns: int) -> NDArray[np.float64]:
+    def waiting_until(self, now_ns: int) -> NDArray[np.int64]:
+        """Return until when each local env has waited for its next action."""
+        local = slice(0, len(self._envs.local_ids))
+        idle = self._requests.state[local] == int(State.IDLE)
+        return np.where(idle, now_ns, self._requests.sent_ns[local])
+
+    def so_far(self, until: NDArray[np.int64]) -> NDArray[np.float64]:
         """By entry: env steps, and seconds in envs, before envs, until collected, for actions.
 
         The first three of these are of requests whose results were returned, the last one is until
         now.
+
+        Args:
+            until: from `waiting_until`.
         """
-        local = slice(0, len(self._envs.local_ids))
-        # Read first: a request that ends meanwhile is in the sums, and its env was taken from then.
-        idle = self._requests.state[local] == int(State.IDLE)
-        until = np.where(idle, now_ns, self._requests.sent_ns[local])
-        self.sum_up()
-        with self._lock:
-            found, taken = self._sums.copy(), self._taken_ns[local].copy()
+        found, taken = self._sums.copy(), self._taken_ns[: len(until)]
         waits = np.where(taken > 0, np.maximum(until - taken, 0), 0)
-        found[:, 4] += np.bincount(self._envs.names.entries[local], waits, len(found))
+        found[:, 4] += np.bincount(self._envs.names.entries[: len(until)], waits, len(found))
         found[:, 1:] /= 1e9
         return found
 
