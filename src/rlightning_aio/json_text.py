@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any, cast
+from typing import Any
+
+from rlightning_aio.trees import converted
 
 __all__ = ["finite", "json_of"]
 
@@ -22,10 +24,6 @@ def json_of(value: Any, *, indent: int | None = None) -> str:
 
 def finite(value: Any) -> Any:
     """Return `value` with None in place of NaN and infinity."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: finite(held) for key, held in cast("dict[Any, Any]", value).items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(held) for held in cast("list[Any]", value)]
-    return value
+    return converted(
+        lambda one: None if isinstance(one, float) and not math.isfinite(one) else one, value
+    )

@@ -9,9 +9,11 @@ torch, whose CPU tensors share the arrays.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+from rlightning_aio.trees import Path, mapped, walked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -155,7 +157,7 @@ class Normalizer:
             )
             return _normal(leaf, *statistics.of(index))
 
-        return self._mapped(updated, observation)
+        return self._normalised(updated, observation)
 
     def update_rewards(
         self, index: NDArray[np.int64], reward: NDArray[Any], starts: NDArray[np.bool_]
@@ -191,7 +193,7 @@ class Normalizer:
             known = self._statistics.get(path)
             return leaf.astype(np.float32) if known is None else _normal(leaf, *known.of(index))
 
-        return self._mapped(found, observation)
+        return self._normalised(found, observation)
 
     def scaled(self, reward: NDArray[Any], index: NDArray[np.int64] | None = None) -> NDArray[Any]:
         """Rewards scaled by the present statistics; arguments as of `normalized`."""
@@ -228,10 +230,18 @@ class Normalizer:
 
     # -- parts --------------------------------------------------------------------
 
-    def _mapped(self, function: Callable[[str, NDArray[Any]], Any], observation: Any) -> Any:
-        if not self._observations:
-            return _mapped(lambda _, leaf: leaf.astype(np.float32, copy=False), observation)
-        return _mapped(function, observation)
+    def _normalised(self, function: Callable[[str, NDArray[Any]], Any], observation: Any) -> Any:
+        """Apply `function` to the keys that lead to each array of floats, and to the array."""
+
+        def found(path: Path, leaf: Any) -> Any:
+            if type(leaf) is not np.ndarray or leaf.dtype.kind != "f":
+                return leaf
+            if not self._observations:
+                return leaf.astype(np.float32, copy=False)
+            return function("/".join(map(str, ("observation", *path))), leaf)
+
+        leaves = iter([found(path, leaf) for path, leaf in walked(observation)])
+        return mapped(lambda _: next(leaves), observation)
 
     def _of(self, path: str, shape: tuple[int, ...], first_variance: float) -> _Statistics:
         if path not in self._statistics:
@@ -253,22 +263,6 @@ def _normal(
 ) -> NDArray[np.float32]:
     found = (values - mean) / np.sqrt(variance + _EPSILON)
     return np.clip(found.astype(np.float32), -_LIMIT, _LIMIT)
-
-
-def _mapped(
-    function: Callable[[str, NDArray[Any]], Any], tree: Any, path: str = "observation"
-) -> Any:
-    """Return `tree` with `function` applied to its arrays of floats and the keys to each."""
-    if isinstance(tree, dict):
-        parts = cast("dict[Any, Any]", tree)
-        return {key: _mapped(function, part, f"{path}/{key}") for key, part in parts.items()}
-    if isinstance(tree, tuple):
-        several = cast("tuple[Any, ...]", tree)
-        return tuple(_mapped(function, part, f"{path}/{k}") for k, part in enumerate(several))
-    if isinstance(tree, np.ndarray):
-        leaf = cast("NDArray[Any]", tree)
-        return function(path, leaf) if leaf.dtype.kind == "f" else leaf
-    return tree
 
 
 def _copied(array: Any) -> NDArray[Any]:

@@ -1,5 +1,7 @@
 """Trees of arrays: an array, or a dict or tuple of trees, as values of Dict and Tuple spaces are.
 
+Anything else in the place of an array is treated as one: a tensor, a space, a list of values. Only
+what converts any value, as envs return it, looks into lists, too.
 Rule: torch is recognised by name and never imported, so that users without it pay nothing.
 """
 
@@ -11,28 +13,37 @@ import numpy as np
 from gymnasium import spaces
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
+    import gymnasium as gym
     from numpy.typing import NDArray
 
 __all__ = [
     "Node",
+    "Path",
     "Tree",
     "array_of_tensor",
     "as_array",
     "as_numpy",
+    "converted",
+    "copied",
     "holds_tensor",
     "index",
     "is_dict",
     "is_tensor",
     "is_tuple",
+    "key_of",
     "mapped",
-    "paired",
     "stacked",
+    "tree_of",
+    "walked",
+    "zipped",
 ]
 
 Tree: TypeAlias = Any
 """An array, or a dict or tuple of trees."""
+Path: TypeAlias = tuple[Any, ...]
+"""The keys of dicts, and positions in tuples, that lead to an array of a tree."""
 Node: TypeAlias = "NDArray[Any] | dict[str, Tree] | tuple[Tree, ...]"
 
 
@@ -46,7 +57,7 @@ def is_tuple(space: object) -> TypeGuard[spaces.Tuple[Any]]:
     return isinstance(space, spaces.Tuple)
 
 
-def mapped(function: Callable[[NDArray[Any]], Any], tree: Node) -> Tree:
+def mapped(function: Callable[[Any], Any], tree: Node) -> Tree:
     """Apply `function` to each array of `tree`."""
     if isinstance(tree, dict):
         return {key: mapped(function, inner) for key, inner in tree.items()}
@@ -55,23 +66,49 @@ def mapped(function: Callable[[NDArray[Any]], Any], tree: Node) -> Tree:
     return function(tree)
 
 
-def paired(function: Callable[[Any, Any], Any], one: Node, other: Any) -> Tree:
-    """Apply `function` to each array of the tree `one`, and to what `other` has in its place."""
-    if isinstance(one, dict):
-        return {key: paired(function, inner, other[key]) for key, inner in one.items()}
-    if isinstance(one, tuple):
-        return tuple(paired(function, inner, other[k]) for k, inner in enumerate(one))
-    return function(one, other)
+def zipped(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
+    """Apply `function` to each array of `tree`, and to what each of `others` has in its place."""
+    if isinstance(tree, dict):
+        parts = cast("dict[str, Tree]", tree).items()
+        return {key: zipped(function, part, *(one[key] for one in others)) for key, part in parts}
+    if isinstance(tree, tuple):
+        several = cast("tuple[Tree, ...]", tree)
+        return tuple(zipped(function, *parts) for parts in zip(several, *others, strict=True))
+    return function(tree, *others)
 
 
-def stacked(trees: Sequence[Node]) -> Tree:
+def walked(tree: Tree, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """Yield each array of `tree`, after the keys that lead to it."""
+    if isinstance(tree, dict | tuple):
+        held = cast("dict[Any, Tree] | tuple[Tree, ...]", tree)
+        for key, part in held.items() if isinstance(held, dict) else enumerate(held):
+            yield from walked(part, (*path, key))
+    else:
+        yield path, tree
+
+
+def key_of(tree: Tree, of_leaf: Callable[[Any], object]) -> object:
+    """A key that is equal for trees of one structure whose arrays have equal keys."""
+    if isinstance(tree, dict):
+        parts = cast("dict[str, Tree]", tree).items()
+        return dict, frozenset((key, key_of(part, of_leaf)) for key, part in parts)
+    if isinstance(tree, tuple):
+        return tuple, *(key_of(part, of_leaf) for part in cast("tuple[Tree, ...]", tree))
+    return of_leaf(tree)
+
+
+def tree_of(space: gym.Space[Any]) -> Tree:
+    """Return the spaces that `space` is made of, in the structure of its values."""
+    if is_dict(space):
+        return {key: tree_of(inner) for key, inner in space.spaces.items()}
+    return tuple(map(tree_of, space.spaces)) if is_tuple(space) else space
+
+
+def stacked(trees: Sequence[Tree]) -> Tree:
     """Stack trees with the same structure along a new first axis; a single one is not copied."""
-    first = trees[0]
-    if isinstance(first, dict):
-        return {key: stacked([cast("Any", tree)[key] for tree in trees]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(map(stacked, zip(*cast("Any", trees), strict=True)))
-    return first[None] if len(trees) == 1 else np.stack(cast("Any", trees))
+    if len(trees) == 1:
+        return mapped(lambda array: array[None], trees[0])
+    return zipped(lambda *arrays: np.stack(arrays), *trees)
 
 
 def index(tree: Node, position: int) -> Tree:
@@ -107,15 +144,35 @@ def holds_tensor(value: Any) -> bool:
     return is_tensor(value)
 
 
+def converted(function: Callable[[Any], Any], value: Any) -> Any:
+    """Apply `function` to all that the dicts, tuples and lists of `value` hold, in new ones."""
+    if isinstance(value, dict):
+        parts = cast("dict[Any, Any]", value).items()
+        return {key: converted(function, inner) for key, inner in parts}
+    if type(value) in (tuple, list):
+        return type(value)([converted(function, inner) for inner in value])
+    if isinstance(value, tuple) and hasattr(cast("Any", value), "_make"):  # A graph, for one.
+        return cast("Any", value)._make(converted(function, inner) for inner in cast("Any", value))
+    return function(value)
+
+
 def as_numpy(value: Any) -> Any:
     """Convert every torch tensor in `value` to a NumPy array, without a copy if it is on the CPU.
 
     Looks into dicts, tuples and lists; returns anything else unchanged.
     """
-    if is_tensor(value):
-        return array_of_tensor(value)
-    if isinstance(value, dict):
-        return {key: as_numpy(inner) for key, inner in cast("dict[Any, Any]", value).items()}
-    if type(value) in (tuple, list):
-        return type(value)(map(as_numpy, value))
-    return value
+    if type(value) is np.ndarray:
+        return value
+    return converted(lambda one: array_of_tensor(one) if is_tensor(one) else one, value)
+
+
+def copied(value: Any) -> Any:
+    """Copy the containers and arrays of `value`, because their owner may change them later.
+
+    Other objects are not copied; a tensor must stay the same tensor.
+    """
+    return converted(_copied_array, value)
+
+
+def _copied_array(value: Any) -> Any:
+    return cast("NDArray[Any]", value).copy() if isinstance(value, np.ndarray) else value

@@ -30,10 +30,10 @@ from rlightning_aio._core.hosts.messages import (
     Reported,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import slot_of
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -53,7 +53,7 @@ def test_values_go_through_rows_unchanged(
         theirs.episode_length[row] = row
         theirs.info[row] = row
     for row in range(rows):
-        assert same(row_reader(actions, theirs.action, row)(), sent[row])
+        assert same(row_reader(theirs.action, row)(), sent[row])
         assert same(index(ours.observation, row), seen[row])
         assert (ours.reward[row] == row).all()
         assert (ours.terminated[row] == bool(row % 2)).all()
@@ -96,7 +96,7 @@ def test_a_value_read_for_an_env_is_a_copy(space: Any) -> None:
     one, other = sampled(space, 1), sampled(space, 2)
     write = row_writer(space, slab.action, 0, "action")
     write(one)
-    read = row_reader(space, slab.action, 0)()
+    read = row_reader(slab.action, 0)()
     write(other)
     assert same(read, one)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, RLightningError
 from rlightning_aio.outcomes import Outcome
+from rlightning_aio.trees import copied
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:

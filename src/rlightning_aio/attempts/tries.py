@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

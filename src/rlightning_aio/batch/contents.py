@@ -9,7 +9,7 @@ users.
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from rlightning_aio.batch.parts import (
     rows_in_order,
 )
 from rlightning_aio.batch.rets import rets_of
+from rlightning_aio.trees import walked, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -157,10 +158,8 @@ def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
 
 def _all_flags(terminated: Any, truncated: Any) -> bool:
     """Return True if one of the two is set for each agent and sub-environment."""
-    if isinstance(terminated, dict):
-        pairs = cast("dict[str, Any]", terminated).items()
-        return all(_all_flags(flags, truncated[agent]) for agent, flags in pairs)
-    return bool(np.all(np.logical_or(terminated, truncated)))
+    either = zipped(np.logical_or, terminated, truncated)
+    return all(np.all(flags) for _, flags in walked(either))
 
 
 def lost_rows(batch: BatchedData) -> set[int]:

@@ -28,7 +28,7 @@ from rlightning_aio.batch.rets import rets_of
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction
-from rlightning_aio.trees import index, mapped, paired
+from rlightning_aio.trees import index, mapped, zipped
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ class BatchedData:
             return self._parts[0].stacked_head("done")
         if not len(self):
             return self.limit_reached
-        return paired(np.bitwise_or, self.terminated, self.truncated)
+        return zipped(np.bitwise_or, self.terminated, self.truncated)
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ from rlightning_aio.batch.contents import origin_of, parts_of, sources_of
 from rlightning_aio.batch.data import BatchedData, Origin, batch_of_results, with_repeats
 from rlightning_aio.batch.sent import joined_sources
 from rlightning_aio.batch.stacking import concatenated
+from rlightning_aio.trees import key_of, walked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.trees import Tree
 
 __all__ = ["joined"]
 
@@ -74,11 +74,11 @@ def _layout(part: ResultColumns) -> Any:
 
     The schemas are part of it, because a replaced worker's rows need the schemas of that worker.
     """
-    shapes = _shapes(part.observation)
-    if shapes is None or part.whole_results:
+    forms = [(path, _form(array)) for path, array in walked(part.observation)]
+    if part.whole_results or any(form is None for _, form in forms):
         return None
     return (
-        shapes,
+        key_of(part.observation, _form),
         part.reward.shape[1:],
         part.agents,
         None if part.info is None else (part.info.shape[1:], id(part.schemas)),
@@ -86,18 +86,9 @@ def _layout(part: ResultColumns) -> Any:
     )
 
 
-def _shapes(tree: Tree | None) -> Any:
-    """Hashable key that is equal for trees that can be concatenated; None if they can't be."""
-    if isinstance(tree, dict):
-        inner = [(key, _shapes(part)) for key, part in cast("dict[str, Tree]", tree).items()]
-        return None if any(shapes is None for _, shapes in inner) else tuple(inner)
-    if isinstance(tree, tuple):
-        inner = [_shapes(part) for part in cast("tuple[Tree, ...]", tree)]
-        return None if None in inner else tuple(inner)
-    if isinstance(tree, np.ndarray):
-        array = cast("NDArray[Any]", tree)
-        return array.shape[1:], array.dtype
-    return None
+def _form(array: Any) -> Any:
+    """The shape and dtype of rows; None for values that aren't in an array."""
+    return (array.shape[1:], array.dtype) if type(array) is np.ndarray else None
 
 
 def _one(parts: list[ResultColumns]) -> ResultColumns:

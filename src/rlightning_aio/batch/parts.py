@@ -14,7 +14,7 @@ import numpy as np
 from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
 from rlightning_aio.batch.stacking import differing, stacked_values
 from rlightning_aio.protocol.columns import leaves
-from rlightning_aio.trees import is_dict, is_tuple
+from rlightning_aio.trees import key_of, tree_of, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -98,14 +98,11 @@ def _stacked_in(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
     Raises:
         ValueError: the spaces differ in structure.
     """
-    keys = _keys_of(known[0])
-    if any(_keys_of(space) != keys for space in known):
+    trees = [tree_of(space) for space in known]
+    if len({key_of(tree, lambda _: None) for tree in trees}) > 1:
         raise differing()
-    if keys is None:
-        return _column(known, values)
-    inner = {key: [cast("Any", space)[key] for space in known] for key in keys}
-    columns = {key: _stacked_in(inner[key], [value[key] for value in values]) for key in keys}
-    return columns if is_dict(known[0]) else tuple(columns.values())
+    count = len(known)
+    return zipped(lambda *both: _column(both[:count], list(both[count:])), *trees, *values)
 
 
 def _column(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
@@ -117,13 +114,6 @@ def _column(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
         return column
     # As if the values had come through rows of fixed size: an env may count a float32 in ints.
     return column.astype(dtype, copy=False)
-
-
-def _keys_of(space: gym.Space[Any]) -> list[Any] | None:
-    """Keys of a Dict, positions of a Tuple; None for any other space."""
-    if is_dict(space):
-        return list(space.spaces)
-    return list(range(len(space.spaces))) if is_tuple(space) else None
 
 
 def infos_of_parts(parts: Sequence[ResultColumns], *, episodes: bool) -> dict[str, Any]:

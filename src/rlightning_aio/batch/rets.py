@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from rlightning_aio.batch.infos import info_list_of_rows
+from rlightning_aio.trees import zipped
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, unchecked
 
 if TYPE_CHECKING:
@@ -72,7 +73,9 @@ def _ret_handed_over(part: ResultColumns, row: int, ret: Any) -> Any:
     if part.episode(row):
         changed["info"] = part.info_of(row)
     if part.limit_reached is not None and part.limit_reached[row]:
-        changed["last_truncated"] = _like(ret.last_truncated, part.head_of(part.truncated, row))
+        changed["last_truncated"] = zipped(
+            _like, ret.last_truncated, part.head_of(part.truncated, row)
+        )
     return ret.model_copy(update=changed) if changed else ret
 
 
@@ -83,6 +86,4 @@ def _is_default(field: Any) -> bool:
 
 def _like(old: Any, value: Any) -> Any:
     """Convert `value` to the type of `old`: a tensor on the same device, or an array."""
-    if isinstance(old, dict):
-        return {key: _like(part, value[key]) for key, part in cast("dict[str, Any]", old).items()}
     return old.new_tensor(value) if hasattr(old, "new_tensor") else value

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.trees import as_array
+from rlightning_aio.trees import as_array, key_of, zipped
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -94,33 +94,30 @@ def columns_where_possible(values: list[Any]) -> Any:
 
 def form_of(tree: Any) -> object:
     """A key that is equal for columns that `concatenated` joins without changing a value."""
-    if isinstance(tree, dict):
-        parts = cast("dict[str, Any]", tree)
-        return dict, frozenset((key, form_of(part)) for key, part in parts.items())
-    if isinstance(tree, tuple):
-        return tuple, *map(form_of, cast("tuple[Any, ...]", tree))
-    if isinstance(tree, np.ndarray):
-        column = cast("NDArray[Any]", tree)
-        kind = column.dtype.kind
-        return np.ndarray, column.shape[1:], "number" if kind in "biufc" else kind
-    if isinstance(tree, list):
+    return key_of(tree, _form_of_column)
+
+
+def _form_of_column(column: Any) -> object:
+    if isinstance(column, np.ndarray):
+        array = cast("NDArray[Any]", column)
+        kind = array.dtype.kind
+        return np.ndarray, array.shape[1:], "number" if kind in "biufc" else kind
+    if isinstance(column, list):
         return list
-    return "tensor", tree.shape[1:], str(tree.device)
+    return "tensor", column.shape[1:], str(column.device)
 
 
 def concatenated(trees: list[Any], order: NDArray[np.intp] | slice = slice(None)) -> Any:
     """Concatenate trees with the same structure, and reorder their rows."""
-    first = trees[0]
-    if isinstance(first, dict):
-        parts = cast("dict[str, Any]", first)
-        return {key: concatenated([tree[key] for tree in trees], order) for key in parts}
-    if isinstance(first, tuple):
-        count = len(cast("tuple[Any, ...]", first))
-        return tuple(concatenated([tree[k] for tree in trees], order) for k in range(count))
+    return zipped(lambda *columns: _joined(columns, order), *trees)
+
+
+def _joined(columns: tuple[Any, ...], order: NDArray[np.intp] | slice) -> Any:
+    first = columns[0]
     if isinstance(first, list):
-        rows = [row for tree in trees for row in tree]
+        rows = [row for column in columns for row in column]
         return [rows[k] for k in np.arange(len(rows))[order].tolist()]
     if isinstance(first, np.ndarray):
-        return np.concatenate(trees)[order]
+        return np.concatenate(columns)[order]
     # A process that holds a tensor has imported torch.
-    return sys.modules["torch"].cat(trees)[order]
+    return sys.modules["torch"].cat(columns)[order]

@@ -16,7 +16,7 @@ from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.answers import answers_of
 from rlightning_aio.protocol.columns import gather, is_array
-from rlightning_aio.trees import mapped, paired
+from rlightning_aio.trees import mapped, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -229,7 +229,7 @@ class EnvKind:
             outs |= allocated(staging.columns, self.quota)
         gathered(staging.columns, order, outs)
         columns = mapped(shaped, outs)
-        columns["done"] = paired(np.bitwise_or, columns["terminated"], columns["truncated"])
+        columns["done"] = zipped(np.bitwise_or, columns["terminated"], columns["truncated"])
         for name, column in staging.of_places(order).items():
             columns[name] = column.reshape(shape)
         return columns

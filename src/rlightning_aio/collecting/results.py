@@ -9,7 +9,7 @@ import numpy as np
 
 from rlightning_aio.batch.contents import all_agents, ended_episodes, plain_columns
 from rlightning_aio.batch.infos import infos_of_each, listed
-from rlightning_aio.collecting.trees import rows_of
+from rlightning_aio.collecting.trees import rows_of, scattered
 from rlightning_aio.trees import Tree, mapped
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class ResultRows:
             if found is not None and len(self.head) > 1:
                 found = _one_of(found, sub_env)
             if found is not None:
-                _write_row(otherwise, k, found)
+                scattered(otherwise, k, found)
         return otherwise
 
     def info(self, name: str) -> NDArray[np.float64]:
@@ -159,14 +159,6 @@ def _one_of(observations: Any, sub_env: int) -> Any:
     if isinstance(observations, np.ndarray):
         return cast("NDArray[Any]", observations)[sub_env]
     return mapped(lambda leaf: leaf[sub_env], observations)
-
-
-def _write_row(tree: Tree, row: int, value: Any) -> None:
-    if isinstance(tree, np.ndarray):
-        tree[row] = value
-        return
-    for key in cast("dict[Any, Tree]", tree) if isinstance(tree, dict) else range(len(tree)):
-        _write_row(tree[key], row, value[key])
 
 
 def result_rows(batch: BatchedData) -> ResultRows:

@@ -9,7 +9,7 @@ import numpy as np
 from rlightning_aio.collecting.advantages import Segments, gae, vtrace
 from rlightning_aio.collecting.trees import with_lists
 from rlightning_aio.protocol.columns import gather
-from rlightning_aio.trees import Tree, mapped, paired
+from rlightning_aio.trees import Tree, mapped, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -160,7 +160,7 @@ class Rollout:
             flat = self._flat(leaf)
             return self._chains().successors(flat, ends).reshape(leaf.shape)
 
-        return with_lists(paired(after, self._columns["observation"], self._end_observation))
+        return with_lists(zipped(after, self._columns["observation"], self._end_observation))
 
     def at_ends(self, name: str) -> Tree:
         """Rows of a column at the ends, ``[k, *shape]``, in new arrays."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.trees import Tree, mapped
+from rlightning_aio.trees import Tree, key_of, mapped, walked, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -135,14 +135,17 @@ def check_alike(columns: Mapping[str, Tree], values: Mapping[str, Tree]) -> None
 
 
 def _alike(tree: Tree, values: Tree) -> bool:
-    if type(values) is not type(tree):
+    if key_of(tree, _form) != key_of(values, _form):
         return False
-    if isinstance(tree, np.ndarray):
-        column, rows = cast("NDArray[Any]", tree), cast("NDArray[Any]", values)
-        castable = np.can_cast(rows.dtype, column.dtype, "same_kind")
-        return castable and rows.shape[1:] == column.shape[1:]
-    keys = _keys(tree)
-    return _keys(values) == keys and all(_alike(tree[key], values[key]) for key in keys)
+    return all(fits for _, fits in walked(zipped(_castable, tree, values)))
+
+
+def _form(array: NDArray[Any]) -> object:
+    return array.shape[1:]
+
+
+def _castable(column: NDArray[Any], rows: NDArray[Any]) -> bool:
+    return np.can_cast(rows.dtype, column.dtype, "same_kind")
 
 
 def _keys(tree: Tree) -> Collection[Any]:

@@ -5,14 +5,14 @@ Sampling works on whole columns, so its cost hardly grows with the batch.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
-from rlightning_aio.trees import index, stacked
+from rlightning_aio.trees import index, mapped, stacked, tree_of, walked
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -91,39 +91,26 @@ class RandomPolicy:
 
 def sampler_of(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
     """Return a function that makes n actions of `space`, as columns."""
-    columns = _columns(space, rng)
-    if columns is not None:
-        return columns
+    samplers = mapped(lambda part: _columns(part, rng), tree_of(space))
+    if all(draw is not None for _, draw in walked(samplers)):
+        return lambda n: mapped(lambda draw: draw(n), samplers)
     space.seed(int(rng.integers(2**31)))
     return lambda n: [space.sample() for _ in range(n)]
 
 
-def _columns(space: gym.Space[Any], rng: np.random.Generator) -> Sampler | None:
+def _columns(space: Any, rng: np.random.Generator) -> Sampler | None:
     """Return a function that makes columns, or None for spaces whose values can't be stacked."""
     # Gymnasium's spaces are generic over a dtype that is usually left out.
     spaces: Any = gym.spaces
-    known = cast("Any", space)
     if isinstance(space, spaces.Box):
-        return _box(known, rng)
+        return _box(space, rng)
     if isinstance(space, spaces.Discrete):
-        return _integers(known.start, known.start + known.n - 1, known, rng)
+        return _integers(space.start, space.start + space.n - 1, space, rng)
     if isinstance(space, spaces.MultiDiscrete):
-        return _integers(known.start, known.start + known.nvec - 1, known, rng)
+        return _integers(space.start, space.start + space.nvec - 1, space, rng)
     if isinstance(space, spaces.MultiBinary):
-        return _integers(0, 1, known, rng)
-    if isinstance(space, spaces.Dict):
-        return _mapping({key: _columns(inner, rng) for key, inner in known.spaces.items()})
-    if isinstance(space, spaces.Tuple):
-        parts = _mapping(dict(enumerate(_columns(inner, rng) for inner in known.spaces)))
-        return parts and (lambda n: tuple(parts(n).values()))
+        return _integers(0, 1, space, rng)
     return None
-
-
-def _mapping(samplers: dict[Any, Sampler | None]) -> Sampler | None:
-    found = {key: sampler for key, sampler in samplers.items() if sampler is not None}
-    if len(found) < len(samplers):
-        return None
-    return lambda n: {key: sampler(n) for key, sampler in found.items()}
 
 
 def _integers(low: Any, high: Any, space: gym.Space[Any], rng: np.random.Generator) -> Sampler:

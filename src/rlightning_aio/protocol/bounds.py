@@ -13,10 +13,12 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.protocol.columns import Leaf
-from rlightning_aio.trees import is_dict, is_tuple
+from rlightning_aio.trees import tree_of, walked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from rlightning_aio.trees import Path
 
 __all__ = ["out_of_bounds"]
 
@@ -25,31 +27,33 @@ _NUMBERS = (np.ndarray, np.generic, int, float)
 
 def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
     """Describe the first number of `value` outside the bounds of `space`; None without any."""
-    return next(_faults(space, value, what, ()), None)
+    return next(_faults(space, value, what), None)
 
 
-def _faults(
-    space: gym.Space[Any], value: Any, what: str, path: tuple[str | int, ...]
-) -> Iterator[str]:
-    if is_dict(space):
-        parts = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
-        for key in space.spaces.keys() & parts.keys():
-            yield from _faults(space.spaces[key], parts[key], what, (*path, key))
-    elif is_tuple(space):
-        items = cast("tuple[Any, ...]", value) if isinstance(value, tuple) else ()
-        for position, (inner, part) in enumerate(zip(space.spaces, items, strict=False)):
-            yield from _faults(inner, part, what, (*path, position))
-    elif (bounds := _bounds(space)) is not None and isinstance(value, _NUMBERS):
-        array = np.asarray(value)
-        if array.shape != space.shape or array.dtype.kind not in "biuf":
-            return
+def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
+    for path, part in walked(tree_of(space)):
+        bounds, found = _bounds(part), _held(value, path)
+        if bounds is None or not isinstance(found, _NUMBERS):
+            continue
+        array = np.asarray(found)
+        if array.shape != part.shape or array.dtype.kind not in "biuf":
+            continue
         low, high = (np.broadcast_to(bound, array.shape) for bound in bounds)
         # In this form NaN is outside.
         outside = ~((array >= low) & (array <= high))
         if outside.any():
             name = Leaf(path, (), array.dtype).name
-            found, least, most = (one[outside][0] for one in (array, low, high))
-            yield f"{what}{name} holds {found}, and the space goes from {least} to {most}"
+            number, least, most = (one[outside][0] for one in (array, low, high))
+            yield f"{what}{name} holds {number}, and the space goes from {least} to {most}"
+
+
+def _held(value: Any, path: Path) -> Any:
+    for key in path:
+        try:
+            value = value[key]
+        except (LookupError, TypeError):
+            return None
+    return value
 
 
 def _bounds(space: gym.Space[Any]) -> tuple[Any, Any] | None:

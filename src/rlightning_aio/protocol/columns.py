@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.trees import as_array, is_dict, is_tuple, mapped
+from rlightning_aio.trees import as_array, is_dict, is_tuple, key_of, mapped, tree_of, walked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -66,21 +66,10 @@ class Leaf:
 
 def leaves(space: gym.Space[Any]) -> tuple[Leaf, ...] | None:
     """Arrays of a value of `space`, or None if it has no fixed size."""
-    found = list(_walk(space, ()))
-    return None if None in found else tuple(leaf for leaf in found if leaf is not None)
-
-
-def _walk(space: gym.Space[Any], path: tuple[str | int, ...]) -> Iterator[Leaf | None]:
-    if is_dict(space):
-        for key, inner in space.spaces.items():
-            yield from _walk(inner, (*path, key))
-    elif is_tuple(space):
-        for position, inner in enumerate(space.spaces):
-            yield from _walk(inner, (*path, position))
-    elif is_array(space) and space.dtype != object:
-        yield Leaf(path, space.shape, space.dtype)
-    else:
-        yield None
+    found = list(walked(tree_of(space)))
+    if not all(is_array(part) and part.dtype != object for _, part in found):
+        return None
+    return tuple(Leaf(path, part.shape, part.dtype) for path, part in found)
 
 
 def structure(space: gym.Space[Any], *, limits: bool = False) -> object:
@@ -88,16 +77,20 @@ def structure(space: gym.Space[Any], *, limits: bool = False) -> object:
 
     With `limits`, boxes that are bounded in different places differ.
     """
-    if is_dict(space):
-        return dict, *((key, structure(s, limits=limits)) for key, s in space.spaces.items())
-    if is_tuple(space):
-        return tuple, *(structure(s, limits=limits) for s in space.spaces)
-    if not is_array(space):
-        return type(space).__qualname__
-    if limits and hasattr(space, "bounded_below"):
-        bounded = space.bounded_below.tobytes(), space.bounded_above.tobytes()
-        return space.shape, space.dtype, *bounded
-    return space.shape, space.dtype
+
+    def of_array(part: gym.Space[Any]) -> object:
+        if not is_array(part):
+            return type(part).__qualname__
+        bounded = (
+            (part.bounded_below, part.bounded_above)
+            if limits and hasattr(part, "bounded_below")
+            else ()
+        )
+        return part.shape, part.dtype, *(where.tobytes() for where in bounded)
+
+    tree = tree_of(space)
+    # Columns are laid out in the order of the keys.
+    return key_of(tree, of_array), *(path for path, _ in walked(tree))
 
 
 def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
@@ -107,11 +100,7 @@ def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
 
 def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
     """Arrange `arrays`, given in the order of `leaves`, in the structure of `space`."""
-    if is_dict(space):
-        return {key: assemble(inner, arrays) for key, inner in space.spaces.items()}
-    if is_tuple(space):
-        return tuple(assemble(inner, arrays) for inner in space.spaces)
-    return next(arrays)
+    return mapped(lambda _: next(arrays), tree_of(space))
 
 
 def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, NDArray[Any]]]:
@@ -309,14 +298,11 @@ def _tuple_writer(
     return write
 
 
-def row_reader(space: gym.Space[Any], tree: Tree, row: int) -> Callable[[], Any]:
+def row_reader(tree: Tree, row: int) -> Callable[[], Any]:
     """Make a function that returns the value in `row` in the form that envs expect: a copy."""
-    if is_dict(space):
-        readers = {k: row_reader(inner, tree[k], row) for k, inner in space.spaces.items()}
-        return lambda: {key: reader() for key, reader in readers.items()}
-    if is_tuple(space):
-        parts = [row_reader(s, t, row) for s, t in zip(space.spaces, tree, strict=True)]
-        return lambda: tuple(reader() for reader in parts)
-    if tree.ndim == 1:
-        return lambda: tree[row]
-    return tree[row].copy
+
+    def of_array(column: NDArray[Any]) -> Callable[[], Any]:
+        return (lambda: column[row]) if column.ndim == 1 else column[row].copy
+
+    readers = mapped(of_array, tree)
+    return readers if callable(readers) else lambda: mapped(lambda read: read(), readers)

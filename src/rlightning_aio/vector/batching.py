@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.trees import is_dict, is_tuple, paired
+from rlightning_aio.trees import mapped, tree_of, zipped
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -17,13 +17,11 @@ __all__ = ["batched", "merged", "replaced", "spread"]
 
 def batched(space: gym.Space[Any], observations: Any) -> Any:
     """Convert lists of observations that can't be stacked to tuples, as Gymnasium does."""
-    if is_dict(space):
-        return {key: batched(part, observations[key]) for key, part in space.spaces.items()}
-    if is_tuple(space):
-        return tuple(batched(part, observations[k]) for k, part in enumerate(space.spaces))
-    if isinstance(observations, list):
-        return tuple(cast("list[Any]", observations))
-    return observations
+
+    def part_of(_: gym.Space[Any], part: Any) -> Any:
+        return tuple(cast("list[Any]", part)) if isinstance(part, list) else part
+
+    return zipped(part_of, tree_of(space), observations)
 
 
 def replaced(columns: Any, others: Any, chosen: NDArray[np.intp]) -> Any:
@@ -35,40 +33,35 @@ def replaced(columns: Any, others: Any, chosen: NDArray[np.intp]) -> Any:
             copy[k] = other[k]
         return copy
 
-    return paired(mixed, columns, others)
+    return zipped(mixed, columns, others)
 
 
 def merged(before: Any, now: Any, chosen: NDArray[np.intp], count: int) -> Any:
     """Observations of all `count` envs: those of `before`, with `now` in the rows `chosen`."""
-    if isinstance(now, dict):
-        parts = cast("dict[str, Any]", now)
-        known: dict[str, Any] = before or {}
-        return {key: merged(known.get(key), part, chosen, count) for key, part in parts.items()}
-    if isinstance(now, np.ndarray):
-        array = cast("NDArray[Any]", now)
-        shape = (count, *array.shape[1:])
-        whole = np.zeros(shape, array.dtype) if before is None else before.copy()
-        whole[chosen] = array
-        return whole
-    if isinstance(now, tuple):
-        several = cast("tuple[Any, ...]", now)
-        old: Any = before or [None] * len(several)
-        return tuple(merged(old[k], part, chosen, count) for k, part in enumerate(several))
-    values: list[Any] = [None] * count if before is None else list(before)
-    for k, value in zip(chosen.tolist(), now, strict=True):
-        values[k] = value
-    return values
+
+    def whole_of(now: Any, before: Any = None) -> Any:
+        if isinstance(now, np.ndarray):
+            array = cast("NDArray[Any]", now)
+            shape = (count, *array.shape[1:])
+            whole = np.zeros(shape, array.dtype) if before is None else before.copy()
+            whole[chosen] = array
+            return whole
+        values: list[Any] = [None] * count if before is None else list(before)
+        for k, value in zip(chosen.tolist(), now, strict=True):
+            values[k] = value
+        return values
+
+    return mapped(whole_of, now) if before is None else zipped(whole_of, now, before)
 
 
 def spread(infos: dict[str, Any], chosen: NDArray[np.intp], count: int) -> dict[str, Any]:
     """Expand infos of the envs `chosen` to columns for all `count` envs."""
-    columns: dict[str, Any] = {}
-    for key, column in infos.items():
-        if isinstance(column, dict):
-            columns[key] = spread(cast("dict[str, Any]", column), chosen, count)
-            continue
-        columns[key] = np.zeros((count, *column.shape[1:]), column.dtype)
+
+    def expanded(column: NDArray[Any]) -> NDArray[Any]:
+        whole = np.zeros((count, *column.shape[1:]), column.dtype)
         if column.dtype == object:
-            columns[key][:] = None
-        columns[key][chosen] = column
-    return columns
+            whole[:] = None
+        whole[chosen] = column
+        return whole
+
+    return mapped(expanded, infos)

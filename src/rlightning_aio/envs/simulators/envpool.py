@@ -23,7 +23,7 @@ from rlightning_aio.envs.fast_path import (
 )
 from rlightning_aio.envs.results import has_preprocess_fn
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.trees import as_numpy, index, is_dict
+from rlightning_aio.trees import as_numpy, index, is_dict, mapped
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -194,12 +194,13 @@ class _PoolArrays:
         self._action_dtype = action.dtype
         self._action_shape = tuple(action.shape[1:] if action.shape[:1] == [-1] else action.shape)
         places = _nested(pool._state_keys)
-        self._observation: Places = places["obs"]
+        observation: Places = places["obs"]
         if not is_dict(pool.observation_space):
-            while isinstance(self._observation, dict) and len(self._observation) == 1:
-                (self._observation,) = self._observation.values()
+            while isinstance(observation, dict) and len(observation) == 1:
+                (observation,) = observation.values()
+        self._observation: Any = observation
         info: Any = places["info"]
-        self._info: Places = {**info, "elapsed_step": places["elapsed_step"]}
+        self._info: Any = {**info, "elapsed_step": places["elapsed_step"]}
         self._reward, self._done, self._truncated = map(
             pool._state_keys.index, ("reward", "done", "trunc")
         )
@@ -219,11 +220,11 @@ class _PoolArrays:
         arrays = self._pool._recv()
         truncated = arrays[self._truncated]
         return (
-            _filled(self._observation, arrays),
+            mapped(arrays.__getitem__, self._observation),
             arrays[self._reward],
             arrays[self._done] > truncated,
             truncated,
-            _filled(self._info, arrays),
+            mapped(arrays.__getitem__, self._info),
         )
 
 
@@ -237,13 +238,3 @@ def _nested(keys: list[str]) -> dict[str, Places]:
             node = node.setdefault(part, {})
         node[name] = position
     return tree
-
-
-def _filled(places: Places, arrays: list[NDArray[Any]]) -> Any:
-    """Return the tree `places` with arrays instead of positions."""
-    if isinstance(places, int):
-        return arrays[places]
-    return {
-        name: arrays[part] if isinstance(part, int) else _filled(part, arrays)
-        for name, part in places.items()
-    }

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import importlib
 from abc import abstractmethod
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 from gymnasium.vector.utils import batch_space
@@ -18,9 +17,12 @@ from gymnasium.vector.utils import batch_space
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn
 from rlightning_aio.envs.simulators.isaac_task import make_simulator
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.trees import mapped
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["IsaacManagerBasedEnv", "IsaacMarlEnv"]
@@ -97,10 +99,8 @@ class _IsaacEnv(BaseEnv):
 
     def _own(self, value: Any) -> Any:
         """Copy nested tensors, without the batch axis if there is one sub-environment."""
-        if isinstance(value, Mapping):
-            tree = cast("Mapping[str, Any]", value)
-            return {key: self._own(item) for key, item in tree.items()}
-        return value[0].clone() if self.num_envs == 1 else value.clone()
+        alone = self.num_envs == 1
+        return mapped(lambda tensor: tensor[0].clone() if alone else tensor.clone(), value)
 
     def _scalar_or_own(self, value: Any) -> Any:
         return value[0].item() if self.num_envs == 1 else value.clone()

@@ -9,7 +9,7 @@ Absent on purpose: batches on the CPU, which ManiSkill doesn't have; use more wo
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, sub_env_seeds
 from rlightning_aio.envs.simulators.vulkan import do_without_materials, render_device_is_usable
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.trees import as_numpy, is_tensor
+from rlightning_aio.trees import as_numpy, is_tensor, mapped
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -189,14 +189,15 @@ class ManiskillEnv(BaseEnv):
             value: tensors with a leading batch axis, in dicts to any depth.
             scalars: convert one number of one env to a Python scalar.
         """
-        if isinstance(value, dict):
-            entries = cast("dict[str, Any]", value)
-            return {key: self._handed_out(one, scalars=scalars) for key, one in entries.items()}
-        if not is_tensor(value):
-            return value
-        if self.num_envs > 1:
-            return value.clone()
-        return value.item() if scalars and value.ndim == 1 else value[0].clone()
+
+        def own(one: Any) -> Any:
+            if not is_tensor(one):
+                return one
+            if self.num_envs > 1:
+                return one.clone()
+            return one.item() if scalars and one.ndim == 1 else one[0].clone()
+
+        return mapped(own, value)
 
     def _require_loaded(self) -> None:
         if self._is_offloaded:

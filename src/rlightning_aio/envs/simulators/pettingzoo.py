@@ -12,12 +12,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from gymnasium.spaces import Box, Dict, Discrete
 
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import did_you_mean
-from rlightning_aio.trees import as_numpy
+from rlightning_aio.trees import as_numpy, mapped, tree_of
 from rlightning_aio.types import MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -177,14 +177,12 @@ def _own_limit(simulator: Any) -> int | None:
 
 def _zeros(space: gym.Space[Any]) -> Any:
     """Return the member of `space` that is nearest to zero."""
-    match space:
-        case Dict():
-            return {key: _zeros(inner) for key, inner in space.spaces.items()}
-        case Tuple():
-            return tuple(map(_zeros, cast("Any", space).spaces))
-        case Discrete():
-            return space.start
-        case Box():
-            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
-        case _:
-            return np.zeros(space.shape or (), space.dtype)
+    return mapped(_zero, tree_of(space))
+
+
+def _zero(space: gym.Space[Any]) -> Any:
+    known = cast("Any", space)  # Gymnasium's spaces are generic over a dtype that is left out.
+    if isinstance(space, Discrete):
+        return known.start
+    zeros = np.zeros(space.shape or (), known.dtype)
+    return np.clip(zeros, known.low, known.high) if isinstance(space, Box) else zeros

@@ -5,14 +5,11 @@ from __future__ import annotations
 import contextlib
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
-from rlightning_aio.trees import as_numpy, holds_tensor, is_tensor
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from rlightning_aio.trees import as_numpy, converted, holds_tensor, is_tensor
 
 __all__ = ["on_cpu", "resolve_object", "to_device", "to_numpy"]
 
@@ -22,19 +19,6 @@ def _torch() -> Any:
     with contextlib.suppress(ImportError):
         return import_module("torch")
     return None
-
-
-def _mapped(function: Callable[[Any], Any], data: Any) -> Any:
-    """Return `data` with `function` applied to all values in its containers."""
-    if isinstance(data, dict):
-        entries = cast("dict[Any, Any]", data).items()
-        return {key: _mapped(function, value) for key, value in entries}
-    if isinstance(data, tuple) and hasattr(cast("Any", data), "_make"):
-        return cast("Any", data)._make(_mapped(function, one) for one in cast("Any", data))
-    if isinstance(data, list | tuple):
-        members = cast("list[Any]", data)
-        return type(members)(_mapped(function, one) for one in members)
-    return function(data)
 
 
 def to_device(data: Any, device: Any) -> Any:
@@ -62,25 +46,25 @@ def to_device(data: Any, device: Any) -> Any:
         is_movable = is_tensor(value) or type(value).__name__ == "TensorDict"
         return value.to(device) if is_movable else value
 
-    return _mapped(moved, data)
+    return converted(moved, data)
 
 
 def to_numpy(data: Any) -> Any:
     """Return `data` with its tensors as arrays; bfloat16 becomes uint16, bit for bit."""
 
-    def converted(value: Any) -> Any:
+    def moved(value: Any) -> Any:
         if is_tensor(value) and str(value.dtype) == "torch.bfloat16":
             return value.detach().cpu().view(_torch().uint16).numpy()
         return as_numpy(value)
 
-    return _mapped(converted, data)
+    return converted(moved, data)
 
 
 def on_cpu(data: Any) -> Any:
     """Return `data` with its tensors on the CPU, from where they can be pickled."""
     if not holds_tensor(data):
         return data
-    return _mapped(lambda value: value.detach().cpu() if is_tensor(value) else value, data)
+    return converted(lambda value: value.detach().cpu() if is_tensor(value) else value, data)
 
 
 def resolve_object(obj: Any) -> Any:

@@ -26,7 +26,7 @@ from rlightning_aio import Anything, Outcome
 from rlightning_aio.errors import ConfigError, EnvFault, RLightningError
 from rlightning_aio.json_text import json_of
 from rlightning_aio.plugins.one_frame import keep_alive_by_system
-from rlightning_aio.trees import as_array, is_dict, is_tuple
+from rlightning_aio.trees import as_array, is_dict, tree_of, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -442,7 +442,7 @@ def _action_in(space: gym.Space[Any], data: dict[str, Any]) -> Any:
         KeyError, TypeError, ValueError: they mean none.
     """
     if is_dict(space):
-        return {key: _value_in(inner, data[key]) for key, inner in space.spaces.items()}
+        return _value_in(space, data)
     if "action" in data:
         return _value_in(space, data["action"])
     if isinstance(space, Anything):
@@ -451,10 +451,10 @@ def _action_in(space: gym.Space[Any], data: dict[str, Any]) -> Any:
 
 
 def _value_in(space: gym.Space[Any], value: Any) -> Any:
-    if is_dict(space):
-        return {key: _value_in(inner, value[key]) for key, inner in space.spaces.items()}
-    if is_tuple(space):
-        return tuple(map(_value_in, space.spaces, value))
+    return zipped(_array_in, tree_of(space), value)
+
+
+def _array_in(space: gym.Space[Any], value: Any) -> Any:
     if space.shape is None:
         return value
     array = np.asarray(value, space.dtype)

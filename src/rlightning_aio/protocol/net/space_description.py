@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio.protocol.net.wire import DTYPES, MAX_FRAME_BYTES, WireError
-from rlightning_aio.trees import is_dict, is_tuple
+from rlightning_aio.trees import converted, is_dict, is_tuple
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -125,13 +125,7 @@ def _bounds(array: NDArray[Any]) -> Any:
         return _plain_number(array.flat[0].item())
     while array.ndim > 1 and (array == array[:1]).all():
         array = array[0]
-    return _plain(array.tolist())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(inner) for inner in cast("list[Any]", value)]
-    return _plain_number(value)
+    return converted(_plain_number, array.tolist())
 
 
 def _plain_number(value: float) -> float | str:

@@ -63,7 +63,7 @@ class _ClientRow:
         self.entry = 0
         self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
-            self._read_action = row_reader(slab.layout.action_space, slab.action, row)
+            self._read_action = row_reader(slab.action, row)
         self._slab = slab
         self._row = row
         self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)

@@ -21,10 +21,10 @@ from rlightning_aio._core.hosts.messages import (
     Withdrawn,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -16,9 +16,9 @@ from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import Built, Closed, Reported, Result
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.runner import attach_all
 from rlightning_aio.protocol.rings import WorkerBell, bell_size
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence

@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
 from rlightning_aio.envs.base import result_of
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import fitted, fitted_tree, row_reader, row_writer
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
-from rlightning_aio.trees import as_numpy, holds_tensor
+from rlightning_aio.trees import as_numpy, copied, holds_tensor
 from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
@@ -207,7 +206,7 @@ class RowWriter:
         if slab.observation is None:
             observation = last.get("observation")
         elif whole is None:
-            observation = row_reader(slab.layout.observation_space, slab.observation, row)()
+            observation = row_reader(slab.observation, row)()
         sums = (slab.episode_return, slab.episode_length, slab.over)
         return ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
 

@@ -182,7 +182,6 @@ class EnvRunner:
         send_checkpoint: Send | None = None,
     ) -> None:
         """Write all results into `row` of `slab` from now on."""
-        layout = self.layout
         num_envs = self.env.config.num_envs
         self._slab, self._row, self._announce = slab, row, announce
         self._attach_again = partial(self.attach, slab, row, announce, send_checkpoint)
@@ -199,7 +198,7 @@ class EnvRunner:
             self._writer.convert_by(self._casts.fitted)
         self.checkpoints = Checkpoints(self.env, slab, row, self._writer)
         if slab.action is not None:
-            self._read_action = row_reader(layout.action_space, slab.action, row)
+            self._read_action = row_reader(slab.action, row)
         every = self.env.config.snapshot_every
         if every is not None and send_checkpoint is not None:
             self._saver = Saver(self.checkpoints, slab.over[row, ...], every, send_checkpoint)
