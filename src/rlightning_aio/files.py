@@ -14,7 +14,7 @@ import re
 import secrets
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
@@ -27,9 +27,6 @@ __all__ = [
     "finish_file",
     "write_file",
 ]
-
-_PROBE: Final = bytes(4096)
-"""One block, because an empty file fits even a full disk."""
 
 
 def file_name(text: str) -> str:
@@ -47,8 +44,8 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: it would fail; the message says why.
     """
-    with _naming(path), _partial_file(check_regular(path).parent) as file:
-        file.write(_PROBE)
+    with _partial_file(path) as file:
+        file.write(bytes(4096))  # One block, because an empty file fits even a full disk.
 
 
 def check_folder(folder: str | os.PathLike[str]) -> None:
@@ -59,8 +56,7 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
     """
     with _naming(folder):
         Path(folder).mkdir(parents=True, exist_ok=True)
-        with _partial_file(Path(folder)) as file:
-            file.write(_PROBE)
+        check_writable(Path(folder) / "any")
 
 
 def write_file(
@@ -76,23 +72,22 @@ def write_file(
     Raises:
         OSError: it can't be written; an existing file is unchanged.
     """
-    with _naming(path), _partial_file(check_regular(path).parent, mode) as file:
+    with _partial_file(path, mode) as file:
         file.writelines((content,) if isinstance(content, bytes) else content)
         file.flush()
-        finish_file(Path(file.name), path)
+        finish_file(file.name, path)
 
 
-def finish_file(partial: Path, path: str | os.PathLike[str]) -> None:
+def finish_file(partial: str | os.PathLike[str], path: str | os.PathLike[str]) -> None:
     """Give the complete file `partial` the name `path`, replacing an existing file.
 
     Raises:
         OSError: it can't be renamed; both files are unchanged.
     """
-    target = check_regular(path)
-    with _naming(path):
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())  # Some file systems report a full disk only here.
-        partial.replace(target)
+    with _naming(path), open(partial, "rb") as file:  # noqa: PTH123
+        target = check_regular(path)
+        os.fsync(file.fileno())  # Some file systems report a full disk only here.
+        os.replace(partial, target)  # noqa: PTH105
 
 
 def check_regular(path: str | os.PathLike[str]) -> Path:
@@ -101,27 +96,25 @@ def check_regular(path: str | os.PathLike[str]) -> Path:
     Raises:
         OSError: it is something else.
     """
-    with _naming(path):
-        target = Path(os.path.realpath(path))
-        if os.path.lexists(target) and (target.is_symlink() or not target.is_file()):
-            number = errno.ELOOP if target.is_symlink() else errno.EEXIST
-            raise OSError(number, "it is no regular file")
+    target = Path(os.path.realpath(path))
+    if os.path.lexists(target) and not target.is_file():
+        raise FileExistsError(errno.EEXIST, "it is no regular file", os.fspath(path))
     return target
 
 
 @contextlib.contextmanager
-def _partial_file(folder: Path, mode: int = 0o666) -> Generator[BinaryIO]:
-    """Open a new file in `folder`, which is removed at the end unless it was renamed."""
-    partial = folder / f".rlightning-aio-{secrets.token_hex(8)}.part"
-    if not folder.exists():
-        raise FileNotFoundError(errno.ENOENT, f"there is no folder {folder}")
-    # Only an opener can set the mode before a secret is written.
-    file = open(partial, "xb", opener=lambda path, flags: os.open(path, flags, mode))  # noqa: SIM115
-    try:
-        with file:
-            yield file
-    finally:
-        partial.unlink(missing_ok=True)
+def _partial_file(path: str | os.PathLike[str], mode: int = 0o666) -> Generator[BinaryIO]:
+    """Open a new file beside `path`, which is removed at the end unless it was renamed."""
+    with _naming(path):
+        partial = check_regular(path).parent / f".rlightning-aio-{secrets.token_hex(8)}.part"
+        if not partial.parent.exists():
+            raise FileNotFoundError(errno.ENOENT, f"there is no folder {partial.parent}")
+        try:
+            # Only an opener can set the mode before a secret is written.
+            with open(partial, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+                yield file
+        finally:
+            partial.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -130,6 +123,4 @@ def _naming(path: str | os.PathLike[str]) -> Generator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename == os.fspath(path):
-            raise
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error
