@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rlightning_aio import sync
 from rlightning_aio.batch import BatchedData, joined
-from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.envs.adapted.same_step import SameStep
 from rlightning_aio.errors import NothingPending
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -178,7 +177,7 @@ class Disturbed:
             if not is_reset:
                 self.logs[int(index)].pop()
         fresh, _ = self.group.reset(env_ids=row.env_ids())
-        (part,) = parts_of(fresh)
+        (part,) = fresh.parts
         part.flags[..., TRUNCATED] = True
         part.restarted = np.ones(1, np.bool_)
         return fresh

@@ -14,7 +14,6 @@ from group.sample_envs import HALVED
 from gymnasium import spaces
 
 import rlightning_aio.sync
-from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
@@ -111,7 +110,7 @@ def test_time_between_the_halves_is_not_part_of_the_step() -> None:
         group.step_async(batch.respond(action=np.array([1])))
         clock.now += 1000
         batch, _ = group.collect_async()
-        (part,) = parts_of(batch)
+        (part,) = batch.parts
         assert part.busy_ns.tolist() == [12]
 
 

@@ -1,10 +1,4 @@
-"""Contents of a batch that only this library reads: its parts, its slots, the requests it answers.
-
-These functions use private attributes of `BatchedData`. They are no methods, to keep them from
-users.
-"""
-
-# pyright: reportPrivateUsage=false
+"""What this library asks of a batch, and users don't: functions, to keep them from users."""
 
 from __future__ import annotations
 
@@ -29,9 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.batch.data import BatchedData, Issuer, Origin
+    from rlightning_aio.batch.data import BatchedData, Issuer
     from rlightning_aio.batch.names import EnvNames
-    from rlightning_aio.batch.sent import Sources
 
 __all__ = [
     "all_agents",
@@ -42,49 +35,41 @@ __all__ = [
     "has_ended",
     "lost_rows",
     "names_of",
-    "origin_of",
-    "parts_of",
     "plain_columns",
     "reported_info_list",
     "reported_infos",
     "slots_of",
     "slots_of_results",
-    "sources_of",
     "summed_rewards",
 ]
 
 
 def reported_infos(batch: BatchedData) -> dict[str, Any]:
     """`BatchedData.infos` of a batch of results, without the sums of episodes."""
-    return infos_of_parts(batch._parts, episodes=False)
+    return infos_of_parts(batch.parts, episodes=False)
 
 
 def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
     """`BatchedData.info` of a batch of results, without the sums of episodes."""
-    return reported_infos_of_parts(batch._parts)
-
-
-def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:
-    """The columns of a batch of results; empty for any other batch."""
-    return batch._parts
+    return reported_infos_of_parts(batch.parts)
 
 
 def plain_columns(batch: BatchedData) -> ResultColumns | None:
     """The columns of a batch whose properties of the same names equal them; None for others."""
-    if len(batch._parts) != 1:
+    if len(batch.parts) != 1:
         return None
-    part = batch._parts[0]
+    part = batch.parts[0]
     unlike = part.positions is not None or part.whole_results or part.agents
     return None if unlike or part.observation is None or not len(part.slots) else part
 
 
 def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
     """Mask of rows whose episode has ended and was not reset since; shaped like `is_reset`."""
-    if not batch._parts:
+    if not batch.parts:
         return np.zeros(0, np.bool_)
-    if len(batch._parts) == 1:
-        return batch._parts[0].has_ended
-    return column_of_parts(batch._parts, attrgetter("has_ended"))
+    if len(batch.parts) == 1:
+        return batch.parts[0].has_ended
+    return column_of_parts(batch.parts, attrgetter("has_ended"))
 
 
 def ended_episodes(
@@ -95,14 +80,14 @@ def ended_episodes(
     The sums are ``r`` and ``l``: numbers, or arrays ``[num_envs]``. Rewards of agents are added.
     They are empty where the group counted no episode.
     """
-    places = rows_in_order(batch._parts)
+    places = rows_in_order(batch.parts)
     chosen = [places[row] for row in rows]
     return [(part.episode_of_all(row), part.reported_info_of(row)) for part, row in chosen]
 
 
 def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
     """Slots of the envs, each once, if the batch was made by `group`."""
-    origin = batch._origin
+    origin = batch.origin
     if origin is None or origin.group is not group or origin.repeats:
         return None
     return origin.slots
@@ -110,38 +95,28 @@ def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
 
 def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
     """Slots of the envs of a batch of results, in order."""
-    assert batch._origin is not None
-    return batch._origin.slots
-
-
-def origin_of(batch: BatchedData) -> Origin | None:
-    """Group and slots of a batch; None for plain values."""
-    return batch._origin
-
-
-def sources_of(batch: BatchedData) -> Sources | None:
-    """Requests that the results of `batch` answer; None for any other batch."""
-    return batch._sources
+    assert batch.origin is not None
+    return batch.origin.slots
 
 
 def names_of(batch: BatchedData) -> EnvNames | None:
     """Names of the envs of the group when it returned the batch; None for plain values."""
-    return None if batch._origin is None else batch._origin.names
+    return None if batch.origin is None else batch.origin.names
 
 
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
     """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
-    return batch._columns
+    return batch.columns
 
 
 def are_over(batch: BatchedData) -> list[bool]:
     """Return for each result whether it ends the episodes of all agents and sub-environments."""
-    return column_of_parts(batch._parts, _over_of_rows).tolist()
+    return column_of_parts(batch.parts, _over_of_rows).tolist()
 
 
 def any_reset(batch: BatchedData) -> NDArray[np.bool_]:
     """Return for each result whether the env, or one of its sub-environments, was reset."""
-    return column_of_parts(batch._parts, _resets_of_rows)
+    return column_of_parts(batch.parts, _resets_of_rows)
 
 
 def _resets_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
@@ -164,7 +139,7 @@ def _all_flags(terminated: Any, truncated: Any) -> bool:
 
 def lost_rows(batch: BatchedData) -> set[int]:
     """Return the positions of results whose episode before was lost."""
-    if all(part.restarted is None for part in batch._parts):
+    if all(part.restarted is None for part in batch.parts):
         return set()
-    lost = column_of_parts(batch._parts, lambda part: part.by_env(part.restarted))
+    lost = column_of_parts(batch.parts, lambda part: part.by_env(part.restarted))
     return {*np.flatnonzero(lost).tolist()}

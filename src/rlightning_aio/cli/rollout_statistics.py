@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.batch.contents import parts_of
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
@@ -132,7 +130,7 @@ class RolloutStatistics:
     def add(self, batch: BatchedData) -> None:
         """Count the results of a `collect_async` or `step`."""
         self._ended = time.monotonic()
-        for part in parts_of(batch):
+        for part in batch.parts:
             if part.names is not self._names:
                 self._meet(part.names)
             stepped = ~part.is_reset.reshape(len(part), -1)
