@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.columns import ResultColumns
-from rlightning_aio.batch.contents import columns_of_responses, reported_info_list, slots_of
-from rlightning_aio.batch.data import batch_of_results
+from rlightning_aio.batch.contents import reported_info_list, slots_of
+from rlightning_aio.batch.data import batch_of_results, columns_of_responses, parts_of
 from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig
@@ -1108,8 +1108,8 @@ def test_only_the_group_of_a_batch_uses_its_slots() -> None:
     assert columns_ is not None
     assert list(columns_) == ["action", "value"]
     assert columns_of_responses(batch) is None
-    assert len(batch.parts) == 1
-    assert responses.parts == BatchedData().parts == ()
+    assert len(parts_of(batch)) == 1
+    assert parts_of(responses) == parts_of(BatchedData()) == ()
 
 
 def test_the_text_of_a_batch_has_shapes_and_no_contents() -> None:

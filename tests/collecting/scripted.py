@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rlightning_aio import sync
 from rlightning_aio.batch import BatchedData, joined
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.envs.adapted.same_step import SameStep
 from rlightning_aio.errors import NothingPending
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -177,7 +178,7 @@ class Disturbed:
             if not is_reset:
                 self.logs[int(index)].pop()
         fresh, _ = self.group.reset(env_ids=row.env_ids())
-        (part,) = fresh.parts
+        (part,) = parts_of(fresh)
         part.flags[..., TRUNCATED] = True
         part.restarted = np.ones(1, np.bool_)
         return fresh

@@ -14,6 +14,7 @@ from group.sample_envs import HALVED
 from gymnasium import spaces
 
 import rlightning_aio.sync
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
@@ -110,7 +111,7 @@ def test_time_between_the_halves_is_not_part_of_the_step() -> None:
         group.step_async(batch.respond(action=np.array([1])))
         clock.now += 1000
         batch, _ = group.collect_async()
-        (part,) = batch.parts
+        (part,) = parts_of(batch)
         assert part.busy_ns.tolist() == [12]
 
 

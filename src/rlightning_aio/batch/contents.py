@@ -1,4 +1,7 @@
-"""What this library asks of a batch, and users don't: functions, to keep them from users."""
+"""What this library asks of a batch, and users don't: functions, to keep them from users.
+
+`data` has the contents themselves: parts, origin, sources, columns of responses.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlightning_aio.batch.data import columns_of_responses, origin_of, parts_of
 from rlightning_aio.batch.endings import all_agents, summed_rewards
 from rlightning_aio.batch.parts import (
     column_of_parts,
@@ -18,7 +22,7 @@ from rlightning_aio.batch.rets import rets_of
 from rlightning_aio.trees import walked, zipped
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -46,30 +50,32 @@ __all__ = [
 
 def reported_infos(batch: BatchedData) -> dict[str, Any]:
     """`BatchedData.infos` of a batch of results, without the sums of episodes."""
-    return infos_of_parts(batch.parts, episodes=False)
+    return infos_of_parts(parts_of(batch), episodes=False)
 
 
 def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
     """`BatchedData.info` of a batch of results, without the sums of episodes."""
-    return reported_infos_of_parts(batch.parts)
+    return reported_infos_of_parts(parts_of(batch))
 
 
 def plain_columns(batch: BatchedData) -> ResultColumns | None:
     """The columns of a batch whose properties of the same names equal them; None for others."""
-    if len(batch.parts) != 1:
+    parts = parts_of(batch)
+    if len(parts) != 1:
         return None
-    part = batch.parts[0]
+    part = parts[0]
     unlike = part.positions is not None or part.whole_results or part.agents
     return None if unlike or part.observation is None or not len(part.slots) else part
 
 
 def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
     """Mask of rows whose episode has ended and was not reset since; shaped like `is_reset`."""
-    if not batch.parts:
+    parts = parts_of(batch)
+    if not parts:
         return np.zeros(0, np.bool_)
-    if len(batch.parts) == 1:
-        return batch.parts[0].has_ended
-    return column_of_parts(batch.parts, attrgetter("has_ended"))
+    return (
+        parts[0].has_ended if len(parts) == 1 else column_of_parts(parts, attrgetter("has_ended"))
+    )
 
 
 def ended_episodes(
@@ -80,14 +86,14 @@ def ended_episodes(
     The sums are ``r`` and ``l``: numbers, or arrays ``[num_envs]``. Rewards of agents are added.
     They are empty where the group counted no episode.
     """
-    places = rows_in_order(batch.parts)
+    places = rows_in_order(parts_of(batch))
     chosen = [places[row] for row in rows]
     return [(part.episode_of_all(row), part.reported_info_of(row)) for part, row in chosen]
 
 
 def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
     """Slots of the envs, each once, if the batch was made by `group`."""
-    origin = batch.origin
+    origin = origin_of(batch)
     if origin is None or origin.group is not group or origin.repeats:
         return None
     return origin.slots
@@ -95,28 +101,25 @@ def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
 
 def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
     """Slots of the envs of a batch of results, in order."""
-    assert batch.origin is not None
-    return batch.origin.slots
+    origin = origin_of(batch)
+    assert origin is not None
+    return origin.slots
 
 
 def names_of(batch: BatchedData) -> EnvNames | None:
     """Names of the envs of the group when it returned the batch; None for plain values."""
-    return None if batch.origin is None else batch.origin.names
-
-
-def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
-    """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
-    return batch.columns
+    origin = origin_of(batch)
+    return None if origin is None else origin.names
 
 
 def are_over(batch: BatchedData) -> list[bool]:
     """Return for each result whether it ends the episodes of all agents and sub-environments."""
-    return column_of_parts(batch.parts, _over_of_rows).tolist()
+    return column_of_parts(parts_of(batch), _over_of_rows).tolist()
 
 
 def any_reset(batch: BatchedData) -> NDArray[np.bool_]:
     """Return for each result whether the env, or one of its sub-environments, was reset."""
-    return column_of_parts(batch.parts, _resets_of_rows)
+    return column_of_parts(parts_of(batch), _resets_of_rows)
 
 
 def _resets_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
@@ -139,7 +142,8 @@ def _all_flags(terminated: Any, truncated: Any) -> bool:
 
 def lost_rows(batch: BatchedData) -> set[int]:
     """Return the positions of results whose episode before was lost."""
-    if all(part.restarted is None for part in batch.parts):
+    parts = parts_of(batch)
+    if all(part.restarted is None for part in parts):
         return set()
-    lost = column_of_parts(batch.parts, lambda part: part.by_env(part.restarted))
+    lost = column_of_parts(parts, lambda part: part.by_env(part.restarted))
     return {*np.flatnonzero(lost).tolist()}

@@ -1,6 +1,8 @@
-"""`BatchedData`, and the functions by which a group makes a batch and takes the answer to it."""
+"""`BatchedData`, and the functions by which this library makes batches and reads what users don't.
 
-# These functions use private attributes of batches.
+The functions below the class use its private attributes, and nothing else does.
+"""
+
 # pyright: reportPrivateUsage=false
 
 from __future__ import annotations
@@ -43,6 +45,10 @@ __all__ = [
     "Origin",
     "answer_of",
     "batch_of_results",
+    "columns_of_responses",
+    "origin_of",
+    "parts_of",
+    "sources_of",
     "with_repeats",
 ]
 
@@ -83,11 +89,8 @@ class BatchedData:
         values: `EnvRet`, `MultiAgentEnvRet`, `PolicyResponse`, or anything else.
     """
 
-    # Four attributes are for this library only: the `parts` of results, the `sources` that they
-    # answer (see `Sent`), the `columns` of responses, and the `origin` of both.
-
     __slots__ = (
-        "_env_ids", "_ids", "_infos", "_values", "columns", "origin", "parts", "sources",
+        "_columns", "_env_ids", "_ids", "_infos", "_origin", "_parts", "_sources", "_values",
     )  # fmt: skip
 
     def __init__(self, ids: Sequence[str] = (), values: Sequence[Any] = ()) -> None:
@@ -95,11 +98,11 @@ class BatchedData:
             raise ValueError(f"{len(ids)} ids for {len(values)} values")
         self._ids: list[str] | None = list(ids)
         self._values: list[Any] | None = list(values)
-        self.parts: Sequence[ResultColumns] = ()
-        self.columns: dict[str, Any] | None = None
-        self.origin: Origin | None = None
+        self._parts: Sequence[ResultColumns] = ()
+        self._columns: dict[str, Any] | None = None
+        self._origin: Origin | None = None
         self._env_ids: list[str] | None = None
-        self.sources: Sources | None = None
+        self._sources: Sources | None = None
         self._infos: dict[str, Any] | None = None
 
     @classmethod
@@ -112,11 +115,11 @@ class BatchedData:
     def __getstate__(self) -> tuple[None, dict[str, Any]]:
         """Copies and pickles have everything but the group, which then uses the ids."""
         state = {name: getattr(self, name) for name in self.__slots__}
-        origin = self.origin
+        origin = self._origin
         if origin is not None:
             names, slots = origin.names.of(origin.slots), np.arange(len(origin.slots))
-            state["origin"] = Origin(None, slots, names)
-            state["parts"] = [part.apart() for part in self.parts]
+            state["_origin"] = Origin(None, slots, names)
+            state["_parts"] = [part.apart() for part in self._parts]
         return None, state
 
     # -- ids and values -----------------------------------------------------------
@@ -127,14 +130,14 @@ class BatchedData:
         The batch owns the list: don't change it.
         """
         if self._ids is None:
-            origin = self.origin
+            origin = self._origin
             self._ids = [] if origin is None else origin.names.batch_ids(origin.slots)
         return self._ids
 
     def env_ids(self) -> list[str]:
         """Env id of each value, in order; that of a client is ``<server id>/<client name>``."""
-        if self.origin is not None:
-            return self.origin.names.ids(self.origin.slots)
+        if self._origin is not None:
+            return self._origin.names.ids(self._origin.slots)
         if self._env_ids is not None:
             return self._env_ids
         return [
@@ -149,10 +152,10 @@ class BatchedData:
         responses are `PolicyResponse`.
         """
         if self._values is None:
-            if self.columns is not None:
-                self._values = _policy_responses(self.columns, self.env_ids())
+            if self._columns is not None:
+                self._values = _policy_responses(self._columns, self.env_ids())
             else:
-                self._values = in_order(self.parts, [rets_of(part) for part in self.parts])
+                self._values = in_order(self._parts, [rets_of(part) for part in self._parts])
         return self._values
 
     def items(self) -> list[tuple[str, Any]]:
@@ -163,7 +166,7 @@ class BatchedData:
         return iter(self.items())
 
     def __len__(self) -> int:
-        return len(self.origin.slots) if self.origin is not None else len(self.ids())
+        return len(self._origin.slots) if self._origin is not None else len(self.ids())
 
     def __contains__(self, id_: object) -> bool:
         return id_ in self.ids()
@@ -181,10 +184,10 @@ class BatchedData:
         return self.values()[position]
 
     def __repr__(self) -> str:
-        kind = "results" if self.parts else "values" if self.columns is None else "responses"
+        kind = "results" if self._parts else "values" if self._columns is None else "responses"
         ids = self.ids()
         described = f"{len(self)} {kind} of {', '.join(ids[:3])}{', …' if len(ids) > 3 else ''}"
-        return f"BatchedData({', '.join([described, *shapes(self.columns or {}, self.parts)])})"
+        return f"BatchedData({', '.join([described, *shapes(self._columns or {}, self._parts)])})"
 
     # -- columns of results -------------------------------------------------------
 
@@ -197,7 +200,7 @@ class BatchedData:
         Raises:
             ValueError: the envs have different observation spaces; use `by_entry`.
         """
-        parts = self.parts
+        parts = self._parts
         if parts:
             columns = None if len(parts) > 1 or parts[0].whole_results else parts[0].observation
             return observations_of_parts(parts) if columns is None else columns
@@ -229,8 +232,8 @@ class BatchedData:
 
         ``[n]`` bool, ``[n, num_envs]`` with sub-environments, or a dict of such by agent.
         """
-        if len(self.parts) == 1 and not self.parts[0].whole_results:
-            return self.parts[0].stacked_head("done")
+        if len(self._parts) == 1 and not self._parts[0].whole_results:
+            return self._parts[0].stacked_head("done")
         if not len(self):
             return self.limit_reached
         return zipped(np.bitwise_or, self.terminated, self.truncated)
@@ -301,9 +304,9 @@ class BatchedData:
         Raises:
             AttributeError: the batch holds plain values, not results of a group.
         """
-        if self.sources is None:
+        if self._sources is None:
             raise AttributeError("only results of a group know what was sent for them")
-        return Sent(self.sources, len(self))
+        return Sent(self._sources, len(self))
 
     @property
     def infos(self) -> dict[str, Any]:
@@ -314,8 +317,8 @@ class BatchedData:
         """
         if self._infos is None:
             self._infos = (
-                infos_of_parts(self.parts, episodes=True)
-                if self.parts
+                infos_of_parts(self._parts, episodes=True)
+                if self._parts
                 else vector_infos(self.info())
             )
         return self._infos
@@ -340,8 +343,8 @@ class BatchedData:
         Raises:
             KeyError: an info lacks the key, and no default was given.
         """
-        if self.parts:
-            infos = [part.info_of(row) for part, row in rows_in_order(self.parts)]
+        if self._parts:
+            infos = [part.info_of(row) for part, row in rows_in_order(self._parts)]
         else:
             infos = [value.info for value in self.values()]
         if key is None:
@@ -357,10 +360,10 @@ class BatchedData:
 
     def by_entry(self) -> dict[str, BatchedData]:
         """Split by config entry, in the order of first appearance; values keep their order."""
-        if self.origin is None:
+        if self._origin is None:
             names = [_entry_of(id_) for id_ in self.ids()]
         else:
-            names = self.origin.names.names(self.origin.slots)
+            names = self._origin.names.names(self._origin.slots)
         positions: dict[str, list[int]] = {}
         for position, name in enumerate(names):
             positions.setdefault(name, []).append(position)
@@ -369,13 +372,13 @@ class BatchedData:
     def take(self, rows: Sequence[int]) -> BatchedData:
         """Copy the results, responses or values at the positions `rows`, in that order."""
         chosen = list(rows)
-        if self.columns is not None:
-            return _taken_responses(self, self.columns, chosen)
-        if self.origin is None:
+        if self._columns is not None:
+            return _taken_responses(self, self._columns, chosen)
+        if self._origin is None:
             ids, values = self.ids(), self.values()
             return BatchedData([ids[k] for k in chosen], [values[k] for k in chosen])
-        parts = taken_parts(self.parts, chosen)
-        origin, sources = self.origin, self.sources
+        parts = taken_parts(self._parts, chosen)
+        origin, sources = self._origin, self._sources
         if sources is not None:
             sources = taken_sources(sources, chosen)
         slots = origin.slots[chosen]
@@ -395,7 +398,7 @@ class BatchedData:
             BadAction: the number of rows of a column is not the number of results.
         """
         columns = {"action": action, **extras}
-        origin = self.origin
+        origin = self._origin
         count = len(self) if origin is None else len(origin.slots)
         for name, column in columns.items():
             if type(column) is not np.ndarray or not column.ndim or len(column) != count:
@@ -409,9 +412,29 @@ class BatchedData:
         Raises:
             AttributeError: the batch holds results; see `sent` for their actions.
         """
-        if self.columns is not None:
-            return self.columns["action"]
+        if self._columns is not None:
+            return self._columns["action"]
         return stacked_values([value.action for value in self.values()])
+
+
+def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:
+    """The columns of a batch of results; empty for any other batch."""
+    return batch._parts
+
+
+def origin_of(batch: BatchedData) -> Origin | None:
+    """Group and slots of a batch; None for plain values."""
+    return batch._origin
+
+
+def sources_of(batch: BatchedData) -> Sources | None:
+    """Requests that the results of `batch` answer; None for any other batch."""
+    return batch._sources
+
+
+def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
+    """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
+    return batch._columns
 
 
 def _entry_of(env_id: str) -> str:
@@ -437,16 +460,16 @@ def batch_of_results(
         sources: see `Sent`.
     """
     batch = BatchedData.__new__(BatchedData)
-    batch._ids = batch._values = batch.columns = batch._env_ids = batch._infos = None
-    batch.parts = parts
-    batch.origin = Origin(group, slots, names)
-    batch.sources = sources
+    batch._ids = batch._values = batch._columns = batch._env_ids = batch._infos = None
+    batch._parts = parts
+    batch._origin = Origin(group, slots, names)
+    batch._sources = sources
     return batch
 
 
 def with_repeats(batch: BatchedData) -> BatchedData:
     """Record in `batch` itself whether it has an env twice, and return it."""
-    origin = batch.origin
+    origin = batch._origin
     if origin is not None:
         origin.repeats = len({*origin.slots.tolist()}) < len(origin.slots)
     return batch
@@ -454,28 +477,28 @@ def with_repeats(batch: BatchedData) -> BatchedData:
 
 def answer_of(batch: BatchedData, group: Issuer) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
     """Distinct slots, and columns of responses, to results of `group`; None for other batches."""
-    if type(batch) is not BatchedData or batch.columns is None:
+    if type(batch) is not BatchedData or batch._columns is None:
         return None
-    origin = batch.origin
+    origin = batch._origin
     if origin is None or origin.group is not group or origin.repeats:
         return None
-    return origin.slots, batch.columns
+    return origin.slots, batch._columns
 
 
 def _head(batch: BatchedData, column: str, attribute: str) -> Any:
     """A column of rewards or flags, by agent if there are agents."""
-    if len(batch.parts) == 1 and not batch.parts[0].whole_results:
-        part = batch.parts[0]
+    if len(batch._parts) == 1 and not batch._parts[0].whole_results:
+        part = batch._parts[0]
         return part.stacked_head(column) if part.agents else getattr(part, column)
     return stacked_values([getattr(value, attribute) for value in batch.values()])
 
 
 def _by_row(batch: BatchedData, column: Callable[[ResultColumns], Any]) -> NDArray[Any]:
     """A column of all parts, in the order of the batch."""
-    parts = batch.parts
+    parts = batch._parts
     if len(parts) == 1 and parts[0].positions is None and len(parts[0].slots):
         return column(parts[0])
-    if batch.origin is not None and batch.columns is None and not len(batch):
+    if batch._origin is not None and batch._columns is None and not len(batch):
         return np.zeros(0, np.bool_)
     if not parts:
         raise AttributeError("only results of a group have this; this batch holds plain values")
@@ -485,11 +508,11 @@ def _by_row(batch: BatchedData, column: Callable[[ResultColumns], Any]) -> NDArr
 def _responses(batch: BatchedData, columns: dict[str, Any]) -> BatchedData:
     responses = BatchedData.__new__(BatchedData)
     responses._ids = batch._ids
-    responses.columns = columns
-    responses.origin = batch.origin
-    responses._env_ids = None if batch.origin is not None else batch.env_ids()
-    responses._values = responses.sources = responses._infos = None
-    responses.parts = ()
+    responses._columns = columns
+    responses._origin = batch._origin
+    responses._env_ids = None if batch._origin is not None else batch.env_ids()
+    responses._values = responses._sources = responses._infos = None
+    responses._parts = ()
     return responses
 
 
@@ -505,12 +528,12 @@ def _taken_responses(batch: BatchedData, columns: dict[str, Any], chosen: list[i
         return leaf[chosen] if hasattr(leaf, "shape") else [leaf[k] for k in chosen]
 
     found = _responses(batch, {name: mapped(taken, column) for name, column in columns.items()})
-    origin = batch.origin
+    origin = batch._origin
     if origin is None:
         env_ids = batch.env_ids()
         found._env_ids = [env_ids[k] for k in chosen]
     else:
-        found.origin = Origin(origin.group, origin.slots[chosen], origin.names)
+        found._origin = Origin(origin.group, origin.slots[chosen], origin.names)
     found._ids = [batch.ids()[k] for k in chosen]
     return with_repeats(found)
 

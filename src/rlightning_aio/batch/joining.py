@@ -8,7 +8,15 @@ import numpy as np
 from msgspec.structs import replace
 
 from rlightning_aio.batch.columns import BY_ROW
-from rlightning_aio.batch.data import BatchedData, Origin, batch_of_results, with_repeats
+from rlightning_aio.batch.data import (
+    BatchedData,
+    Origin,
+    batch_of_results,
+    origin_of,
+    parts_of,
+    sources_of,
+    with_repeats,
+)
 from rlightning_aio.batch.sent import joined_sources
 from rlightning_aio.batch.stacking import concatenated
 from rlightning_aio.trees import key_of, walked
@@ -35,7 +43,7 @@ def joined(batches: Sequence[BatchedData]) -> BatchedData:
         raise ValueError("there is no batch to join")
     if len(batches) == 1:
         return batches[0]
-    origins = [batch.origin for batch in batches]
+    origins = [origin_of(batch) for batch in batches]
     last = origins[-1]
     if last is None or any(o is None or o.group is not last.group for o in origins):
         raise ValueError("only batches of results of one group can be joined")
@@ -44,7 +52,7 @@ def joined(batches: Sequence[BatchedData]) -> BatchedData:
     parts = _merged(placed)
     if len(parts) == 1:
         parts = [replace(parts[0], positions=None)]
-    sources = joined_sources([(batch.sources, len(batch)) for batch in batches])
+    sources = joined_sources([(sources_of(batch), len(batch)) for batch in batches])
     return with_repeats(batch_of_results(parts, last.group, slots, last.names, sources))
 
 
@@ -56,7 +64,7 @@ def _placed(batch: BatchedData, before: Sequence[BatchedData]) -> list[ResultCol
             part,
             positions=(np.arange(len(part)) if part.positions is None else part.positions) + offset,
         )
-        for part in batch.parts
+        for part in parts_of(batch)
     ]
 
 

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.batch.data import parts_of
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
@@ -130,7 +132,7 @@ class RolloutStatistics:
     def add(self, batch: BatchedData) -> None:
         """Count the results of a `collect_async` or `step`."""
         self._ended = time.monotonic()
-        for part in batch.parts:
+        for part in parts_of(batch):
             if part.names is not self._names:
                 self._meet(part.names)
             stepped = ~part.is_reset.reshape(len(part), -1)

@@ -18,6 +18,7 @@ import numpy as np
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch import joined
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.collecting.procedure import Procedure, run_as_one_call
 from rlightning_aio.errors import EnvFault, NothingPending, RLightningError
 from rlightning_aio.files import write_file
@@ -317,7 +318,7 @@ def _outcome(found: tuple[BatchedData, list[bool]] | EnvFault) -> list[tuple[str
 def _kinds(batch: BatchedData) -> list[tuple[str, int]]:
     """Return the env id and the kind of each result."""
     kinds = np.empty(len(batch), np.intp)
-    for part in batch.parts:
+    for part in parts_of(batch):
         count = len(part)
         resets = part.is_reset.reshape(count, -1).all(axis=1).astype(np.intp)
         lost = 0 if part.restarted is None else part.restarted

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.data import origin_of
 from rlightning_aio.errors import BadAction
 from rlightning_aio.trees import is_dict
 
@@ -33,7 +34,7 @@ def can_await(batch: BatchedData) -> bool:
         asyncio.get_running_loop()
     except RuntimeError:
         return False
-    origin = batch.origin
+    origin = origin_of(batch)
     group = None if origin is None else origin.group
     return group is None or group.shares_thread
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.batch.infos import listed, vector_infos
 from rlightning_aio.batch.joining import joined
 from rlightning_aio.trees import index
@@ -69,7 +70,7 @@ class Deaths:
 
     def concern(self, batch: BatchedData) -> bool:
         """Return True if `settle` has anything to do for the results of a step."""
-        for part in batch.parts:
+        for part in parts_of(batch):
             if part.restarted is not None:
                 return True
         return self._held is not None

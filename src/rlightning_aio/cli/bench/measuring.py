@@ -21,6 +21,7 @@ import numpy as np
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.cli.machine import cpu_seconds, memory_bytes
 from rlightning_aio.cli.policies.collecting import (
     Roster,
@@ -297,7 +298,7 @@ class Stand:
             batch, _ = await group.collect_async(min_results=min_results)
             now = time.monotonic()
             self.statistics.add(batch)
-            for part in batch.parts:
+            for part in parts_of(batch):
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             await respond_to_all(group, self._respond, batch)
