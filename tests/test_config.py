@@ -464,7 +464,7 @@ def test_other_fields_are_accepted_for_the_placement() -> None:
         "env_vars": {},
     }
     parse_configs(INLINE | asks_nothing | {"num_workers": 3, "num_gpus": 0.5})
-    if BACKENDS["env_server"].installed_version() is not None:
+    if BACKENDS["env_server"].is_installed():
         limits = {"step_timeout": 1.0, "reset_timeout": 1.0, "max_episode_steps": 9}
         parse_configs(SERVER | limits | {"num_workers": 1, "num_envs": 1})
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import sys
 from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints
 from typing import TYPE_CHECKING
+from unittest import mock
 
 import pytest
 
 from rlightning_aio import registry
+from rlightning_aio.config import parse_configs
+from rlightning_aio.config.checks import check_installed
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, MujocoEnv
 from rlightning_aio.errors import ConfigError
@@ -148,6 +152,16 @@ def test_each_built_in_backend_has_a_class_and_an_install_command(backend: Backe
     assert module.startswith("rlightning_aio.")
     assert name.isidentifier()
     assert backend.install.startswith("pip install ")
+
+
+def test_an_entry_with_a_server_reads_no_lists_of_installed_files(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That would take up to half a second for each group."""
+    listed = mock.Mock()
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", listed)
+    check_installed(parse_configs({"name": "e", "backend": "env_server"}))
+    listed.assert_not_called()
 
 
 def test_the_version_of_a_missing_simulator_is_none() -> None:

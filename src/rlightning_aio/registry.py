@@ -80,6 +80,10 @@ class Backend:
     preload: tuple[str, ...] = ()
     described_by: str = ""
 
+    def is_installed(self) -> bool:
+        """Return True if this interpreter has the simulator; import nothing."""
+        return importlib.util.find_spec(self.module) is not None
+
     def installed_version(self) -> str | None:
         """Return the simulator's version in this interpreter, or None if it isn't installed."""
         # Imported here, because it takes as long as a tenth of a worker's other imports.
@@ -89,11 +93,13 @@ class Backend:
             version,
         )
 
-        if importlib.util.find_spec(self.module) is None:
+        if not self.is_installed():
             return None
         try:
             return version(self.module)
-        except PackageNotFoundError:  # pyzmq has the module zmq.
+        except (
+            PackageNotFoundError
+        ):  # pyzmq has the module zmq; finding it reads all lists of files.
             names = packages_distributions().get(self.module)
             return version(names[0]) if names else "unknown"
 

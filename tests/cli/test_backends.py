@@ -41,7 +41,7 @@ def test_json_has_one_object_for_each_backend() -> None:
 
 def test_a_missing_simulator_is_listed_as_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has no version, and is no error."""
-    monkeypatch.setattr(Backend, "installed_version", lambda self: None)
+    monkeypatch.setattr(Backend, "is_installed", lambda self: False)
     assert {row["installed"] for row in invoke_json("backends")[: len(ROWS)]} == {False}
     assert invoke("backends").stdout.count("not installed") == len(ROWS)
 

@@ -179,7 +179,7 @@ def test_a_missing_simulator_is_code_2_with_the_command_that_installs_it(
     """The message comes before any worker starts."""
     from rlightning_aio.registry import Backend
 
-    monkeypatch.setattr(Backend, "installed_version", lambda self: None)
+    monkeypatch.setattr(Backend, "is_installed", lambda self: False)
     done = invoke("rollout", write_config(tmp_path, CARTPOLE))
     assert done.exit_code == 2
     assert "pip install" in done.stderr

@@ -76,6 +76,6 @@ def names_of_tasks(backend: str) -> list[str]:
             f"there are lists for {known}"
         )
     known_backend = BACKENDS[backend]
-    if known_backend.installed_version() is None:
+    if not known_backend.is_installed():
         raise ConfigError(f"backend {backend!r} is not installed: {known_backend.install}")
     return sorted(_LISTS[backend]())

@@ -54,7 +54,7 @@ def check_installed(configs: Iterable[EnvConfig]) -> None:
         backend = ENVS.described(config.backend)
         if backend is None or not runs_here(config) or ENVS.registered(config.backend):
             continue
-        if backend.installed_version() is None:
+        if not backend.is_installed():
             problems.add(
                 f"envs.{index} ({config.name!r}), backend",
                 f"{backend.name!r} needs {backend.module}: {backend.install}",
