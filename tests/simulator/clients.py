@@ -9,6 +9,7 @@ the first result of a later session.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections import deque
 from dataclasses import replace
@@ -66,14 +67,27 @@ class Lent(ScriptedBase):
             before.scripts.subs = [self.script]
             self._client.sessions.append(Begun(before.copy(), self._troubles))
             self._troubles = None
-        return super().reset(seed=seed, options=options)
+        with self._ending():
+            return super().reset(seed=seed, options=options)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         act = self.act_of(policy_resp)
         self._client.done.append(act)
         if act[0] == "hang":
             self._client.note_hang()
-        return super().step(policy_resp)
+        with self._ending():
+            return super().step(policy_resp)
+
+    @contextlib.contextmanager
+    def _ending(self) -> Iterator[None]:
+        """Note what ends the client: the server may hear of it before its process has ended."""
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:
+            self._client.note_trouble()
+            raise
 
     def on_disconnect(self) -> None:
         self._troubles = self._client.troubles
@@ -141,16 +155,17 @@ class Client:
         self._lent = lent = Lent(self, self._code)
         self.hangs = False
         self.process = self._world.network.client(
-            lambda: lent, address, self.name, self._note_trouble
+            lambda: lent, address, self.name, self.note_trouble
         )
 
     def leave(self) -> None:
         """Have it end in order, soon."""
         assert self._lent is not None
-        self._note_trouble()
+        self.note_trouble()
         self._lent.is_finished = True
 
-    def _note_trouble(self) -> None:
+    def note_trouble(self) -> None:
+        """Note what may end a session."""
         self.troubles += 1
 
     def note_hang(self) -> None:
