@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from kit.scripted import DIE, GO, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -27,33 +27,25 @@ if TYPE_CHECKING:
 SHORT, LONG = 2, 8
 
 
-class Scripted(gym.Env[Any, Any]):
+class Succeeding(Scripted):
     """Succeeds soon or fails late, as ``succeeds`` says for the seed of the episode.
 
-    Its reward is 1 in each step; action 1 ends its process.
+    Action 1 ends its process.
     """
 
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-
     def __init__(self, succeeds: Callable[[int], bool], key: str = "success") -> None:
-        self._succeeds, self._key = succeeds, key
-        self._seed = self._steps = 0
+        self._succeeds, self._key, self._seed = succeeds, key, 0
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        if seed is not None:
-            self._seed = seed
-        self._steps = 0
-        return np.array([self._seed], np.float64), {}
+    def does(self, action: Any) -> None:
+        self.length = SHORT if self._succeeds(self._seed) else LONG
+        super().does(DIE if action == 1 else GO)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if action == 1:
-            os._exit(3)
-        self._steps += 1
-        success = self._succeeds(self._seed)
-        over = self._steps == (SHORT if success else LONG)
-        observation = np.array([self._seed], np.float64)
-        return observation, 1.0, over, False, {self._key: success and over}
+    def observed(self) -> Any:
+        self._seed = self._seed if self.seed is None else self.seed
+        return np.array([self._seed], np.float64)
+
+    def told(self) -> dict[str, Any]:
+        return {self._key: self.over and self.length == SHORT} if self.steps else {}
 
 
 class Patient(SyncVectorEnv):
@@ -75,8 +67,8 @@ def nothing(batch: rl.BatchedData) -> Any:
     return np.zeros(batch.is_reset.shape, np.int64)
 
 
-def scripted(succeeds: Callable[[int], bool], **kwargs: Any) -> Callable[[], Scripted]:
-    return lambda: Scripted(succeeds, **kwargs)
+def scripted(succeeds: Callable[[int], bool], **kwargs: Any) -> Callable[[], Succeeding]:
+    return lambda: Succeeding(succeeds, **kwargs)
 
 
 def evaluated(group: sync.EnvGroup, episodes: Any, **kwargs: Any) -> Evaluation:

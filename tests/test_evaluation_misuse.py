@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kit.scripted import RAISE
 from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
@@ -106,7 +107,7 @@ def test_failures_in_the_file_count(tmp_path: Path) -> None:
         log_of(results).add_failure(EpisodeSpec("1", 0, entry="env"), 0, 0, died)
     for _ in range(2):
         with ResultsFile(tmp_path / "results.jsonl") as results:
-            group = group_of(1, env_kwargs={"breaks": {"1": "raise"}})
+            group = group_of(1, env_kwargs={"breaks": {"1": RAISE}})
             found = evaluated(group, [EpisodeSpec("1", 0)], results=results, retries=1)
         (attempt,) = found.failed
         assert (attempt.outcome.kind, attempt.outcome.attempt) == ("env_raised", 1)
@@ -140,7 +141,7 @@ class Dies(Tasks):
 
     def step(self, action: Any) -> Any:
         flag = Path(self._folder, "died")
-        if self._seed == 9 and self._left == 8 and not flag.exists():
+        if self.seed == 9 and self.steps == 2 and not flag.exists():
             flag.touch()
             time.sleep(0.3)
             os._exit(3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import time
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
-from patience import HANG
+from kit.scripted import DIE, GO, HANG, RAISE, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -33,43 +32,33 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts import Attempt
 
 
-class Tasks(gym.Env[Any, Any]):
+class Tasks(Scripted):
     """An episode has as many steps as its seed says, plus one, each with the task as reward.
 
     It succeeds if the seed is even. ``breaks`` maps tasks to what their first step does.
     """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(2)
     render_mode = "rgb_array"
 
-    def __init__(self, switches: bool = True, breaks: dict[str, str] | None = None) -> None:
+    def __init__(self, switches: bool = True, breaks: dict[str, int] | None = None) -> None:
         self.switches_task = switches
         self._breaks, self._task = breaks or {}, "1"
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self._task = (options or {}).get("task", self._task)
-        self._seed, self._left = seed or 0, (seed or 0) + 1 + (options or {}).get("longer", 0)
-        return self._observation(), {}
+    def does(self, action: Any) -> float:
+        super().does(self._breaks.get(self._task, GO))
+        return float(self._task)
 
-    def _observation(self) -> Any:
-        return np.array([float(self._task), self._left], np.float64)
+    def observed(self) -> Any:
+        self._task = self.options.get("task", self._task)
+        self.length = (self.seed or 0) + 1 + self.options.get("longer", 0)
+        return np.array([float(self._task), self.length - self.steps], np.float64)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        match self._breaks.get(self._task):
-            case "raise":
-                raise ValueError("as asked for")
-            case "exit":
-                os._exit(3)
-            case "hang":
-                time.sleep(HANG)
-        self._left -= 1
-        over = self._left == 0
-        info = {"is_success": self._seed % 2 == 0} if over else {}
-        return self._observation(), float(self._task), over, False, info
+    def told(self) -> dict[str, Any]:
+        return {"is_success": (self.seed or 0) % 2 == 0} if self.over else {}
 
     def render(self) -> Any:
-        return np.full((16, 16, 3), self._left, np.uint8)
+        return np.full((16, 16, 3), self.length - self.steps, np.uint8)
 
 
 def group_of(num_workers: int = 3, **fields: Any) -> sync.EnvGroup:
@@ -197,21 +186,21 @@ def test_sub_environments_are_refused() -> None:
 
 def test_an_episode_whose_env_raises_fails_after_some_attempts() -> None:
     """The other episodes are played, and figures are those of played ones."""
-    found = evaluated(group_of(env_kwargs={"breaks": {"2": "raise"}}), retries=1)
+    found = evaluated(group_of(env_kwargs={"breaks": {"2": RAISE}}), retries=1)
     assert rows(Evaluation(found.played)) == ROWS[:4] + ROWS[8:]
     assert [one.spec.task for one in found.failed] == ["2"] * 4
     for one in found.failed:
         assert (one.reward, one.length, one.success) == (None, 0, None)
         assert [outcome.kind for outcome in one.failures] == ["env_raised"]
         assert (one.outcome.kind, one.outcome.attempt) == ("env_raised", 1)
-        assert one.outcome.cause == "ValueError: as asked for"
+        assert one.outcome.cause == "ValueError: as asked"
     assert found.success is not None
     assert (found.success.count, found.failures) == (8, {"env_raised": 8})
 
 
 def test_an_episode_whose_worker_always_ends_fails() -> None:
     """Its worker is replaced each time, and other episodes continue."""
-    group = group_of(2, env_kwargs={"breaks": {"2": "exit"}}, placement="process")
+    group = group_of(2, env_kwargs={"breaks": {"2": DIE}}, placement="process")
     queue = [EpisodeSpec("1", 0), EpisodeSpec("2", 0), EpisodeSpec("3", 5)]
     found = evaluated(group, queue, retries=1)
     (failed,) = found.failed
@@ -223,8 +212,8 @@ def test_an_episode_whose_worker_always_ends_fails() -> None:
     ]
 
 
-@pytest.mark.parametrize("breaks", ["exit", "hang"])
-def test_only_the_env_at_fault_is_charged_an_attempt(breaks: str) -> None:
+@pytest.mark.parametrize("breaks", [DIE, HANG])
+def test_only_the_env_at_fault_is_charged_an_attempt(breaks: int) -> None:
     """The others of its worker lose their episodes as well, and play them again."""
     fields = {
         "env_kwargs": {"breaks": {"2": breaks}}, "placement": "process", "envs_per_process": 3,
@@ -304,7 +293,7 @@ def test_each_suspect_is_charged_an_attempt_where_no_env_is_at_fault(
 def test_an_env_whose_worker_is_not_replaced_leaves(together: int) -> None:
     """The others play its episodes; with no env left the evaluation ends in the error."""
     fields = {
-        "env_kwargs": {"breaks": {"2": "exit"}}, "placement": "process",
+        "env_kwargs": {"breaks": {"2": DIE}}, "placement": "process",
         "on_worker_death": "raise", "envs_per_process": together,
     }  # fmt: skip
     queue = [EpisodeSpec("1", 3), EpisodeSpec("2", 0), EpisodeSpec("3", 9)]
@@ -321,7 +310,7 @@ def test_an_env_whose_worker_is_not_replaced_leaves(together: int) -> None:
 def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None:
     """Episodes in the file aren't played again, and lost attempts of others still count."""
     path, subject = tmp_path / "results.jsonl", {"policy": "nothing"}
-    breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
+    breaks = {"env_kwargs": {"breaks": {"2": RAISE}}}
     seen: list[Attempt] = []
 
     def interrupts(record: Attempt) -> None:
@@ -368,7 +357,7 @@ def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
         if attempt.spec.task == "1" and attempt.spec.seed == 3:
             raise Enough
 
-    breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
+    breaks = {"env_kwargs": {"breaks": {"2": RAISE}}}
     with ResultsFile(tmp_path / "results.jsonl") as results:
         with pytest.raises(Enough):
             evaluated(group_of(**breaks), results=results, on_episode=stops, retries=9)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import Counts
 
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from rlightning_aio.collecting import Rollout
 
 
-class Counting(gym.Env[Any, Any]):
+class Counting(Counts):
     """Shows the number of its episode and of its step; the third step is the last."""
 
     observation_space = gym.spaces.Dict(
@@ -31,22 +32,14 @@ class Counting(gym.Env[Any, Any]):
         pixels=gym.spaces.Box(0, 255, (64, 96, 3), np.uint8),
     )
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    length = 3
 
-    def __init__(self) -> None:
-        self._episode = self._step = 0
+    def does(self, action: Any) -> float:
+        return self.steps + 1.0
 
-    def _seen(self) -> Any:
-        place = np.array([self._episode, self._step], np.float64)
-        return {"agent_pos": place, "pixels": np.full((64, 96, 3), 40 * self._step, np.uint8)}
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed, options=options)
-        self._episode, self._step = self._episode + 1, 0
-        return self._seen(), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self._step += 1
-        return self._seen(), float(self._step), self._step == 3, False, {}
+    def observed(self) -> Any:
+        place = np.array([self.resets, self.steps], np.float64)
+        return {"agent_pos": place, "pixels": np.full((64, 96, 3), 40 * self.steps, np.uint8)}
 
 
 def halves(batch: BatchedData) -> dict[str, Any]:
@@ -91,7 +84,7 @@ class Dying(Counting):
         self._marker = marker
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if self._step == 1 and not self._marker.exists():
+        if self.steps == 1 and not self._marker.exists():
             self._marker.touch()
             os._exit(1)
         return super().step(action)

@@ -9,7 +9,6 @@ import contextlib
 import json
 import logging
 import math
-import time
 from typing import TYPE_CHECKING, Any
 
 import aiohttp
@@ -18,6 +17,7 @@ import numpy as np
 import pytest
 from cli.command import start, write_config
 from envs.test_openenv import on_asyncio
+from kit.scripted import HANG, Counts, Scripted
 from websockets.asyncio.client import connect
 
 import rlightning_aio as rl
@@ -135,19 +135,19 @@ async def test_invalid_messages_do_not_change_the_session() -> None:
         pytest.fail("the session's env was not given back")
 
 
-class Unstable(gym.Env[Any, Any]):
+class Unstable(Counts):
     """Its observations hold NaN and infinity; action 1 has a reward of NaN."""
 
     observation_space = Anything()
-    action_space = gym.spaces.Discrete(2)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        observation = {"place": np.array([1, np.nan, np.inf], np.float32), "note": [-math.inf]}
-        return observation, {"speed": np.float64("nan"), "spread": np.full(2, np.nan)}
+    def does(self, action: Any) -> float:
+        return math.nan if action else 1.0
 
-    def step(self, action: Any) -> Any:
-        observation, info = self.reset()
-        return observation, math.nan if action else 1.0, False, False, info
+    def observed(self) -> Any:
+        return {"place": np.array([1, np.nan, np.inf], np.float32), "note": [-math.inf]}
+
+    def told(self) -> dict[str, Any]:
+        return {"speed": np.float64("nan"), "spread": np.full(2, np.nan)}
 
 
 @on_asyncio
@@ -244,23 +244,11 @@ async def test_a_session_without_a_connection_ends_by_itself() -> None:
             assert refusal["data"]["message"] == f"Unknown session_id: {key}"
 
 
-class Stuck(gym.Env[Any, Any]):
-    """Its steps never end."""
-
-    observation_space = action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
-        time.sleep(3600)
-
-
 @on_asyncio
 async def test_a_kept_session_whose_step_never_ends_ends_by_itself() -> None:
     """Its client is gone, and never closes it; the step is aborted, and its env is free again."""
     async with (
-        rl.build_env_group(Stuck, name="stuck") as served,
+        rl.build_env_group(Scripted, name="stuck") as served,
         OpenEnvServer(served, "127.0.0.1", 0) as server,
     ):
         created: Any = await rpc(server, "openenv/session/create")
@@ -269,7 +257,7 @@ async def test_a_kept_session_whose_step_never_ends_ends_by_itself() -> None:
             await socket.send('{"type": "reset"}')
             await socket.recv()
             server._session_timeout = 0.01
-            await socket.send('{"type": "step", "data": {"action": 1}}')
+            await socket.send(json.dumps({"type": "step", "data": {"action": HANG}}))
             while not served.pending:  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
         while isinstance(  # noqa: ASYNC110

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,6 +11,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from kit.scripted import DIE, RAISE, Awaitable, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -25,32 +24,19 @@ STEP = 8
 """The difference in brightness between successive frames."""
 
 
-class Brighter(gym.Env[Any, Any]):
+class Brighter(Scripted):
     """Its frames get brighter with each step; an episode has three."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's.
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
-    action_space = gym.spaces.Discrete(10)
     length = 3
     size = (32, 48)
 
     def __init__(self, render_mode: str | None = "rgb_array", start: int = 0) -> None:
-        self.render_mode, self._start, self._steps = render_mode, start, 0
-        self.rendered = 0
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self._steps = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if action == 9:
-            os.kill(os.getpid(), signal.SIGKILL)
-        self._steps += 1
-        return np.zeros(1, np.float32), 1.0, self._steps == self.length, False, {}
+        self.render_mode, self._start, self.rendered = render_mode, start, 0
 
     def render(self) -> Any:
         self.rendered += 1
-        return np.full((*self.size, 3), self._start + STEP * self._steps, np.uint8)
+        return np.full((*self.size, 3), self._start + STEP * self.steps, np.uint8)
 
 
 class Odd(Brighter):
@@ -201,41 +187,13 @@ def test_films_are_added_to_a_folder_of_films(tmp_path: Path) -> None:
     assert list(films(tmp_path)) == ["env-0-episode-0.mp4", "env-0-episode-1.mp4"]
 
 
-class Raises(Brighter):
-    """Raises in the step with action 8."""
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if action == 8:
-            raise OSError("lost")
-        return super().step(action)
-
-
-class Awaits:
-    """The same, awaitable."""
-
-    observation_space, action_space = Raises.observation_space, Raises.action_space
-    render_mode = "rgb_array"
-
-    def __init__(self) -> None:
-        self._env = Raises()
-
-    async def reset(self, **_: Any) -> Any:
-        return self._env.reset()
-
-    async def step(self, action: Any) -> Any:
-        return self._env.step(action)
-
-    def render(self) -> Any:
-        return self._env.render()
-
-
 async def test_an_awaitable_env_that_is_rebuilt_continues_to_be_filmed(tmp_path: Path) -> None:
     """On the trainer's event loop."""
-    config = entry(Awaits, on_env_error="restart") | {"placement": "loop"}
+    config = entry(lambda: Awaitable(Brighter), on_env_error="restart") | {"placement": "loop"}
     async with rl.build_env_group(config) as group:
         await group.record_video(tmp_path)
         batch, _ = await group.reset()
-        batch, _ = await group.step(batch.respond(action=[8]))
+        batch, _ = await group.step(batch.respond(action=[RAISE]))
         assert batch.restarted.all()
         for _ in range(3):
             batch, _ = await group.step(batch.respond(action=[0]))
@@ -245,8 +203,8 @@ async def test_an_awaitable_env_that_is_rebuilt_continues_to_be_filmed(tmp_path:
 @pytest.mark.parametrize(
     ("config", "action"),
     [
-        (entry(Brighter, placement="process"), 9),
-        (entry(Raises, on_env_error="restart"), 8),
+        (entry(Brighter, placement="process"), DIE),
+        (entry(Brighter, on_env_error="restart"), RAISE),
     ],
     ids=["a replaced worker", "an env that is rebuilt"],
 )
@@ -271,11 +229,11 @@ def test_a_replacement_that_cannot_film_plays_on(
 ) -> None:
     """Here a file takes the place of the folder; there is one warning."""
     folder = tmp_path / "films"
-    with filming(entry(Raises, on_env_error="restart"), folder, episodes=[9]) as group:
+    with filming(entry(Brighter, on_env_error="restart"), folder, episodes=[9]) as group:
         batch, _ = group.reset()
         folder.rmdir()
         folder.touch()
-        batch, _ = group.step(batch.respond(action=[8]))
+        batch, _ = group.step(batch.respond(action=[RAISE]))
         assert batch.restarted.all()
         play(group, 9)
     assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1
@@ -288,7 +246,7 @@ def test_a_replaced_worker_films_what_was_filmed_last(tmp_path: Path, stop: bool
         group.record_video(tmp_path / "first", ["env-0"])
         group.record_video(None if stop else tmp_path / "second", ["env-0"])
         play(group, 1)
-        group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+        group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", DIE)]))
         play(group, 3)
     whole = [0, 1, 2, 3]
     seen = {folder.name: films(folder).get("env-0-episode-1.mp4") for folder in tmp_path.iterdir()}
@@ -361,7 +319,7 @@ def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
         group.record_video(tmp_path, group.env_ids)
         play(group, 2)
         with pytest.raises(rl.WorkerDied):
-            group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+            group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", DIE)]))
     names = [f"env-{k}-episode-0.partial.mp4" for k in range(2)]
     for name in names:
         while ffmpeg(tmp_path / name, "-f", "null", "-").returncode:

@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from kit.scripted import Counts
 
 from rlightning_aio.errors import EnvError
 from rlightning_aio.spaces import Anything
@@ -93,16 +94,11 @@ class AwaitedRoom:
         await asyncio.sleep(3600)
 
 
-class CountedRoom(gym.Env[Any, Any]):
+class CountedRoom(Counts):
     """Its observation is the seed, and the number of steps; three steps end it."""
 
     observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = spaces.Discrete(2)
+    length = 3
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.state = np.array([seed, 0.0])
-        return self.state.copy(), {}
-
-    def step(self, action: Any) -> Any:
-        self.state[1] += 1
-        return self.state.copy(), 1.0, bool(self.state[1] == 3), False, {}
+    def observed(self) -> Any:
+        return np.array([self.seed, self.steps], np.float64)

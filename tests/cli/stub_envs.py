@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from kit.scripted import Awaitable, Counts
 
 import rlightning_aio as rl
 
@@ -186,7 +187,14 @@ class Finishing(Stub):
         Path(self.options["closed_file"]).touch()
 
 
-class Casting(gym.Env[Any, Any]):
+class Plays(Counts):
+    """Episodes have five steps, whatever is done."""
+
+    action_space = gym.spaces.Discrete(2)
+    length = 5
+
+
+class Casting(Plays):
     """Returns observations whose dtypes are not those of their space, except one."""
 
     observation_space = gym.spaces.Dict(
@@ -198,70 +206,43 @@ class Casting(gym.Env[Any, Any]):
             "number": gym.spaces.Discrete(9),
         }
     )
-    action_space = gym.spaces.Discrete(2)
 
-    def _observed(self) -> Any:
+    def observed(self) -> Any:
         return {
             "pose": np.full(2, 0.1),
             "goal": np.full(2, 0.5, np.float32),
             "count": np.full(1, self.steps),
             "list": [0.5, 0.5],
             "number": 3,
-        }, {}
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.steps = 0
-        return self._observed()
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        observation, info = self._observed()
-        return observation, 1.0, self.steps == 5, False, info
+        }
 
 
-class AwaitedCasting:
+class AwaitedCasting(Awaitable):
     """The same, awaited."""
 
-    observation_space, action_space = Casting.observation_space, Casting.action_space
-
     def __init__(self) -> None:
-        self.env = Casting()
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return self.env.reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        return self.env.step(action)
+        super().__init__(Casting)
 
 
-class Narrow(gym.Env[Any, Any]):
+class Narrow(Plays):
     """Returns one array of float64 where its space has float32."""
 
     observation_space = gym.spaces.Box(-1, 1, (2,))
-    action_space = gym.spaces.Discrete(2)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return np.full(2, 0.5), {}
-
-    def step(self, action: Any) -> Any:
-        return np.full(2, 0.5), 1.0, False, False, {}
+    def observed(self) -> Any:
+        return np.full(2, 0.5)
 
 
-class Careless(gym.Env[Any, Any]):
+class Careless(Plays):
     """Draws from a generator that nobody seeds, forgets files, and divides by zero."""
 
     observation_space = gym.spaces.Box(0, 1, (2,))
-    action_space = gym.spaces.Discrete(2)
     files: ClassVar[list[Any]] = []
 
-    def _observed(self) -> Any:
+    def does(self, action: Any) -> float:
+        return math.nan
+
+    def observed(self) -> Any:
+        if not self.steps:
+            self.files.append(Path(__file__).open())  # noqa: SIM115
         return np.random.default_rng().random(2, np.float32)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.files.append(Path(__file__).open())  # noqa: SIM115
-        self.steps = 0
-        return self._observed(), {}
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        return self._observed(), math.nan, self.steps == 5, False, {}

@@ -8,9 +8,9 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
+from kit.scripted import Counts
 from timelines import Seen
 
 from rlightning_aio import sync
@@ -19,20 +19,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class Napping(gym.Env[Any, Any]):
+class Napping(Counts):
     """Sleeps for as many milliseconds as the action says; dies at 99."""
 
-    observation_space = gym.spaces.Box(0, 1, (1,), np.float32)
     action_space = gym.spaces.Discrete(100)
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         if action == 99:
             os._exit(7)
         time.sleep(int(action) / 1000)
-        return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
 def recorded(path: Path, actions: list[list[int]], think: float = 0.0) -> Any:

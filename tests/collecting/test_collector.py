@@ -14,6 +14,7 @@ from group import sample_envs
 from gymnasium.vector import AutoresetMode
 from kit.counting import ClientThread, CountingEnv
 from kit.faulty import CODES
+from kit.scripted import Scripted
 from kit.tokens import entry
 from patience import HANG
 
@@ -36,19 +37,6 @@ def zeros(batch: BatchedData) -> dict[str, Any]:
 
 def poles(count: int, **fields: Any) -> Any:
     return sync.build_env_group({**POLE, "num_workers": count, **fields})
-
-
-class Endless(gym.Env[Any, Any]):
-    """Its episodes don't end."""
-
-    observation_space = gym.spaces.Box(-1, 1, (1,))
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        return np.zeros(1, np.float32), 1.0, False, False, {}
 
 
 # -- kinds of envs
@@ -603,7 +591,7 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
             assert set(collector.collect().episodes["length"]) == {5}
         with group.auto_reset(math.inf):
             pass
-    endless = {"name": "endless", "task": Endless, "num_workers": 2, "placement": "inline"}
+    endless = {"name": "endless", "task": Scripted, "num_workers": 2, "placement": "inline"}
     for limit, number in ((None, 0), (4, 5)):
         with sync.build_env_group({**endless, "max_episode_steps": limit}) as group:
             rollout = Collector(group, zeros, num_transitions=40, min_results=2).collect()

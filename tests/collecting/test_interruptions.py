@@ -23,6 +23,7 @@ from combinations.played import Uneven, act, played
 from kit.counting import ClientThread, CountingEnv
 from kit.driven import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
 from kit.processes import kill
+from kit.scripted import Awaitable, Counts
 from patience import HANG
 
 import rlightning_aio as rl
@@ -40,22 +41,16 @@ if TYPE_CHECKING:
 SEED = 7
 
 
-class Awaited:
+class Awaited(Awaitable):
     """An awaitable `Uneven`, whose resets take some turns of the event loop, and steps one."""
 
-    observation_space, action_space = Uneven.observation_space, Uneven.action_space
-
     def __init__(self, turns: int) -> None:
-        self.env, self.turns = Uneven(), turns
+        super().__init__(Uneven)
+        self.turns = turns
 
-    async def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        for _ in range(self.turns):
+    async def pause(self, action: Any = None) -> None:
+        for _ in range(self.turns if action is None else 1):
             await asyncio.sleep(0)
-        return self.env.reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(0)
-        return self.env.step(action)
 
 
 def policy(batch: BatchedData) -> dict[str, Any]:
@@ -171,29 +166,21 @@ async def test_a_collect_of_workers_goes_on_wherever_it_was_cancelled() -> None:
 # -- envs that raise, and groups that others use between two calls
 
 
-class Numbered(gym.Env[Any, Any]):
+class Numbered(Counts):
     """Observes [its number, the episode, the step]; raises an error for the action 1."""
 
     observation_space = gym.spaces.Box(-1, 9999, (3,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    episode = 0
 
     def __init__(self, number: int) -> None:
         self.number = number
 
-    def observed(self) -> Any:
-        return np.array([self.number, self.episode, self.count], np.float64)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.episode = (options or {}).get("episode", self.episode + 1)
-        self.count = 0
-        return self.observed(), {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         if action == 1:
             raise LookupError("as it was told")
-        self.count += 1
-        return self.observed(), 1.0, False, False, {}
+
+    def observed(self) -> Any:
+        self.resets = self.options.get("episode", self.resets)
+        return np.array([self.number, self.resets, self.steps], np.float64)
 
 
 def numbered(place: Place, **fields: Any) -> Any:
@@ -346,8 +333,8 @@ async def send_resets(group: Any) -> None:
 
 async def reset_and_call(group: Any) -> None:
     await reset_two(group)
-    await group["a-0"].get_attr("episode")
-    await group["a-1"].get_attr("episode")
+    await group["a-0"].get_attr("resets")
+    await group["a-1"].get_attr("resets")
 
 
 async def reset_twice(group: Any) -> None:
@@ -358,7 +345,7 @@ async def reset_twice(group: Any) -> None:
 async def step_all(group: Any) -> None:
     batch, _ = await group.reset(options={"episode": 499})
     await group.step(batch.respond(action=np.zeros(4, int)))
-    await group["b-1"].get_attr("episode")
+    await group["b-1"].get_attr("resets")
 
 
 async def restore(group: Any) -> None:
@@ -369,7 +356,7 @@ async def restore(group: Any) -> None:
 
 async def only_call(group: Any) -> None:
     for env_id in group.env_ids:
-        await group[env_id].get_attr("episode")
+        await group[env_id].get_attr("resets")
 
 
 BETWEEN = {

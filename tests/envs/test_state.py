@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from kit.scripted import Counts
 
 from rlightning_aio import PolicyResponse
 from rlightning_aio._core.hosts.running.build_env import build_env
@@ -166,21 +167,16 @@ def test_any_point_is_restored(fields: dict[str, Any]) -> None:
         made.env.close()
 
 
-class Sampling(gym.Env[Any, Any]):
+class Sampling(Counts):
     """Its observations are samples of its space."""
-
-    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, space: gym.Space[Any]) -> None:
         self.observation_space = space
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.observation_space.seed(seed)
-        return self.observation_space.sample(), {}
-
-    def step(self, action: Any) -> Any:
-        return self.observation_space.sample(), 0.0, False, False, {}
+    def observed(self) -> Any:
+        if not self.steps:
+            self.observation_space.seed(self.seed)
+        return self.observation_space.sample()
 
 
 BOX = gym.spaces.Box(-1, 1, (1,), np.float64)

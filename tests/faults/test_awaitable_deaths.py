@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from kit.deeds import BLOCK, DIE, DIE_LATER, GO, HANG, Awaited
 from kit.driven import Driven, on_one_driver
 from kit.processes import kill
+from kit.scripted import BLOCK, DIE, DIE_LATER, GO, HANG, Awaited
 
 import rlightning_aio as rl
 

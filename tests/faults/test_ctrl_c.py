@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from faults.striking import hear_of_interrupt, interrupt, press, struck
+from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio.sync
@@ -120,18 +121,11 @@ def test_a_group_can_be_closed_wherever_a_second_ctrl_c_interrupts_its_step(line
         assert interrupted == reached
 
 
-class Pressing(gym.Env[Any, Any]):
+class Pressing(Counts):
     """Presses Ctrl-C in each step."""
 
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         press()
-        return 1, 1.0, False, False, {}
 
 
 def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
@@ -148,16 +142,13 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
         finally:
             assert signal.signal(signal.SIGINT, own) is not before
         assert heard == [signal.SIGINT]
-        assert batch.observation.tolist() == [1]
+        assert batch.observation.tolist() == [[1]]
 
 
-class Saved(Pressing):
+class Saved(Counts):
     """Presses Ctrl-C when the state of the first of its kind is saved."""
 
     presses: Iterator[Callable[[], None]]
-
-    def step(self, action: Any) -> Any:
-        return 1, 1.0, False, False, {}
 
     def save_state(self) -> Any:
         next(self.presses, int)()
@@ -179,18 +170,15 @@ def test_an_interrupted_call_of_all_inline_envs_keeps_none_of_them_busy(use: str
 
 def uses_of(group: Any, batch: BatchedData) -> dict[str, Callable[[], Any]]:
     return {
-        "step": lambda: group.step(batch.respond(action=[1] * len(batch))),
-        "step_async": lambda: group.step_async(batch.respond(action=[1] * len(batch))),
+        "step": lambda: group.step(batch.respond(action=[0] * len(batch))),
+        "step_async": lambda: group.step_async(batch.respond(action=[0] * len(batch))),
         "reset": group.reset,
         "call": lambda: group["a-0"].get_attr("observation_space"),
     }
 
 
-class Waiting(Pressing):
+class Waiting(Counts):
     """Presses Ctrl-C in the trainer, and waits for a file."""
-
-    def step(self, action: Any) -> Any:
-        return 1, 1.0, False, False, {}
 
     def wait(self, trainer: int, go_on: str) -> None:
         os.kill(trainer, signal.SIGINT)

@@ -6,10 +6,10 @@ import os
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from faults.striking import hear_of_interrupt, struck
+from kit.scripted import Counts
 
 import rlightning_aio.sync
 from rlightning_aio.calling import collect_calls, send_calls
@@ -31,22 +31,17 @@ NUM_LINES = 4000
 """More lines than any of the calls below executes."""
 
 
-class Serial(gym.Env[Any, Any]):
+class Serial(Counts):
     """Numbers what it is asked for, beginning with 1."""
 
-    observation_space = gym.spaces.Box(0, np.inf, (1,), np.int64)
-    action_space = gym.spaces.Discrete(2)
     serial = 0
 
     def number(self) -> int:
         self.serial += 1
         return self.serial
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return np.array([self.number()]), {}
-
-    def step(self, action: Any) -> Any:
-        return np.array([self.number()]), 1.0, False, False, {}
+    def observed(self) -> Any:
+        return np.array([float(self.number())])
 
 
 class Answers:

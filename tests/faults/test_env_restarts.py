@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from kit.driven import Driven, on_one_driver
+from kit.scripted import Awaitable, Counts
 from kit.tokens import Tokens, entry, marked, two_workers
 
 from rlightning_aio.errors import ConfigError, EnvRaised
@@ -130,7 +131,7 @@ def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
     tokens.check(batch)
 
 
-class Lives(gym.Env[Any, Any]):
+class Lives(Counts):
     """Its observation is its number among all that were made, and its steps; action 1 raises,
     and so does action 2, as Ctrl-C does.
 
@@ -139,26 +140,23 @@ class Lives(gym.Env[Any, Any]):
     """
 
     observation_space = gym.spaces.Box(0, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(3)
+    length = 4
     made: ClassVar[int] = 0
     closed: ClassVar[list[int]] = []
 
     def __init__(self) -> None:
         Lives.made += 1
-        self.number, self.steps = Lives.made, 0
+        self.number = Lives.made
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.steps = 0
-        return self._observed(), {"told": (options or {}).get("task", "nothing")}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         if action:
             raise KeyError("a bug") if action == 1 else KeyboardInterrupt
-        self.steps += 1
-        return self._observed(), 1.0, self.steps == 4, False, {}
 
-    def _observed(self) -> Any:
+    def observed(self) -> Any:
         return np.array([self.number, self.steps], np.float64)
+
+    def told(self) -> dict[str, Any]:
+        return {} if self.steps else {"told": self.options.get("task", "nothing")}
 
     def lives(self) -> tuple[int, list[int]]:
         return Lives.made, Lives.closed
@@ -167,28 +165,11 @@ class Lives(gym.Env[Any, Any]):
         Lives.closed.append(self.number)
 
 
-class AwaitedLives:
+class AwaitedLives(Awaitable):
     """The same with coroutines."""
 
-    observation_space, action_space = Lives.observation_space, Lives.action_space
-
     def __init__(self) -> None:
-        self.env = Lives()
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        await asyncio.sleep(0)
-        return self.env.reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(0)
-        return self.env.step(action)
-
-    async def close(self) -> None:
-        await asyncio.sleep(0)
-        self.env.close()
-
-    def lives(self) -> tuple[int, list[int]]:
-        return self.env.lives()
+        super().__init__(Lives)
 
 
 @pytest.mark.parametrize(
@@ -235,9 +216,9 @@ class Unsendable(Lives):
         return *super().step(0)[:-1], {"lock": threading.Lock()} if action else {}
 
 
-class AwaitedUnsendable(AwaitedLives):
+class AwaitedUnsendable(Awaitable):
     def __init__(self) -> None:
-        self.env = Unsendable()
+        super().__init__(Unsendable)
 
 
 @pytest.mark.parametrize("task", [Unsendable, AwaitedUnsendable])

@@ -7,10 +7,9 @@ import math
 import pickle
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from kit.deeds import BLAME, CUT, DIE, END, GO, HANG, RAISE, Awaited, Deeds, Fails
+from kit.scripted import BLAME, CUT, DIE, END, GO, HANG, RAISE, Awaited, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio.outcomes import TimeSpent
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 def entry(**fields: Any) -> dict[str, Any]:
     limits = {"step_timeout": 0.4, "reset_timeout": 0.4}
     place = {} if fields.get("placement") == "loop" else {"envs_per_process": 2}
-    return {"name": "f", "task": Fails, "num_workers": 2, **place, **limits, **fields}
+    return {"name": "f", "task": Scripted, "num_workers": 2, **place, **limits, **fields}
 
 
 def step(group: Driven, *actions: int) -> rl.BatchedData:
@@ -166,7 +165,7 @@ def test_it_survives_json_and_pickle() -> None:
             rl.Outcome.from_json({**outcome.to_json(), **wrong})
 
 
-class Particular(Deeds, gym.Env[Any, Any]):
+class Particular(Scripted):
     """Can't be reset without options, as a replacement does."""
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:

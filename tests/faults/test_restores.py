@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import gymnasium as gym
-import numpy as np
 import pytest
 from kit.driven import Driven, on_one_driver
 from kit.processes import kill
+from kit.scripted import Saved
 
 from rlightning_aio.errors import WorkerDied
 
@@ -19,31 +18,18 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 
-class Deadly(gym.Env[Any, Any]):
-    """Counts its steps; once it is prepared, it ends its worker when its state is restored."""
+class Deadly(Saved):
+    """Once it is prepared, it ends its worker when its state is restored."""
 
-    observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
-    action_space = gym.spaces.Discrete(2)
     is_prepared = False
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = 0
-        return np.array([0]), {}
-
-    def step(self, action: Any) -> Any:
-        self.count += 1
-        return np.array([self.count]), 1.0, False, False, {}
 
     def prepare(self) -> None:
         self.is_prepared = True
 
-    def save_state(self) -> Any:
-        return self.count
-
     def load_state(self, state: Any) -> None:
         if self.is_prepared:
             os._exit(5)
-        self.count = state
+        super().load_state(state)
 
 
 ENTRY: dict[str, Any] = {

@@ -12,6 +12,7 @@ import pytest
 from gymnasium.wrappers import NormalizeObservation
 from kit.driven import Driven, on_one_driver
 from kit.processes import kill
+from kit.scripted import Counts
 
 from rlightning_aio.config import parse_configs
 from rlightning_aio.errors import ConfigError, EnvRaised
@@ -22,25 +23,24 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 
-class Walk(gym.Env[Any, Any]):
+class Walk(Counts):
     """A random walk: each value depends on all previous ones."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(2)
+    length = 30
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.steps, self.at = 0, self.np_random.normal()
-        return self.observation(), {"steps": 0}
+    def does(self, action: Any) -> float:
+        self.at += self.np_random.normal() * (1 + action)
+        self.over = bool(self.np_random.random() < 0.05)
+        return self.at
 
-    def observation(self) -> Any:
+    def observed(self) -> Any:
+        if not self.steps:
+            self.at = self.np_random.normal()
         return np.array([self.steps, self.at])
 
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        self.at += self.np_random.normal() * (1 + action)
-        over = bool(self.np_random.random() < 0.05)
-        return self.observation(), self.at, over, self.steps >= 30, {"steps": self.steps}
+    def told(self) -> dict[str, Any]:
+        return {"steps": self.steps}
 
 
 NUM_DEATHS = int(os.environ.get("RLIGHTNING_AIO_DEATHS", "4"))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import time
 from functools import partial
 from typing import Any
 
@@ -12,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from kit.scripted import DIE, HANG, RAISE, Scripted
 
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
@@ -29,34 +29,28 @@ NUM_STEPS = 15
 GAMMA, LAMBDA = 0.9, 0.8
 
 
-class Numbered(gym.Env[Any, Any]):
+class Numbered(Scripted):
     """Its observation is a random number of the episode, and that of steps.
 
     Every second episode of seven steps is truncated. Every eleventh step goes wrong, if any does.
     """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, fault: str = "") -> None:
         self.fault, self.count = fault, itertools.count(1)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.state = np.array([int.from_bytes(os.urandom(6), "little"), 0.0])
-        return self.state.copy(), {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> Any:
         if self.fault and next(self.count) % 11 == 0:
-            if self.fault == "env_raised":
-                raise RuntimeError("a fault")
-            if self.fault == "env_died":
-                os._exit(3)
-            time.sleep(3600)
-        self.state[1] += 1
-        ends = self.state[1] == 7
-        is_cut = bool(self.state[0] % 2)
-        reward = earned(self.state)
-        return self.state.copy(), reward, ends and not is_cut, ends and is_cut, {}
+            super().does({"env_raised": RAISE, "env_died": DIE, "env_hung": HANG}[self.fault])
+        ends, is_cut = self.steps == 6, self.number % 2 == 1
+        self.over, self.cut = ends and not is_cut, ends and is_cut
+        return earned(np.array([self.number, self.steps + 1.0]))
+
+    def observed(self) -> Any:
+        if not self.steps:
+            self.number = int.from_bytes(os.urandom(6), "little")
+        return np.array([self.number, self.steps], np.float64)
 
 
 def earned(observation: Any) -> Any:

@@ -7,13 +7,13 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from kit.scripted import Counts
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
 from rlightning_aio._core.group.engine.actions import write_actions
@@ -99,19 +99,14 @@ def test_meaningless_numbers_are_refused_by_name(
         )
 
 
-class Waiting(gym.Env[Any, Any]):
+class Waiting(Counts):
     """Takes two numbers."""
-
-    observation_space = spaces.Discrete(2)
 
     def __init__(self, limit: float) -> None:
         self.action_space = spaces.Box(-limit, limit, (2,))
 
-    def reset(self, **_kwargs: Any) -> Any:
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
-        return 0, float(action.max()), False, False, {}
+    def does(self, action: Any) -> float:
+        return float(action.max())
 
 
 @pytest.mark.parametrize("order", [("far", "near"), ("near", "far")])

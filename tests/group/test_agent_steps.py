@@ -6,12 +6,11 @@ tests/hosts/test_loop.py tests agents that leave, and who is woken.
 from __future__ import annotations
 
 import asyncio
-import os
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import DIE, GO, HANG, RAISE, Awaited, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio._core.group.engine import agent_steps
@@ -25,45 +24,18 @@ from rlightning_aio.errors import (
     WorkerDied,
 )
 
-STEP, RAISE, EXIT, HANG = range(4)
 PLACES = [{"placement": "inline"}, {"envs_per_process": 2}]
 pytestmark = pytest.mark.timeout(60)
 
 
-class Counter(gym.Env[Any, Any]):
-    """Shows how many steps it has made."""
+class Counter(Scripted):
+    """Reports how many steps it has made."""
 
-    observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
-    action_space = gym.spaces.Discrete(4)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.count = 0
-        return np.array([0]), {}
-
-    def step(self, action: Any) -> Any:
-        if action == RAISE:
-            raise ArithmeticError
-        if action == EXIT:
-            os._exit(3)
-        self.count += 1
-        return np.array([self.count]), 1.0, False, False, {"count": self.count}
+    def told(self) -> dict[str, Any]:
+        return {"count": self.steps}
 
 
-class Hanging:
-    """Waits for ever if it is told to."""
-
-    observation_space, action_space = Counter.observation_space, Counter.action_space
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return np.array([0]), {}
-
-    async def step(self, action: Any) -> Any:
-        if action == HANG:
-            await asyncio.Event().wait()
-        return np.array([0]), 1.0, False, False, {}
-
-
-class Long(Hanging):
+class Long(Awaited):
     """Steps end one soon after another, but for those that don't."""
 
     async def step(self, action: Any) -> Any:
@@ -87,14 +59,14 @@ async def test_only_the_agent_with_a_bad_action_gets_an_error(place: dict[str, A
     async with rl.build_env_group(Counter, num_workers=4, **place) as group:
         playing = await episodes(group)
         for bad, said in ((np.ones(3), "expected shape"), ("north", "is not an array|expected")):
-            found = await stepped(playing, [STEP, bad, STEP, STEP])
+            found = await stepped(playing, [GO, bad, GO, GO])
             assert isinstance(found[1], BadAction)
             with pytest.raises(BadAction, match=said):
                 raise found[1]
             assert [ret.env_id for ret in found if not isinstance(ret, BadAction)] == [
                 one.env.env_id for one in playing if one is not playing[1]
             ]
-        found = await stepped(playing, [STEP] * 4)
+        found = await stepped(playing, [GO] * 4)
         assert [ret.info["count"] for ret in found] == [3, 1, 3, 3]
 
 
@@ -102,7 +74,7 @@ async def test_only_the_agent_with_a_bad_action_gets_an_error(place: dict[str, A
 async def test_an_error_of_an_env_is_that_of_its_agent(place: dict[str, Any]) -> None:
     async with rl.build_env_group(Counter, num_workers=4, **place) as group:
         playing = await episodes(group)
-        found = await stepped(playing, [STEP, RAISE, STEP, RAISE])
+        found = await stepped(playing, [GO, RAISE, GO, RAISE])
         assert [one.env_id for one in found] == group.env_ids
         assert [isinstance(one, EnvRaised) for one in found] == [False, True, False, True]
 
@@ -111,20 +83,22 @@ async def test_two_steps_of_one_env_are_one_too_many() -> None:
     """The second one is refused, and nobody else notices."""
     async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
         first, other = await episodes(group)
-        found = await stepped([first, first, other], [STEP] * 3)
+        found = await stepped([first, first, other], [GO] * 3)
         assert [type(ret) is EnvBusy for ret in found] == [False, True, False]
-        found = await stepped([first, other], [STEP] * 2)
+        found = await stepped([first, other], [GO] * 2)
         assert [ret.info["count"] for ret in found] == [2, 2]
 
 
 class Picky(Counter):
     """Its observation is the seed; refuses an odd one, and says which options it was given."""
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        if seed is not None and seed % 2:
+    def observed(self) -> Any:
+        if self.seed is not None and self.seed % 2:
             raise ArithmeticError
-        super().reset()
-        return np.array([seed or 0]), {"options": options} if options else {}
+        return np.array([self.seed or 0.0])
+
+    def told(self) -> Any:
+        return {"options": self.options} if self.options else super().told()
 
 
 async def begun(starts: list[Any]) -> list[Any]:
@@ -153,7 +127,7 @@ async def test_episodes_that_begin_together_have_their_own_seeds_options_and_err
         assert isinstance(found[5], TypeError)
         assert group.pending == []
         assert len(await begun([group.episode(env_id, 8) for env_id in group.env_ids])) == 6
-        found = await stepped(await episodes(group), [STEP] * 6)
+        found = await stepped(await episodes(group), [GO] * 6)
         assert [ret.info["count"] for ret in found] == [1] * 6
 
 
@@ -174,7 +148,7 @@ async def test_two_episodes_of_one_env_that_begin_together_are_one_too_many() ->
 async def test_agents_of_a_worker_that_dies_lose_their_own_episodes() -> None:
     async with rl.build_env_group(Counter, num_workers=4, envs_per_process=2) as group:
         playing = await episodes(group)
-        found = await stepped(playing, [EXIT, STEP, STEP, STEP])
+        found = await stepped(playing, [DIE, GO, GO, GO])
         assert [type(ret) is EpisodeLost for ret in found] == [True, True, False, False]
         assert [lost.env_id for lost in found[:2]] == group.env_ids[:2]
         assert [lost.results.ids() for lost in found[:2]] == [["Counter-0"], ["Counter-1"]]
@@ -184,7 +158,7 @@ async def test_each_agent_has_its_own_error_of_a_worker_that_is_not_replaced() -
     fields: dict[str, Any] = {"envs_per_process": 2, "on_worker_death": "raise"}
     async with rl.build_env_group(Counter, num_workers=4, **fields) as group:
         playing = await episodes(group)
-        found = await stepped(playing, [EXIT, STEP, STEP, STEP])
+        found = await stepped(playing, [DIE, GO, GO, GO])
         assert [type(ret) is WorkerDied for ret in found] == [True, True, False, False]
         assert found[0] is not found[1]
         assert [found[2].info["count"], found[3].info["count"]] == [1, 1]
@@ -193,24 +167,24 @@ async def test_each_agent_has_its_own_error_of_a_worker_that_is_not_replaced() -
 async def test_a_step_that_is_cancelled_before_it_is_sent_is_not_sent() -> None:
     async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
         first, other = await episodes(group)
-        cancelled = asyncio.ensure_future(first.step(STEP))
-        going_on = asyncio.ensure_future(other.step(STEP))
+        cancelled = asyncio.ensure_future(first.step(GO))
+        going_on = asyncio.ensure_future(other.step(GO))
         await asyncio.sleep(0)
         cancelled.cancel()
         assert (await going_on).info["count"] == 1
-        assert (await first.step(STEP)).info["count"] == 1
+        assert (await first.step(GO)).info["count"] == 1
 
 
 async def test_all_agents_learn_that_the_group_is_closed() -> None:
     """Those whose steps were sent, and those whose steps were not."""
-    group = rl.build_env_group(Hanging, num_workers=3, placement="loop")
+    group = rl.build_env_group(Awaited, num_workers=3, placement="loop")
     await group.init()
     playing = await episodes(group)
     steps = [asyncio.ensure_future(one.step(HANG)) for one in playing[:2]]
     while len(group.pending) < 2:  # noqa: ASYNC110  # Twice.
         await asyncio.sleep(0)
     closing = asyncio.ensure_future(group.close())
-    found = await asyncio.gather(*steps, playing[2].step(STEP), return_exceptions=True)
+    found = await asyncio.gather(*steps, playing[2].step(GO), return_exceptions=True)
     assert [type(error) for error in found] == [GroupClosed] * 3
     await closing
 
@@ -223,7 +197,7 @@ async def test_agents_and_batches_and_calls_take_turns() -> None:
 
         async def agent(one: Any) -> int:
             for _ in range(30):
-                found = await one.step(STEP)
+                found = await one.step(GO)
             return found.info["count"]
 
         async def called(env_id: str) -> None:

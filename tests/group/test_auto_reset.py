@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from kit.scripted import Counts
 
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 
@@ -195,18 +196,13 @@ async def test_without_a_limit_episodes_end_by_themselves(start: Any, what: int)
         assert (await group.step(responses(*IDS)))[1] == [True, False, True]
 
 
-class Brief(gym.Env[Any, Any]):
-    """Observes the number of steps of its episode; every episode ends with the third."""
+class Brief(Counts):
+    """Every episode ends with the third step."""
 
-    observation_space, action_space = gym.spaces.Discrete(9), gym.spaces.Discrete(2)
+    observation_space, length = gym.spaces.Box(0, 9, (), np.int64), 3
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.steps = 0
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        return self.steps, 1.0, self.steps == 3, False, {}
+    def observed(self) -> Any:
+        return np.array(self.steps)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])

@@ -8,26 +8,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv
+from kit.scripted import Counts
 
 from rlightning_aio import BaseEnv, EnvConfig, MultiAgentEnvRet, build_env_group
 
 
-class Timed(gym.Env[Any, Any]):
+class Timed(Counts):
     """Ends after `length` steps."""
 
-    observation_space = gym.spaces.Box(0, 99, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-
     def __init__(self, length: int) -> None:
-        self._length = length
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self._count = 0
-        return np.zeros(1), {}
-
-    def step(self, action: Any) -> Any:
-        self._count += 1
-        return np.zeros(1), 1.0, self._count >= self._length, False, {}
+        self.length = length
 
 
 class Duel(BaseEnv):
@@ -59,8 +49,8 @@ class Duel(BaseEnv):
 @pytest.mark.parametrize(
     ("make_env", "action", "limit", "num_steps"),
     [
-        (lambda: Timed(5), 1, None, 5),
-        (lambda: Timed(5), 1, 3, 3),
+        (lambda: Timed(5), 0, None, 5),
+        (lambda: Timed(5), 0, 3, 3),
         (lambda: Duel(EnvConfig(name="duel", backend="callable", task="-")), None, None, 3),
         (lambda: Duel(EnvConfig(name="duel", backend="callable", task="-")), None, 2, 2),
     ],

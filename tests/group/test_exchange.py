@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from group import sample_envs
 from gymnasium import spaces
+from kit.scripted import Counts
 
 from rlightning_aio import (
     BadAction,
@@ -265,17 +265,17 @@ async def test_actions_without_a_fixed_size_are_sent_out_of_band(start: Any) -> 
         await group["e-1"].step(("far too long a text", 1))
 
 
-class Echo(gym.Env[Any, Any]):
+class Echo(Counts):
     """Reports each action."""
 
-    observation_space = spaces.Discrete(2)
     action_space = spaces.Text(99)
+    heard = ""
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return 0, {}
+    def does(self, action: Any) -> None:
+        self.heard = action
 
-    def step(self, action: Any) -> Any:
-        return 0, 0.0, False, False, {"heard": action}
+    def told(self) -> dict[str, Any]:
+        return {"heard": self.heard}
 
 
 @pytest.mark.parametrize("text", ["the action is in the row", "ACTION_IN_ROW", "None", ""])

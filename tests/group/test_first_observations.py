@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
+from kit.scripted import Counts
 
 from rlightning_aio import EnvConfig, sync
 
 
-class Exceeding(gym.Env[Any, Any]):
+class Exceeding(Counts):
     """Observes its number of steps, which exceeds its space."""
 
-    action_space = spaces.Discrete(2)
-
     def __init__(self, announced: int) -> None:
-        self.observation_space = spaces.Box(0, announced, (1,), np.float32)
-        self.steps = 0
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.steps = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> Any:
-        self.steps += 1
-        return np.full(1, self.steps, np.float32), 0.0, False, False, {}
+        self.observation_space = gym.spaces.Box(0, announced, (1,), np.float64)
 
 
 gym.register("Exceeding-v0", Exceeding)

@@ -2,54 +2,28 @@
 
 from __future__ import annotations
 
-import os
 import random
-import signal
+from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from kit.scripted import DIE, GO, Awaitable, Scripted
 
 from rlightning_aio import EnvConfig, sync
 
 
-class Dice(gym.Env[Any, Any]):
-    """Observes numbers of the global generators; action 1 ends the process."""
+class Dice(Scripted):
+    """Observes numbers of the global generators."""
 
     observation_space = spaces.Box(0, 1, (2,), np.float64)
-    action_space = spaces.Discrete(2)
 
-    def _observation(self) -> Any:
+    def observed(self) -> Any:
         return np.array([np.random.random(), random.random()])  # noqa: NPY002
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        return self._observation(), {}
 
-    def step(self, action: Any) -> Any:
-        if action == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return self._observation(), 0.0, False, False, {}
-
-
-class AwaitableDice:
-    """The same for an event loop."""
-
-    observation_space, action_space = Dice.observation_space, Dice.action_space
-
-    def __init__(self) -> None:
-        self.dice = Dice()
-
-    async def reset(self, **kwargs: Any) -> Any:
-        return self.dice.reset(**kwargs)
-
-    async def step(self, action: Any) -> Any:
-        return self.dice.step(action)
-
-
-DICE = pytest.mark.parametrize("make", [Dice, AwaitableDice])
+DICE = pytest.mark.parametrize("make", [Dice, partial(Awaitable, Dice)])
 
 
 def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 2) -> list[Any]:
@@ -59,9 +33,9 @@ def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 2) 
     with sync.build_env_group(config) as group:
         for _ in range(2):
             batch, _ = group.reset(seed=seed, options=options)
-            for deadly in (0, 0, 0, 1, 0, 0, 0):
+            for deed in (GO, GO, GO, DIE, GO, GO, GO):
                 found.append(batch.observation)
-                batch, _ = group.step(batch.respond(action=np.full(count, deadly)))
+                batch, _ = group.step(batch.respond(action=np.full(count, deed)))
             assert batch.restarted.sum() == 0
     return np.array(found).tolist()
 
@@ -91,4 +65,4 @@ def test_an_env_in_this_process_leaves_the_generators_to_their_owner() -> None:
         batch, _ = group.reset(seed=9)
     random.seed(3)
     np.random.seed(3)  # noqa: NPY002
-    assert batch.observation.tolist() == [Dice()._observation().tolist()]
+    assert batch.observation.tolist() == [Dice().observed().tolist()]

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import Counts
 
 from rlightning_aio import EnvConfig, sync
 from rlightning_aio._core.group.state.host_record import HostRecord
@@ -255,17 +255,11 @@ def test_a_look_comes_early_and_then_ever_more_rarely() -> None:
     assert found == [8, 16, 32, 64, 128, 256, 512, HINT_AFTER_BATCHES]
 
 
-class Sleeper(gym.Env[Any, Any]):
+class Sleeper(Counts):
     """Waits in each step."""
 
-    observation_space = action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         time.sleep(0.02)
-        return 0, 0.0, False, False, {}
 
 
 def test_envs_that_truly_wait_get_the_warning(caplog: pytest.LogCaptureFixture) -> None:

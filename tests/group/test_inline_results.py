@@ -12,6 +12,7 @@ import pytest
 from group import sample_envs
 from group.sample_envs import HALVED
 from gymnasium import spaces
+from kit.scripted import Counts
 
 import rlightning_aio.sync
 from rlightning_aio.batch.data import parts_of
@@ -65,12 +66,10 @@ def test_an_interrupt_of_the_first_half_comes_with_the_result(
         halved.collect_async()
 
 
-class Interrupting(gym.Env[Any, Any]):
+class Interrupting(Counts):
     """Its `reset` is interrupted."""
 
-    observation_space = action_space = spaces.Discrete(2)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+    def observed(self) -> Any:
         raise KeyboardInterrupt
 
 

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
-from kit.deeds import CUT, DIE, GO, RAISE
-from kit.deeds import END as FAIL_END
-from kit.deeds import HANG as HANG_UP
+from kit.scripted import CUT, DIE, GO, RAISE
+from kit.scripted import END as FAIL_END
+from kit.scripted import HANG as HANG_UP
 from patience import HANG
 
 import rlightning_aio
@@ -293,7 +293,7 @@ def test_a_killed_worker_is_counted() -> None:
 def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None:
     """In batches and in errors, of every kind; steps that are aborted are cancelled."""
     rng, counted = random.Random(1), Counter[str]()
-    task = {"backend": "gymnasium", "task": "kit.deeds:Fails-v0", **fields}
+    task = {"backend": "gymnasium", "task": "kit.scripted:Scripted-v0", **fields}
     config = {"name": "f", **task, "step_timeout": 0.3, "max_restarts": 100}
 
     def note(batch: rlightning_aio.BatchedData | None) -> None:

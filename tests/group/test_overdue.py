@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio as rl
@@ -20,22 +21,16 @@ from rlightning_aio import sync
 from rlightning_aio._core.group.supervision import overdue
 
 
-class Stuck(gym.Env[Any, Any]):
+class Stuck(Counts):
     """Waits in a step with action 1 until a file is there."""
-
-    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
 
     def __init__(self, gate: Any) -> None:
         self._gate = gate
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> Any:
         while action == 1 and not self._gate.exists():
             threading.Event().wait(0.2)  # Long, to be found here.
-        return np.zeros(1, np.float32), 1.0, False, False, {}
+        return super().step(0)
 
 
 @pytest.fixture

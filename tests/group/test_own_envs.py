@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from kit.scripted import Counts
 
 from rlightning_aio import (
     ENVS,
@@ -181,24 +182,18 @@ def test_an_inline_env_of_two_halves_starts_when_its_step_is_sent() -> None:
 def test_an_action_space_may_be_empty(space: gym.Space[Any]) -> None:
     """Such an env acts without a choice."""
 
-    class Clock(gym.Env[Any, Any]):
-        observation_space = gym.spaces.Discrete(9)
+    class Clock(Counts):
         action_space = space
 
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-            self.now = 0
-            return self.now, {}
-
-        def step(self, action: Any) -> Any:
-            self.now += 1
-            return self.now, float(action == space.sample()), False, False, {}
+        def does(self, action: Any) -> float:
+            return float(action == space.sample())
 
     clock = {"name": "clock", "task": Clock, "num_workers": 2}
     with sync.build_env_group({**clock, "envs_per_process": 2}) as group:
         batch, _ = group.reset()
         for now in (1, 2):
             batch, _ = group.step(batch.respond(action=[space.sample()] * 2))
-            assert batch.observation.tolist() == [now] * 2
+            assert batch.observation.tolist() == [[now]] * 2
             assert batch.reward.tolist() == [1.0] * 2
 
 

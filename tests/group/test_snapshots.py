@@ -12,6 +12,7 @@ import pytest
 from gymnasium.wrappers import NormalizeObservation, NormalizeReward, RecordEpisodeStatistics
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kit.scripted import Saved
 from run_python import output_of
 
 import rlightning_aio as rl
@@ -303,29 +304,18 @@ def test_a_wrong_number_of_envs_is_refused() -> None:
         group.collect_async(wait_all=True)
 
 
-class Fragile(gym.Env[Any, Any]):
-    """Counts; its state can be taken, but restoring the second env fails once."""
+class Fragile(Saved):
+    """Restoring the second env fails once."""
 
-    observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
-    action_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(3)
     fails: Any = None
-    count = 0
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = 0
-        return np.array([0]), {}
-
-    def step(self, action: Any) -> Any:
-        self.count += 1
+    def does(self, action: Any) -> None:
         if action:
             self.fails = "raise" if action == 1 else "exit"
-        return np.array([self.count]), 1.0, False, False, {}
-
-    def save_state(self) -> Any:
-        return self.count
 
     def load_state(self, state: int) -> None:
-        self.count = state
+        super().load_state(state)
         if state == 1 and self.fails == "raise":
             raise OSError("the disk is gone")
 
@@ -353,7 +343,7 @@ class Lost(Fragile):
     def load_state(self, state: int) -> None:
         if self.fails:
             raise OSError("the disk is gone")
-        self.count = state
+        self.steps = state
 
 
 def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:

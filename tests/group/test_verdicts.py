@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
+from kit.scripted import Counts
 
 from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
 from rlightning_aio.attempts.success import success_of
@@ -103,19 +104,13 @@ def test_success_is_counted_where_an_episode_ends(backend: str, placement: str) 
         assert again[f"{config.name}-0"]["success_rate"] is None
 
 
-class Judged(gym.Env[Any, Any]):
+class Judged(Counts):
     """Its episodes have three steps. Each ends with success, and each reset reports a failure."""
 
-    observation_space = action_space = gym.spaces.Discrete(2)
+    length = 3
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.count = 0
-        return 0, {"success": False}
-
-    def step(self, action: Any) -> Any:
-        self.count += 1
-        ended = self.count == 3
-        return 0, 1.0, ended, False, {"success": True} if ended else {}
+    def told(self) -> dict[str, Any]:
+        return {"success": self.over} if self.over or not self.steps else {}
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
+from kit.scripted import GO, RAISE, Scripted
 
 from rlightning_aio import sync
 from rlightning_aio._core.hosts.messages import CASTS
@@ -64,19 +64,13 @@ def test_what_does_not_fit_is_an_error_as_ever() -> None:
     assert casts.found() == []
 
 
-class Narrowed(gym.Env[Any, Any]):
-    """Returns float64 where its space has float32, and raises when told to."""
+class Narrowed(Scripted):
+    """Returns float64 where its space has float32."""
 
-    observation_space = spaces.Box(-9, 9, (2,))
-    action_space = spaces.Discrete(2)
+    observation_space = gym.spaces.Box(-9, 9, (2,))
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        return np.zeros(2, FLOAT), {}
-
-    def step(self, action: Any) -> Any:
-        if action:
-            raise ValueError("as told")
-        return np.full(2, 0.1), 1.0, False, False, {}
+    def observed(self) -> Any:
+        return np.full(2, 0.1) if self.steps else np.zeros(2, FLOAT)
 
 
 @pytest.mark.usefixtures("implementation")
@@ -86,13 +80,13 @@ def test_an_env_that_was_rebuilt_is_looked_at_as_well(placement: str) -> None:
     entry = {"name": "e", "task": Narrowed, "placement": placement, "on_env_error": "restart"}
     with sync.build_env_group({**entry, "backend": "callable"}) as group:
         batch, _ = group.reset(seed=0)
-        batch, _ = group.step(batch.respond(action=[0]))
+        batch, _ = group.step(batch.respond(action=[GO]))
         casts = group["e-0"].call
         assert casts(CASTS) == []
-        batch, _ = group.step(batch.respond(action=[1]))
+        batch, _ = group.step(batch.respond(action=[RAISE]))
         assert group.num_restarts == 1
         batch, _ = group.reset(seed=0)
         assert casts(CASTS) == []
-        batch, _ = group.step(batch.respond(action=[0]))
+        batch, _ = group.step(batch.respond(action=[GO]))
         assert batch.observation.dtype == FLOAT
         assert casts(CASTS) == [Cast("observation", "float64", "float32", rounds=True)]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from kit.scripted import Counts
 
 from rlightning_aio import sync
 from rlightning_aio.evaluation import EpisodeSpec
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 QUEUE = [EpisodeSpec("", seed) for seed in range(6)]
 
 
-class Counting(gym.Env[Any, Any]):
+class Counting(Counts):
     """Observes its seed and step; an episode has seed + 4 steps.
 
     The reward is 1 for an action that says (seed, step when its chunk was asked for, place in it).
@@ -31,23 +31,20 @@ class Counting(gym.Env[Any, Any]):
     action_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 
     def __init__(self, period: int = 3, breaks: bool = False) -> None:
-        self._period, self._breaks, self._resets = period, breaks, itertools.count()
+        self._period, self._breaks = period, breaks
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self._seed, self._steps = seed, 0
-        self._breaks_now = self._breaks and next(self._resets) % 2 == 0
-        return self._observation(), {"task_description": f"lift {seed}"}
-
-    def _observation(self) -> Any:
-        return np.array([self._seed, self._steps], np.float64)
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        place = self._steps % self._period
-        right = action.tolist() == [self._seed, self._steps - place, place]
-        self._steps += 1
-        if self._breaks_now and self._steps == 3:
+    def does(self, action: Any) -> float:
+        if self._breaks and self.resets % 2 and self.steps == 2:
             raise ValueError("as asked for")
-        return self._observation(), float(right), self._steps == self._seed + 4, False, {}
+        self.length = self.seed + 4
+        place = self.steps % self._period
+        return float(action.tolist() == [self.seed, self.steps - place, place])
+
+    def observed(self) -> Any:
+        return np.array([self.seed, self.steps], np.float64)
+
+    def told(self) -> dict[str, Any]:
+        return {} if self.steps else {"task_description": f"lift {self.seed}"}
 
 
 def chunk_of(observation: Any, horizon: int = 5) -> Any:

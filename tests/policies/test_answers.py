@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import Counts
 
 import rlightning_aio as rl
 from rlightning_aio import BatchedData, sync
@@ -20,21 +21,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-class Echo(gym.Env[Any, Any]):
+class Echo(Counts):
     """Its reward is what the action says; an episode has three steps."""
 
-    observation_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+    length = 3
 
     def __init__(self, space: gym.Space[Any], read: Callable[[Any], float]) -> None:
-        self.action_space, self._read = space, read
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self._steps = 0
-        return np.zeros(1), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self._steps += 1
-        return np.zeros(1), self._read(action), self._steps == 3, False, {}
+        self.action_space, self.does = space, read
 
 
 class Plain(Echo):

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from kit.counting import CountingEnv as CountedSteps
+from kit.scripted import Awaitable, Counts
 from simulator.world import Faults, World
 
 import rlightning_aio as rl
@@ -19,47 +20,35 @@ from rlightning_aio import sync
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
 
-class CountingEnv(gym.Env[Any, Any]):
+class CountingEnv(Counts):
     """Its observation is its seed and the number of its steps; an action raises if it is 1."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Discrete(8)
+    nested = False
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.seed = -1 if seed is None else seed
-        self.steps = 0
-        return np.array([self.seed, 0.0]), {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         if action == 1:
             raise ValueError("as asked for")
-        self.steps += 1
-        info = {"nested": [self.steps]} if action == 2 else {}
-        return np.array([self.seed, self.steps], np.float64), 1.0, False, False, info
+        self.nested = bool(action == 2)
+
+    def observed(self) -> Any:
+        return np.array([-1 if self.seed is None else self.seed, self.steps], np.float64)
+
+    def told(self) -> dict[str, Any]:
+        return {"nested": [self.steps]} if self.steps and self.nested else {}
 
     def count(self) -> int:
         return self.steps
 
 
-class AwaitableEnv:
+class AwaitableEnv(Awaitable):
     """The same, whose coroutines take a while."""
 
-    observation_space = CountingEnv.observation_space
-    action_space = CountingEnv.action_space
-
     def __init__(self) -> None:
-        self.env = CountingEnv()
+        super().__init__(CountingEnv)
 
-    async def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        await asyncio.sleep(0.01)
-        return self.env.reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(0.01 * action)
-        return self.env.step(action)
-
-    def count(self) -> int:
-        return self.env.steps
+    async def pause(self, action: Any = None) -> None:
+        await asyncio.sleep(0.01 if action is None else 0.01 * action)
 
 
 def config(**fields: Any) -> rl.EnvConfig:

@@ -11,8 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector as wrappers
 from kit.processes import kill, stop
-from vector.numbered import Counted
-from vector.toys import Mortal, assert_alike
+from vector.toys import Counted, Mortal, assert_alike
 
 from rlightning_aio.errors import WorkerDied
 from rlightning_aio.vector import VectorEnv, make_vec

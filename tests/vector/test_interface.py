@@ -22,6 +22,7 @@ from gymnasium.error import (
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from kit.scripted import Awaited
 from patience import HANG
 from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
@@ -116,18 +117,6 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         env.reset()
 
 
-class Awaitable:
-    """Gymnasium's methods as coroutine functions."""
-
-    observation_space = action_space = spaces.Discrete(2)
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return 0, {}
-
-    async def step(self, action: Any) -> Any:
-        return 0, 0.0, False, False, {}
-
-
 @pytest.mark.parametrize(
     ("mode", "why"),
     [
@@ -139,7 +128,7 @@ class Awaitable:
 def test_an_awaitable_env_is_refused(mode: AutoresetMode, why: str) -> None:
     """One worker has both, so the first is always built first."""
     with pytest.raises((EnvRaised, StartFailed), match=why):
-        VectorEnv([Awaitable, Awaitable], autoreset_mode=mode, envs_per_process=2)
+        VectorEnv([Awaited, Awaited], autoreset_mode=mode, envs_per_process=2)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
+from kit.scripted import Counts
 from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
 
@@ -86,21 +87,17 @@ def test_infos_are_made_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> N
     envs.close()
 
 
-class Choosy(gym.Env[Any, Any]):
+class Choosy(Counts):
     """Raises for some actions and options."""
 
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        if options:
-            raise RuntimeError("no options, please")
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
+    def does(self, action: Any) -> None:
         if action:
             raise RuntimeError("no such action")
-        return 0, 0.0, False, False, {}
+
+    def observed(self) -> Any:
+        if self.options:
+            raise RuntimeError("no options, please")
+        return super().observed()
 
 
 class Stuck:
@@ -131,31 +128,24 @@ def test_after_an_env_has_raised_all_are_reset() -> None:
         env.step(np.array([1, 0, 1]))
     with pytest.raises(ResetNeeded, match="set_env"):
         env.step(np.zeros(3, np.int64))
-    assert env.reset().tolist() == [0, 0, 0]
+    assert env.reset().tolist() == [[0], [0], [0]]
     with pytest.raises(BadAction):
         env.step(np.zeros(3))
     env.step(np.zeros(3, np.int64))
     env.close()
 
 
-class Interrupting(gym.Env[Any, Any]):
+class Interrupting(Counts):
     """Its first step presses Ctrl-C while the trainer waits for it."""
 
-    observation_space = gym.spaces.Discrete(10)
-    action_space = gym.spaces.Discrete(2)
-
     def __init__(self, trainer: int) -> None:
-        self.trainer, self.count = trainer, 0
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = 0
-        return 0, {}
+        self.trainer = trainer
 
     def step(self, action: Any) -> Any:
-        self.count += 1
+        found = super().step(0)
         if action == 1:
             press_ctrl_c(self.trainer)
-        return self.count, 0.0, False, False, {}
+        return found
 
 
 def test_after_ctrl_c_it_is_reset() -> None:
@@ -168,16 +158,16 @@ def test_after_ctrl_c_it_is_reset() -> None:
     with pytest.raises(KeyboardInterrupt):
         env.step([1, 0])
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    assert env.get_attr("count") == [1, 1]
+    assert env.get_attr("steps") == [1, 1]
     with pytest.raises(ResetNeeded, match="interrupted"):
         env.step([0, 0])
-    assert env.reset().tolist() == [0, 0]
-    assert env.step([0, 0])[0].tolist() == [1, 1]
+    assert env.reset().tolist() == [[0], [0]]
+    assert env.step([0, 0])[0].tolist() == [[1], [1]]
     with pytest.raises(KeyboardInterrupt):
         env.env_method("step", 1, indices=[0])
-    assert env.get_attr("count", indices=[1]) == [1]
+    assert env.get_attr("steps", indices=[1]) == [1]
     env.set_attr("note", 7)
-    assert env.step([0, 0])[0].tolist() == [3, 2]
+    assert env.step([0, 0])[0].tolist() == [[3], [2]]
     env.close()
 
 
@@ -204,19 +194,20 @@ def test_a_method_of_some_envs_leaves_the_others_alone(kind: str) -> None:
     env.close()
 
 
-class Pushed(gym.Env[Any, Any]):
+class Pushed(Counts):
     """Its action is a tree."""
 
     observation_space = gym.spaces.Box(-9, 9, (2,), np.float64)
     action_space = gym.spaces.Dict(
         push=gym.spaces.Box(-1, 1, (2,), np.float64), times=gym.spaces.Discrete(5)
     )
+    at = np.zeros(2)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        return np.zeros(2), {}
+    def does(self, action: Any) -> None:
+        self.at = action["push"] * action["times"]
 
-    def step(self, action: Any) -> Any:
-        return action["push"] * action["times"], 0.0, False, False, {}
+    def observed(self) -> Any:
+        return self.at
 
 
 @pytest.mark.parametrize("together", [False, True])

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from kit.scripted import Scripted
 
 
 class Toy(gym.Env[Any, Any]):
@@ -81,6 +82,18 @@ class Mortal(gym.Env[Any, Any]):
         self.sum += int(action)
         ends = action == self.TERMINATE, action == self.TRUNCATE
         return self._observed(), 1.5 + self.count, *ends, {"count": self.count}
+
+
+class Counted(Scripted):
+    """Observes [episode, step]; action 1 ends the episode."""
+
+    observation_space = spaces.Box(-1, 99, (2,), np.float64)
+
+    def observed(self) -> Any:
+        return np.array([self.resets, self.steps], np.float64)
+
+    def told(self) -> dict[str, Any]:
+        return {"count": self.steps} if self.steps else {"begun": self.resets}
 
 
 class Wrapped(gym.Wrapper[Any, Any, Any, Any]):
