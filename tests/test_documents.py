@@ -256,6 +256,20 @@ def test_plug_ins_use_only_names_of_the_reference() -> None:
         assert any(f"rlightning_aio.plugins.{name}" in one for one in described), name
 
 
+@pytest.mark.parametrize(
+    ("page", "line"),
+    [
+        ("gymnasium", 'envs = VectorEnv([lambda: MySim("10.0.0.7")] * 8, step_timeout=30)'),
+        ("remote", 'with build_env_group(backend="env_server", env_kwargs=net, step_timeout=2)'),
+        ("agents", "await asyncio.gather(*(agent(group, env_id) for env_id in group.env_ids))"),
+        ("rlightning", "batch, truncations = env_group.step(BatchedData(batch.ids(), answers))"),
+    ],
+)
+def test_each_kind_of_user_meets_a_first_program(page: str, line: str) -> None:
+    """Of their own simulator, a robot, agents, and RLightning's idiom; other tests run them."""
+    assert line in (DOCS / f"{page}.md").read_text()
+
+
 def test_all_files_have_the_same_version() -> None:
     """The package, the project, the changelog and the citation."""
     (version,) = re.findall(

@@ -38,6 +38,12 @@ def blocks_of_python(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 
 
+def printed_on(page: Path) -> dict[str, str]:
+    """Return what the page says that its programs print, where it shows that below them."""
+    shown = r"^```python\n((?:(?!```).)*)^```\n+```text\n(.*?)^```"
+    return dict(re.findall(shown, page.read_text(), re.MULTILINE | re.DOTALL))
+
+
 def by_program(written: str) -> dict[str, str]:
     return dict(part.split("\n", 1) for part in written.split("\0")[1:])
 
@@ -52,9 +58,10 @@ PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE
 
 @pytest.mark.parametrize("pages", [[ROOT / "README.md"], *(PAGES[k::4] for k in range(4))], ids=len)
 def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
-    """It ends without a warning; the examples print to stdout, and nothing to stderr."""
+    """It ends without a warning, and prints what its page shows; the examples write no error."""
     examples = [ROOT / "examples" / f"{name}.py" for name in LOOPS if len(pages) == 1]
     programs = list(examples)
+    shown: dict[str, str] = {}
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     for page in pages:
         for number, block in enumerate(blocks_of_python(page)):
@@ -63,6 +70,8 @@ def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
             program = tmp_path / f"{page.stem}_{number}.py"
             program.write_text(block)
             programs.append(program)
+            if block in (texts := printed_on(page)):
+                shown[str(program)] = texts[block]
     # Without asyncio's debug mode, which logs every slow callback.
     environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
     done = subprocess.run(
@@ -77,6 +86,7 @@ def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
     printed, complained = by_program(done.stdout), by_program(done.stderr)
     assert done.returncode == 0, list(complained.items())[-1]
     assert list(printed) == [str(program) for program in programs]
+    assert {program: printed[program] for program in shown} == shown
     for example in map(str, examples):
         assert printed[example]
         assert complained[example] == ""
