@@ -55,6 +55,24 @@ def test_good_settings_get_no_hint(workers: int, step: float, transfer: float) -
     assert hint([config], {"pole": workers}, 2, latencies(step, transfer)) is None
 
 
+def test_times_of_several_entries_are_no_reason_for_a_hint(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Short steps of envs on the event loop say nothing of other envs, in workers."""
+    caplog.set_level(logging.INFO, "rlightning_aio")
+    machine = Machine(per_worker=1, num_workers=3, envs_per_process=1)
+    machine.hints.due = HINT_AFTER_BATCHES
+    with patch.object(Machine, "summary", lambda *_: {"latency_us": latencies(8.0, 60.0)}):
+        machine.look()
+        assert "3 workers for 2 cores" in caplog.text
+        caplog.clear()
+        machine.hints.due = HINT_AFTER_BATCHES
+        config = entry().model_copy(update={"name": "waiting", "placement": "loop"})
+        machine.records.append(HostRecord(OnLoop(), config))
+        machine.look()
+    assert not caplog.records
+
+
 def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """At INFO, after some steps."""
     measured = {"latency_us": latencies(step=10.0, transfer=100.0)}
@@ -93,6 +111,15 @@ class Worker(Host):
 
     def inspect(self, slot: int, answer: Any, after: float) -> None:
         answer(f"step of env {slot}, env.py:{after * 1000:.0f}", "all stacks")
+
+
+@dataclass
+class OnLoop(Host):
+    """A host of envs on the event loop, which is no process."""
+
+    first_slot: int = 3
+    num_envs: int = 1
+    host_id: int = 3
 
 
 @dataclass

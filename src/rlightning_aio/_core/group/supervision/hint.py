@@ -175,6 +175,8 @@ class Hints:
             _log.warning("%s", _advice_to_share(name, len(records), self._num_cores, step_us))
 
     def _look_at_latencies(self) -> None:
+        if len({record.config.name for record in self._records}) > 1:
+            return  # The latencies are those of all entries.
         workers = Counter(record.config.name for record in self._records if record.is_worker_here)
         warned = {name for name, since in self._since.items() if since is None}
         configs = [r.config for r in self._records if r.config.name not in warned]
