@@ -519,6 +519,29 @@ async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
     client.join()
 
 
+async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() -> None:
+    """However many wait; all are played when it comes."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        await episode.step([0.0, 0.0])
+        return episode.env_id
+
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
+    order = [*["robots"] * 4, *["here"] * 3]
+    specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(order)]
+    found: list[str] = []
+    async with rl.build_env_group([local, server]) as group:
+        handle: Any = group["robots-0"]
+        async with asyncio.timeout(HANG):
+            async for attempts in play(group, specs, agent, size=2):
+                found += [str(attempt.result) for attempt in attempts]
+                if found == ["here-0"] * 6:
+                    client = ClientThread(handle.address, "c0", CountingEnv(0))
+    assert found == ["here-0"] * 6 + ["robots-0/c0"] * 8
+    client.join()
+
+
 async def test_numbers_that_are_not_finite_are_in_the_file(tmp_path: Path) -> None:
     """As null, which is read as NaN; a failure's reward is None."""
     path = tmp_path / "attempts.jsonl"

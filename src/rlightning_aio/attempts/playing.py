@@ -38,6 +38,8 @@ _BURST: Final = 16
 """Most attempts that begin in one turn of the event loop, so that it is free for others."""
 _LOOK_SECONDS: Final = 0.2
 """Between looks for clients of env_servers that have come."""
+_MOST_LACKING: Final = 1000
+"""Most attempts that wait for entries without an env while tasks are read for the others."""
 _SURPLUS: Final = "enough other attempts at its task have ended"
 
 
@@ -146,7 +148,8 @@ class _Engine:
                 if self._begin():
                     await asyncio.sleep(0)
                     continue
-                lacking = self._entries_without_env()
+                self._check_envs()
+                lacking = self._num_lacking()
                 if not self._playing and not lacking and self._source.is_at_end:
                     return
                 if not lacking and not self._has_clients:
@@ -186,9 +189,9 @@ class _Engine:
                     return True
                 self._start(env_id)
                 begun += 1
-            room = max(self._most, 1)
-            is_full = len(self.done) * self._size >= room or len(queue) >= room
-            if is_full or len(self._playing) >= room or not queue.free:
+            room, lacking = max(self._most, 1), self._num_lacking()
+            is_full = len(self.done) * self._size >= room or len(queue) - lacking >= room
+            if is_full or lacking >= _MOST_LACKING or len(self._playing) >= room or not queue.free:
                 return False
             spec = self._source.next(self._wake)
             if spec is None:
@@ -246,13 +249,16 @@ class _Engine:
 
     # -- envs that are not there ------------------------------------------------------
 
-    def _entries_without_env(self) -> list[str]:
-        """Entries whose attempts wait although nothing plays; raise if that is for good."""
+    def _num_lacking(self) -> int:
+        """Number of attempts that wait for an entry of which no env is there."""
+        return self._queue.lacking(one.env_id for _, one in self._playing.values())
+
+    def _check_envs(self) -> None:
+        """Raise the last fault if attempts wait for an env that won't come."""
         queue = self._queue
         if not (queue.free or self._playing or self._has_clients or self._source.is_at_end):
             raise queue.fault or RLightningError("no env of this group is left that could play")
         queue.check_players()
-        return queue.lacking(one.env_id for _, one in self._playing.values())
 
     def _look(self) -> None:
         """Look for clients that have come, or come back, a few times in a second."""

@@ -228,8 +228,8 @@ class AttemptQueue:
 
     # -- envs that are gone -----------------------------------------------------------
 
-    def lacking(self, busy: Iterable[str]) -> list[str]:
-        """The entries of attempts that wait for envs of which none is free or `busy`."""
+    def lacking(self, busy: Iterable[str]) -> int:
+        """The number of attempts that wait for envs of which none is free or `busy`."""
         entry_of = self.players.entry_of
         entries, pinned = dict.fromkeys(self._entries()), dict.fromkeys(self._pinned_to())
         for env_id in chain(self.free, busy):  # Few are looked at: each entry has many.
@@ -237,7 +237,8 @@ class AttemptQueue:
                 break
             entries.pop(entry_of[env_id], None)
             pinned.pop(env_id, None)
-        return [*entries, *(entry_of[env_id] for env_id in pinned)]
+        queues = chain.from_iterable(self._pinned[env_id].values() for env_id in pinned)
+        return sum(len(self._waiting[entry]) for entry in entries) + sum(map(len, queues))
 
     def _entries(self) -> list[str]:
         """The entries of attempts that any of their envs may play."""
