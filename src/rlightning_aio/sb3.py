@@ -135,9 +135,7 @@ class VecEnv(_Base):
     ) -> None:
         del start_method
         assert not isinstance(env_fns, gym.vector.VectorEnv)  # See `__new__`.
-        limit = entry.pop("max_episode_steps", None)
-        makers = adapted(env_fns, AutoresetMode.SAME_STEP, limit)
-        self.group: EnvGroup = build_env_group({"name": "env", "task": makers, **entry})
+        self.group: EnvGroup = build_env_group(adapted(env_fns, AutoresetMode.SAME_STEP, entry))
         metas = self.group.init()
         try:
             first, *others = [(meta.observation_space, meta.action_space) for meta in metas]
@@ -416,6 +414,12 @@ class _OfVector(VecEnv):
         if self._separate is not None:
             name = name_of(wrapper_class)
             return [has_wrapper(self._separate[k], name) for k in places]
+        if isinstance(self._inner, gym.vector.AsyncVectorEnv):
+            raise ValueError(
+                f"AsyncVectorEnv can't say whether its envs are in a {wrapper_class.__name__}: "
+                "give VecEnv a list of callables, one for each env, or put it in a VecMonitor, "
+                "after which Stable-Baselines3 doesn't ask"
+            )
         ask: Any = getattr(self._inner, "env_is_wrapped", None)
         return [ask is not None and ask(wrapper_class)] * len(places)
 

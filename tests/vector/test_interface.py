@@ -28,7 +28,7 @@ from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
 from rlightning_aio import sync
-from rlightning_aio.errors import BadAction, EnvRaised, StartFailed
+from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
 
 if TYPE_CHECKING:
@@ -273,6 +273,8 @@ def test_bad_arguments_raise_as_in_gymnasium() -> None:
             VectorEnv([toy], max_concurrency=wrong)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="worker"):
         VectorEnv([toy], worker=print)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"^task: .*make_vec takes the name of a task"):
+        VectorEnv([toy], task="CartPole-v1")
 
 
 class Sized(Plain):

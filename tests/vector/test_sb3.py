@@ -274,6 +274,8 @@ def test_any_vector_env_does_the_same_as_dummy_vec_env(kind: str) -> None:
     if kind == "async":
         with pytest.raises(ValueError, match="AsyncVectorEnv can't call get_wrapper_attr"):
             ours.get_attr("dt", indices=[1])
+        with pytest.raises(ValueError, match=r"can't say .* in a TimeLimit: .* in a VecMonitor"):
+            ours.env_is_wrapped(gym.wrappers.TimeLimit)
     else:
         assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
         assert ours.get_attr("np_random_seed", indices=[2, -3]) == [7, 5]
@@ -294,6 +296,8 @@ def test_a_vector_env_in_another_mode_is_refused() -> None:
     envs: Any = make_vec_env("Hopper-v5", 2)
     with pytest.raises(AttributeError, match="without a group"):
         _ = envs.venv.group
+    with pytest.raises(ConfigError, match=r"^task: the envs are those of the callables"):
+        VecEnv([lambda: gym.make("CartPole-v1")], task="Acrobot-v1")
     with pytest.raises(ConfigError, match="step_timeout: a vector env has no workers"):
         VecEnv(envs.venv.envs, step_timeout=3.0)
     with pytest.raises(ValueError, match="can't be set for only some envs of a MujocoVectorEnv"):

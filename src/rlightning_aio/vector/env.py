@@ -116,16 +116,14 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._has_leftovers = False
         # Results of a step or reset were not returned, so no episode can go on.
         self._has_lost = False
-        limit = entry.pop("max_episode_steps", None)
         # What a state is of, besides the envs of the group.
+        limit = entry.get("max_episode_steps")
         self._kind = {"autoreset_mode": self.autoreset_mode.value, "max_episode_steps": limit}
-        makers = adapted(env_fns, self.autoreset_mode, limit)
+        config = adapted(env_fns, self.autoreset_mode, entry)
         if max_concurrency is not None:
-            entry = {"envs_per_process": per_worker(max_concurrency, len(makers)), **entry}
-        self.group: EnvGroup = build_env_group(
-            {"name": "env", "task": makers, **entry},
-            mixed_actions=True,
-        )
+            together = per_worker(max_concurrency, len(env_fns))
+            config = {"envs_per_process": together, **config}
+        self.group: EnvGroup = build_env_group(config, mixed_actions=True)
         metas = self.group.init()
         self.closed = False
         try:

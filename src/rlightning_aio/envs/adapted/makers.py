@@ -9,28 +9,35 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.envs.adapted.same_step import SameStep
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import name_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 __all__ = ["adapted"]
 
 
 def adapted(
-    makers: Sequence[Callable[[], Any]], mode: AutoresetMode, max_episode_steps: int | None
-) -> list[Callable[[], Any]]:
-    """Wrap callables that make envs, to adapt the envs in the workers.
+    makers: Sequence[Callable[[], Any]], mode: AutoresetMode, entry: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return a config entry of callables that make envs; the workers adapt the envs.
 
     Args:
         makers: the user's callables.
         mode: when an env is reset after the end of its episode.
-        max_episode_steps: step limit of the config entry, which an env with same-step autoreset
-            must apply itself.
+        entry: further fields. The step limit is applied by the envs themselves, as one with
+            same-step autoreset must.
 
     Raises:
+        ConfigError: `entry` has a task.
         TypeError: they are no callables, or there is one in place of one for each env.
     """
+    if "task" in entry:
+        raise ConfigError(
+            "task: the envs are those of the callables; leave it out (make_vec takes the name of "
+            "a task)"
+        )
     if callable(makers):
         raise TypeError(
             f"env_fns must be a list with a callable for each env: [{name_of(makers)}] * 4, say"
@@ -38,8 +45,9 @@ def adapted(
     for k, make in enumerate(makers):
         if not callable(make):
             raise TypeError(f"env_fns[{k}] is a {type(make).__name__}, which is not callable")
-    own = {id(make): _Adapted(make, mode, max_episode_steps) for make in makers}
-    return [own[id(make)] for make in makers]
+    own = {id(make): _Adapted(make, mode, entry.get("max_episode_steps")) for make in makers}
+    fields = {name: value for name, value in entry.items() if name != "max_episode_steps"}
+    return {"name": "env", "task": [own[id(make)] for make in makers], **fields}
 
 
 class _Adapted:
