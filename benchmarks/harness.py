@@ -1,8 +1,7 @@
 """Alternating rounds of contenders in one run, and their reports.
 
-Rule: contenders take turns (A B C A B C …), each in its own process, which sleeps during the
-turns of others, and a ratio is the median over pairs of the same round. So a machine that slows
-down for a while slows all of them down.
+Rule: contenders take turns (see `rlightning_aio.cli.measurement`), each in its own process, which
+sleeps during the turns of others.
 Left out on purpose: the work to measure, which is in the scripts, one question each.
 """
 
@@ -13,21 +12,19 @@ import importlib.util
 import json
 import multiprocessing as mp
 import os
-import statistics
 import sys
 import tempfile
 import time
 import traceback
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
-from itertools import chain
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
-from rlightning_aio.cli.machine import machine_facts
+from rlightning_aio.cli.measurement import Figures, family, in_turns, machine_facts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from multiprocessing.connection import Connection
 
 # One math thread for each contender: none is faster with more, and some would
@@ -79,9 +76,6 @@ class Target:
     at_most: bool = False
     difference: bool = False
 
-    def compare(self, subject: float, reference: float) -> float:
-        return subject - reference if self.difference else subject / reference
-
     def is_met(self, value: float) -> bool:
         return value <= self.bound if self.at_most else value >= self.bound
 
@@ -125,38 +119,21 @@ class Load(NamedTuple):
     switches: float
 
 
-@dataclass
-class Figures:
-    """The measured values, one for each round, in order."""
-
-    values: list[float] = field(default_factory=list)
-    loads: list[Load] = field(default_factory=list)
-
-    @property
-    def median(self) -> float:
-        return statistics.median(self.values)
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "median": self.median,
-            "low": min(self.values),
-            "high": max(self.values),
-            "values": self.values,
-        }
-
-    def load_by_step(self, batch: int | None) -> dict[str, float]:
-        """Return the processor time of all processes for a step, the number of busy processors,
-        and the context switches for a batch of `batch` steps.
-        """
-        pairs = list(zip(self.loads, self.values, strict=True))
-        found = {
-            "cpu_us_per_step": statistics.median(1e6 * load.cores / rate for load, rate in pairs),
-            "cores_used": statistics.median(load.cores for load in self.loads),
-        }
-        if batch is not None:
-            switches = (batch * load.switches / rate for load, rate in pairs)
-            found["switches_per_batch"] = statistics.median(switches)
-        return found
+def load_by_step(
+    rates: Sequence[float], loads: Sequence[Load], batch: int | None
+) -> dict[str, float]:
+    """Return the processor time of all processes for a step, the number of busy processors, and the
+    context switches for a batch of `batch` steps.
+    """
+    pairs = list(zip(loads, rates, strict=True))
+    found = {
+        "cpu_us_per_step": Figures([1e6 * load.cores / rate for load, rate in pairs]),
+        "cores_used": Figures([load.cores for load in loads]),
+    }
+    if batch is not None:
+        switches = [batch * load.switches / rate for load, rate in pairs]
+        found["switches_per_batch"] = Figures(switches)
+    return {name: figures.median for name, figures in found.items()}
 
 
 def throughput(step: Callable[[], int], seconds: float) -> float:
@@ -209,7 +186,9 @@ class Stage:
         processes so far.
         """
         assert self._process.pid is not None
-        threads = [thread for pid in family(self._process.pid) for thread in pid]
+        threads = [
+            t for pid in family(self._process.pid) for t in Path(f"/proc/{pid}/task").glob("*")
+        ]
         return sum(map(_busy_ns, threads)) / 1e9, sum(map(_switches, threads))
 
     def _answer(self) -> Any:
@@ -228,18 +207,6 @@ class Stage:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-
-
-def family(pid: int) -> Iterator[list[Path]]:
-    """Yield the threads of a process, and of each of its descendants."""
-    try:
-        threads = list(Path(f"/proc/{pid}/task").iterdir())
-        children = [thread.joinpath("children").read_text().split() for thread in threads]
-    except (FileNotFoundError, ProcessLookupError):
-        return  # The process has just ended.
-    yield threads
-    for child in chain.from_iterable(children):
-        yield from family(int(child))
 
 
 def _busy_ns(thread: Path) -> int:
@@ -295,10 +262,7 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
     """Run a question; return its report as plain data."""
     machine = machine_facts(modules_of(question.contenders))
     turns, skipped = take_turns(question.contenders, rounds, seconds, only)
-    figures = {
-        name: Figures([value for value, _ in found], [load for _, load in found])
-        for name, found in turns.items()
-    }
+    figures = {name: Figures([value for value, _ in found]) for name, found in turns.items()}
     return {
         "name": question.name,
         "title": question.title,
@@ -308,7 +272,11 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
         "machine": machine,
         "results": {
             name: found.as_json()
-            | (found.load_by_step(question.batch) if question.counts_steps else {})
+            | (
+                load_by_step(found.values, [load for _, load in turns[name]], question.batch)
+                if question.counts_steps
+                else {}
+            )
             for name, found in figures.items()
         },
         "targets": [
@@ -343,19 +311,18 @@ def take_turns(
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
         stages = _stages(contenders, only, stack, skipped)
-        for number in range(rounds):
-            for stage in list(stages):
-                name = stage.contender.name
-                try:
-                    value, load = stage.round(seconds)
-                except ContenderFailed as error:
-                    stages.remove(stage)
-                    found.pop(name, None)
-                    skipped[name] = _last_line(name, error)
-                    continue
-                found.setdefault(name, []).append((value, load))
-                text = (text_of or number_text)(value)
-                say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
+        for number, stage in in_turns(stages, rounds):
+            name = stage.contender.name
+            try:
+                value, load = stage.round(seconds)
+            except ContenderFailed as error:
+                stages.remove(stage)
+                found.pop(name, None)
+                skipped[name] = _last_line(name, error)
+                continue
+            found.setdefault(name, []).append((value, load))
+            text = (text_of or number_text)(value)
+            say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
     return found, skipped
 
 
@@ -386,8 +353,8 @@ def _last_line(name: str, error: ContenderFailed) -> str:
 
 
 def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
-    pairs = zip(figures[target.subject].values, figures[target.reference].values, strict=True)
-    found = Figures([target.compare(*pair) for pair in pairs])
+    subject, reference = figures[target.subject], figures[target.reference]
+    found = subject.minus(reference) if target.difference else subject.over(reference)
     return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
 
 

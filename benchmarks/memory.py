@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from contenders import Stepped, Work, group_config
-from harness import Question, Target, family, main
+from harness import Question, Target, main
+
+from rlightning_aio.cli.measurement import family, memory_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,12 +30,7 @@ GYMNASIUM = "Gymnasium AsyncVectorEnv"
 def resident_kib() -> int:
     """Return the memory of this process and its descendants; shared pages count in part."""
     gc.collect()
-    total = 0
-    for threads in family(os.getpid()):
-        for line in (threads[0].parent.parent / "smaps_rollup").read_text().splitlines():
-            if line.startswith("Pss:"):
-                total += int(line.split()[1])
-    return total
+    return memory_bytes(list(family(os.getpid()))) // 1024
 
 
 def kib_per_env(measure: Callable[[int], int], many: int) -> float:

@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.cli.bench.measuring import Costs, Limits, Round, Rule, as_round
-from rlightning_aio.cli.machine import cpu_seconds, memory_bytes
+from rlightning_aio.cli.measurement import cpu_seconds, memory_bytes
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.registry import ENVS

@@ -17,7 +17,7 @@ from rlightning_aio.cli.bench.measuring import Contender, Limits, Rule, take_tur
 from rlightning_aio.cli.bench.plots import check_plot, draw_contenders
 from rlightning_aio.cli.bench.settings import Setting, possible_settings, swept_settings
 from rlightning_aio.cli.live_line import LiveLine, time_left
-from rlightning_aio.cli.machine import machine_facts
+from rlightning_aio.cli.measurement import machine_facts
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
     AsJson,

@@ -13,7 +13,6 @@ import os
 import time
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from statistics import median
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
@@ -22,7 +21,7 @@ import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
-from rlightning_aio.cli.machine import cpu_seconds, memory_bytes
+from rlightning_aio.cli.measurement import Figures, cpu_seconds, in_turns, memory_bytes
 from rlightning_aio.cli.policies.collecting import (
     Roster,
     respond_to_all,
@@ -179,26 +178,27 @@ class Contender:
     @property
     def steps_per_second(self) -> float:
         """Return the median over the rounds, or 0 without any."""
-        return median(r.steps_per_second for r in self.rounds) if self.rounds else 0.0
+        return self._rates.median
+
+    @property
+    def _rates(self) -> Figures:
+        return Figures([r.steps_per_second for r in self.rounds])
 
     @property
     def spread(self) -> float:
         """Return half the range of the rounds, as a share of the median."""
-        rates = [r.steps_per_second for r in self.rounds]
-        return (max(rates) - min(rates)) / 2 / self.steps_per_second
+        return self._rates.spread
 
     @property
     def latency_us(self) -> tuple[float, float]:
         """Return the medians of the rounds' p50 and p99."""
-        return (
-            median(r.latency_us[0] for r in self.rounds),
-            median(r.latency_us[1] for r in self.rounds),
-        )
+        p50, p99 = (Figures([r.latency_us[k] for r in self.rounds]).median for k in (0, 1))
+        return p50, p99
 
     @property
     def cores(self) -> float:
         """Return the median over the rounds of the cores that were busy."""
-        return median(r.cores for r in self.rounds)
+        return Figures([r.cores for r in self.rounds]).median
 
     @property
     def restarts(self) -> int:
@@ -214,7 +214,7 @@ class Contender:
             "min_results": self.rule.min_results,
             "failure": self.failure,
             "restarts": self.restarts,
-            "rounds": [r.steps_per_second for r in self.rounds],
+            "rounds": self._rates.values,
         }
         if self.rounds:
             p50, p99 = self.latency_us
@@ -382,11 +382,10 @@ async def take_turns(
     Raises:
         RLightningError: none could be measured.
     """
-    for _ in range(rounds):
-        for contender in contenders:
-            await take_turn(stands, contender, limits)
-            report(contender)
-            await asyncio.sleep(0)  # Let Ctrl-C take effect.
+    for _, contender in in_turns(contenders, rounds):
+        await take_turn(stands, contender, limits)
+        report(contender)
+        await asyncio.sleep(0)  # Let Ctrl-C take effect.
     if not any(contender.rounds for contender in contenders):
         raise_if_all_failed(stands)
 

@@ -1,6 +1,8 @@
-"""This machine: what its processes use, as the kernel counts it, and what figures depend on.
+"""Measuring: turns, figures, what processes use, and what figures depend on.
 
-Rule: `bench` and the scripts of benchmarks/ both measure with this module.
+Rule: `bench` and the scripts of benchmarks/ both measure with this module. Contenders take turns
+(A B C A B C …), a figure is a median over rounds, and a ratio one over pairs of the same round. So
+a machine that slows down for a while slows all of them down.
 """
 
 from __future__ import annotations
@@ -9,22 +11,69 @@ import importlib.metadata
 import os
 import platform
 import time
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from statistics import median
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-__all__ = ["cpu_seconds", "machine_facts", "memory_bytes"]
+__all__ = [
+    "Figures",
+    "cpu_seconds",
+    "family",
+    "in_turns",
+    "machine_facts",
+    "memory_bytes",
+]
 
+C = TypeVar("C")
 _ALWAYS_USED: Final = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
 
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _USER_TICKS: Final = 11
 """Position of user time behind a process's name; kernel time follows it."""
+
+
+def in_turns(contenders: Sequence[C], rounds: int) -> Iterator[tuple[int, C]]:
+    """Yield the number of the round and a contender: those that are left when a round begins."""
+    for number in range(rounds):
+        for contender in list(contenders):
+            yield number, contender
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The measured values, one for each round, in order."""
+
+    values: Sequence[float]
+
+    @property
+    def median(self) -> float:
+        """0 without any."""
+        return median(self.values) if self.values else 0.0
+
+    @property
+    def spread(self) -> float:
+        """Half the range of the values, as a share of the median."""
+        return (max(self.values) - min(self.values)) / 2 / self.median
+
+    def over(self, others: Figures) -> Figures:
+        """Ratios to the figures of the same rounds."""
+        return Figures([a / b for a, b in zip(self.values, others.values, strict=True)])
+
+    def minus(self, others: Figures) -> Figures:
+        """Differences from the figures of the same rounds."""
+        return Figures([a - b for a, b in zip(self.values, others.values, strict=True)])
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all for JSON."""
+        values = list(self.values)
+        return {"median": self.median, "low": min(values), "high": max(values), "values": values}
 
 
 def cpu_seconds(pids: Sequence[int]) -> float:
@@ -50,6 +99,14 @@ def _memory_bytes(pid: int) -> int:
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024
     return 0
+
+
+def family(pid: int) -> Iterator[int]:
+    """Yield the ids of a process and of its descendants."""
+    yield pid
+    for of_thread in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in _read(str(of_thread)).split():
+            yield from family(int(child))
 
 
 def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
