@@ -87,25 +87,6 @@ def test_an_error_of_a_step_is_reported_and_the_env_stays_usable(start: Start) -
     assert [ret.observation[1] for ret in batch.values()] == pids
 
 
-def test_an_error_in_a_collect_ends_one_request(start: Start) -> None:
-    """It is raised once; the next collect returns the others' results."""
-    group, tokens = start(two_workers()), Tokens()
-    for name in RAISED:
-        group.step_async(tokens.steps(group.group.env_ids, {"faulty-1": name}))
-        ids: list[str] = []
-        errors: list[EnvRaised] = []
-        while len(ids) + len(errors) < 4:
-            try:
-                batch, _ = group.collect_async()
-            except EnvRaised as error:
-                errors.append(error)
-            else:
-                tokens.check(batch)
-                ids += batch.ids()
-        assert sorted(ids) == ["faulty-0", "faulty-2", "faulty-3"]
-        check_error(errors[0], name, "step")
-
-
 @on_one_driver
 def test_an_error_of_a_reset_is_reported_and_the_next_reset_works(start: Start) -> None:
     """With options, which go through the channel, and without, when the row has the seed."""

@@ -319,58 +319,6 @@ def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> Non
             tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-async def test_cancelled_step_leaves_its_results_to_collect() -> None:
-    """After a cancellation, the next results are right, in any call."""
-    tokens = Tokens()
-    async with rlightning_aio.build_env_group(two_workers()) as group:
-        batch, _ = await group.reset()
-        pid = int(batch["faulty-0"].observation[1])
-        stop(pid)
-        stepping = asyncio.ensure_future(group.step(tokens.steps(group.env_ids)))
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(stepping, 0.05)
-        os.kill(pid, signal.SIGCONT)
-        batch, _ = await group.collect_async(wait_all=True)
-        assert sorted(batch.ids()) == group.env_ids
-        tokens.check(batch)
-        for _ in range(3):
-            tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
-
-
-async def test_cancelled_call_answers_no_other_request() -> None:
-    """Its late value is dropped, and the env's next request gets its own reply."""
-    tokens = Tokens()
-    async with rlightning_aio.build_env_group(two_workers()) as group:
-        batch, _ = await group.reset()
-        pid = int(batch["faulty-0"].observation[1])
-        stop(pid)
-        with pytest.raises(TimeoutError):
-            await asyncio.wait_for(group["faulty-0"].call("returns", os.getpid), 0.05)
-        os.kill(pid, signal.SIGCONT)
-        with pytest.raises(NothingPending):
-            await group.collect_async()
-        # The worker replies in order: once the other env has replied, the call is over.
-        assert await group["faulty-1"].call("returns", os.getpid) == pid
-        tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
-
-
-async def test_cancelled_collect_loses_nothing() -> None:
-    """The next collect returns everything."""
-    tokens = Tokens()
-    async with rlightning_aio.build_env_group(two_workers()) as group:
-        batch, _ = await group.reset()
-        pid = int(batch["faulty-0"].observation[1])
-        stop(pid)
-        group.step_async(tokens.steps(group.env_ids))
-        for _ in range(3):
-            with pytest.raises(TimeoutError):
-                await asyncio.wait_for(group.collect_async(wait_all=True), 0.05)
-        os.kill(pid, signal.SIGCONT)
-        batch, _ = await group.collect_async(wait_all=True)
-        assert sorted(batch.ids()) == group.env_ids
-        tokens.check(batch)
-
-
 @on_one_driver
 def test_signals_that_the_trainer_blocks_reach_its_workers(build: Start) -> None:
     """Whatever the starting thread blocks: deaths are noticed at once, hangs show their stacks, and

@@ -479,25 +479,6 @@ def test_stopped_fork_server_does_not_delay_close(start: Start) -> None:
         ended()
 
 
-async def test_close_ends_a_collect_that_waits(tmp_path: Path) -> None:
-    """The collect raises GroupClosed."""
-    tokens, gate = Tokens(), tmp_path / "gate"
-    os.mkfifo(gate)
-    group = rlightning_aio.build_env_group(two_workers())
-    await group.init()
-    await group.reset()
-    await group["faulty-0"].call("answer_with", info=lambda: {"gate": gate.read_bytes()})
-    group.step_async(tokens.steps(["faulty-0"]))
-    collecting = asyncio.ensure_future(group.collect_async())
-    await asyncio.sleep(0)
-    with gate.open("w"):  # The env waits at the gate, and continues when it is closed.
-        closing = asyncio.gather(group.close(), group.close())
-        await asyncio.sleep(0)
-    await closing
-    with pytest.raises(GroupClosed):
-        await collecting
-
-
 async def test_cancelled_close_still_closes() -> None:
     """No later call would finish it."""
     group = rlightning_aio.build_env_group(two_workers())

@@ -203,7 +203,7 @@ def test_invalid_arguments_are_refused(rules: dict[str, Any], said: str) -> None
         assert len(group.collect_async()[0]) == 1
 
 
-# -- awaited (cancellation and a second collector: on either loop in tests/faults)
+# -- awaited
 
 
 async def test_results_are_ordered_by_readiness(group: Any, gates: list[Gate]) -> None:
@@ -228,7 +228,6 @@ async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gat
     assert batch.ids() == IDS[:3]
 
 
-@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate]) -> None:
     """Neither ready results nor outstanding ones."""
     group.step_async(responses(0, 1, 2))
@@ -245,7 +244,6 @@ async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate
     assert sorted(batch.ids()) == IDS[:3]
 
 
-@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_a_cancelled_step_is_collected(group: Any, gates: list[Gate]) -> None:
     """The envs have their requests; the next collect returns the results."""
     stepping = asyncio.create_task(group.step(responses(0, 1)))
@@ -279,7 +277,6 @@ async def test_the_value_of_a_cancelled_call_is_dropped(group: Any, gates: list[
             await group["gated-2"].call("double", 1)
 
 
-@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_a_second_collect_at_the_same_time_is_refused(group: Any, gates: list[Gate]) -> None:
     """The first one gets its result."""
     group.step_async(responses(0))
@@ -363,7 +360,6 @@ async def test_inline_envs_are_served_while_others_are_waited_for(
         assert (await collecting)[0].ids() == ["gated-0"]
 
 
-@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:
     """A collect and a step raise at once; the envs get time to close."""
     group.step_async(responses(0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
@@ -10,18 +9,15 @@ import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
-from rlightning_aio._core.group.state.conditions import CLOSED, UNLIKE_ENVS
+from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
 from rlightning_aio._core.hosts.messages import Faulted, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
-    BadAction,
     EnvBusy,
     EnvFault,
     EnvHung,
     EnvRaised,
-    GroupClosed,
     NothingPending,
-    RLightningError,
     WorkerDied,
 )
 from rlightning_aio.types import PolicyResponse
@@ -121,19 +117,6 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
     assert not host.waiting
 
 
-def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
-    """Of two calls on envs of one worker, each returns when its own envs have replied."""
-    group = new_group(3)
-    quick = group.begin(group.steps.step(steps(0), group.now))
-    slow = group.begin(group.steps.step(steps(1, 2), group.now))
-    group.finish(0)
-    assert ids_of(quick) == ["fake-0"]
-    assert not slow.done
-    group.finish(2)
-    group.finish(1)
-    assert ids_of(slow) == ["fake-1", "fake-2"]
-
-
 def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
     """The next collect returns the results."""
     group = new_group(2)
@@ -180,15 +163,6 @@ def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str
     assert ids_of(stepped) == ["fake-0"]
 
 
-def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
-    """A call that names an env twice is refused as a whole, like a batch of steps."""
-    group = new_group(2)
-    ids = ["fake-1", "fake-0", "fake-1"]
-    with pytest.raises(EnvBusy, match="'fake-1' appears twice"):
-        group.begin(group.core.reset(group.now, None, None, ids)).result()
-    assert not group.hosts[0].waiting
-
-
 def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
     """Only a collect of nothing is refused."""
     group = new_group(2)
@@ -218,55 +192,6 @@ def test_seeds_are_counted_for_each_env(new_group: NewGroup) -> None:
     group = new_group(2)
     with pytest.raises(ValueError, match="3 seeds for 2 envs"):
         group.begin(group.core.reset(group.now, [1, 2, 3], None, None)).result()
-
-
-@pytest.mark.parametrize("moment", ["before init", "after close"])
-def test_a_group_that_is_not_open_says_so(moment: str) -> None:
-    """For every operation; the error differs from that of an idle group."""
-    group = FakeGroup([1])
-    if moment == "before init":
-        group.core.lifetime.open = False
-        group.conditions.note(CLOSED, True)
-    else:
-        group.steps.step_async(steps(0), group.now)
-        group.finish(0)
-        group.close()
-    before = moment == "before init"
-    error, hint = (RLightningError, "init") if before else (GroupClosed, "build a new one")
-    with pytest.raises(error, match=hint):
-        collect(group).result()
-    with pytest.raises(error, match=hint):
-        group.steps.step_async(steps(0), group.now)
-    with pytest.raises(error, match=hint):
-        group.begin(group.core.reset(group.now, None, None, None)).result()
-    with pytest.raises(error, match=hint):
-        group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))).result()
-    group.close()
-
-
-def test_values_that_cannot_be_pickled_are_refused_before_anything_is_sent(
-    new_group: NewGroup,
-) -> None:
-    """Extras, options and arguments: nothing is sent in part, and every env stays usable."""
-    group = new_group(1, 1, reads_extras=[True, True])
-    unpicklable = threading.Lock()
-    batch = BatchedData(
-        ["fake-0", "fake-1"],
-        [PolicyResponse("fake-0", 0, good=1), PolicyResponse("fake-1", 0, bad=unpicklable)],
-    )
-    with pytest.raises(BadAction, match=r"'fake-1'.*nothing was sent"):
-        group.steps.step_async(batch, group.now)
-    with pytest.raises(BadAction, match="'fake-1'"):
-        group.begin(group.steps.step(batch, group.now)).result()
-    with pytest.raises(TypeError, match="options for env 'fake-0'"):
-        group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
-    with pytest.raises(TypeError, match=r"arguments of who\(\)"):
-        group.begin(group.core.calls.call_one(group.now, 0, ("who", (unpicklable,), {}))).result()
-    assert not any(host.waiting for host in group.hosts)
-    running = group.begin(group.steps.step(steps(0, 1), group.now))
-    group.finish(0)
-    group.finish(1)
-    assert ids_of(running) == ["fake-0", "fake-1"]
 
 
 def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
@@ -502,28 +427,6 @@ def die(group: FakeGroup, slot: int) -> None:
     group.turn()
 
 
-def test_a_collect_also_waits_for_requests_sent_meanwhile(new_group: NewGroup) -> None:
-    """It armed the bell for one worker; another worker now has the first result."""
-    group = new_group(1, 1)
-    group.steps.step_async(steps(0), group.now)
-    waiting = collect(group)
-    group.steps.step_async(steps(1), group.now)
-    group.turn()
-    group.finish(1)
-    assert ids_of(waiting) == ["fake-1"]
-
-
-def test_a_collect_returns_results_of_a_cancelled_call(new_group: NewGroup) -> None:
-    """Results that are ready wake it."""
-    group = new_group(3)
-    group.steps.step_async(steps(2), group.now)
-    stepping = group.begin(group.steps.step(steps(0, 1), group.now))
-    waiting = collect(group)
-    group.finish(0)
-    group.cancel(stepping)
-    assert ids_of(waiting) == ["fake-0"]
-
-
 def test_a_result_that_another_call_read_wakes_its_caller(new_group: NewGroup) -> None:
     """A collect of nothing reads every worker's reports; other calls still get their results."""
     group = new_group(2)
@@ -558,14 +461,3 @@ def test_calls_go_on_when_one_is_cancelled(new_group: NewGroup, whose: int) -> N
         group.finish(slot)
         assert slot == whose or ids_of(callers[slot]) == [f"fake-{slot}"]
     assert ids_of(collect(group)) == [f"fake-{whose}"]
-
-
-def test_calls_that_wait_learn_of_a_close(new_group: NewGroup) -> None:
-    group = new_group(4)
-    callers = [group.begin(group.steps.step(steps(slot), group.now)) for slot in range(4)]
-    assert group.begin(group.core.close(group.now)).done
-    group.wake()
-    group.turn()
-    for caller in callers:
-        with pytest.raises(GroupClosed):
-            caller.result()

@@ -111,8 +111,9 @@ async def test_a_group_that_is_not_open_refuses_all_operations(place: Any, momen
         group.get_observation_spaces,
         group.get_action_spaces,
     ):
-        with pytest.raises(error, match=said):
+        with pytest.raises(error, match=said) as caught:
             plain()
+        assert type(caught.value) is error
     await group.close()
     await group.close()
     with pytest.raises(GroupClosed, match="build a new one"):

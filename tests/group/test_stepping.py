@@ -167,6 +167,11 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
         (batch.respond(action=np.zeros((4, 3))), BadAction, r"\(4, 2\).*\(4, 3\)"),
         (batch.respond(action=good.astype(complex)), BadAction, "float64.*complex128"),
         (batch.respond(action=[[0, 1], [0, 1], [0, 1], [0]]), BadAction, "not an array"),
+        (batch.respond(action=np.full((4, 2), "x")), BadAction, "float64, found .* dtype <U1"),
+        (batch.respond(action=[None] * 4), BadAction, "found .* dtype object"),
+        (np.zeros((4, 2)), BadAction, r"not a \w+: .*batch.respond\(action=...\)"),
+        (None, BadAction, r"not a \w+: .*batch.respond\(action=...\)"),
+        ([PolicyResponse("probe-0", [0, 1])], BadAction, r"not a \w+: .*batch.respond"),
         (responses([*IDS, "probe-9"], 1, 2, 3, 4, 5), UnknownEnv, "'probe-9'.*probe-0"),
         (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' appears twice"),
         (batch.take([1, 1]).respond(action=good[:2]), EnvBusy, "'probe-1' appears twice"),
@@ -188,6 +193,19 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
             group.step_async(bad)
         with pytest.raises(error, match=said):
             await group.step(bad)
+    for count in (0, 3, 5):  # Refused where it is attached.
+        with pytest.raises(BadAction, match="action"):
+            batch.respond(action=np.zeros((count, 2)))
+    with pytest.raises(BadAction, match=r"response is for env 'probe-1'.*handle of 'probe-0'"):
+        await group["probe-0"].step(PolicyResponse("probe-1", [0, 1]))
+    for ids, error, said in (
+        ([*IDS, "probe-9"], UnknownEnv, "'probe-9'; its envs are probe-0, probe-1"),
+        ([*IDS, "probe-1"], EnvBusy, "'probe-1' appears twice"),
+    ):
+        with pytest.raises(error, match=said):
+            await group.reset(env_ids=ids)
+    with pytest.raises(UnknownEnv, match="probe-9"):
+        _ = group["probe-9"]
     batch, _ = await group.step(batch.respond(action=good))
     assert batch.observation[:, 2].tolist() == [1] * 4
 

@@ -439,14 +439,6 @@ def test_a_cause_of_death_is_described(started: Scene, exit_code: int, cause: st
     assert died.death.cause.startswith(cause)
 
 
-def test_workers_end_with_their_fork_server(started: Scene) -> None:
-    """The cause includes that of the fork server."""
-    started.host.on_fork_server_lost("it crashed")
-    (died,) = started.posted()
-    assert died.death.cause == "ended with its fork server: it crashed"
-    assert died.death.exit_code is None
-
-
 def test_a_replacement_has_a_new_link(started: Scene) -> None:
     """Reports and frames of the former worker are dropped, and counts are correct."""
     bell, old = started.bell, started.channel
@@ -480,30 +472,6 @@ def test_a_close_is_posted_once_with_the_errors_of_the_envs(started: Scene) -> N
     assert started.posted() == [Closed(0, errors)]
     started.host.on_exit(0, "")
     assert started.posted() == []
-
-
-def test_a_death_while_closing_is_an_error_of_the_close(started: Scene) -> None:
-    """The error names the env that was being closed."""
-    started.host.close()
-    started.rings.begin(entry(0, 1, 0), 5)
-    started.host.on_exit(-signal.SIGSEGV, "last words")
-    (closed,) = started.posted()
-    ((index, error),) = closed.errors
-    assert index == 1
-    assert error.text == "its worker was killed by SIGSEGV"
-    assert error.traceback == "last words"
-
-
-def test_a_worker_that_does_not_close_in_time_is_reported_as_killed(started: Scene) -> None:
-    """The errors explain the SIGKILL; no env was closed."""
-    started.host.close()
-    started.host.kill(dump=True)
-    assert started.fork_server.killed == [True]
-    started.host.on_exit(-signal.SIGKILL, "")
-    (closed,) = started.posted()
-    assert [index for index, _ in closed.errors] == list(range(started.host.num_envs))
-    text = "its worker did not close in time and was killed"
-    assert {error.text for _, error in closed.errors} == {text}
 
 
 def test_a_host_without_a_worker_closes_immediately(started: Scene) -> None:
