@@ -47,7 +47,7 @@ EXAMPLES = [
             reward=1.0,
             terminated=False,
             truncated=True,
-            info={"seconds": 0.5, "force": np.array([1, 2], np.float32)},
+            info={"force": np.array([1, 2], np.float32)},
         ),
         OBSERVATIONS,
         np.array([0.25, 1], np.float32),
