@@ -68,6 +68,7 @@ if TYPE_CHECKING:
 PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO = range(5)
 """Effects of an action: nothing special, end the episode, raise, send an info by frame."""
 
+REFUSAL = "no more processes"
 OBSERVATION_SPACE = spaces.Box(-np.inf, np.inf, (4,), np.float64)
 ACTION_SPACE = spaces.Discrete(5)
 LAYOUT = RowLayout(OBSERVATION_SPACE, ACTION_SPACE, (), ())
@@ -110,6 +111,7 @@ class Shared:
     bell_memory: memoryview
     rings: list[Ring | None]
     num_hosts: int
+    log: list[str]
 
 
 class FakeHost(Host):
@@ -119,9 +121,15 @@ class FakeHost(Host):
         waiting: index and execution of requests that are not executed yet, oldest first.
         extras: by slot, the extras of its last step.
         life: number of starts.
+        asked: entries of all requests that have reached it.
+        builds, closes: at once; otherwise not before it is killed.
+        awaits: its envs are awaitable.
+        close_errors: of its envs.
     """
 
     inline = False
+    builds = closes = True
+    awaits = built = closing = False
 
     def __init__(
         self, host_id: int, first_slot: int, num_envs: int, shared: Shared, *, reads_extras: bool
@@ -135,37 +143,52 @@ class FakeHost(Host):
         self.extras: dict[int, dict[str, Any]] = {}
         self.life = 0
         self.rung = False
+        self.asked: list[int] = []
+        self.close_errors: list[tuple[int, ErrorText]] = []
+        self.waiting: deque[tuple[int, Callable[[], None]]] = deque()
+
+    def note(self, what: str) -> None:
+        self.shared.log.append(f"{what} {self.host_id}")
 
     def start(self) -> None:
+        self.note("start")
         self.life += 1
-        self.waiting: deque[tuple[int, Callable[[], None]]] = deque()
+        self.waiting.clear()
         slots = range(self.first_slot, self.first_slot + self.num_envs)
         self.envs = [FakeEnv(slot, self.life) for slot in slots]
+        if self.builds:
+            self.build()
+
+    def build(self) -> None:
+        self.built = True
         self.post(
             Built(
                 self.host_id,
                 [
                     EnvStarted(
                         EnvMeta(
-                            env_id=f"fake-{slot}",
+                            env_id=f"fake-{env.identity}",
                             observation_space=OBSERVATION_SPACE,
                             action_space=ACTION_SPACE,
                         ),
                         LAYOUT,
                         reads_extras=self.reads_extras,
                         transforms_actions=False,
+                        is_awaitable=self.awaits,
                     )
-                    for slot in slots
+                    for env in self.envs
                 ],
             )
         )
 
     def attach(self, order: AttachOrder) -> None:
+        self.note("attach")
         (offset, rows), *_ = order.slabs
         memory = self.shared.arena.map(offset, LAYOUT.size(rows))
         self.slab = Slab(LAYOUT, memory, rows)
         self.row_of = [row for _, row in order.rows]
-        self.post(Attached(self.host_id))
+        if self.built:
+            self.post(Attached(self.host_id))
 
     # -- requests
 
@@ -173,6 +196,8 @@ class FakeHost(Host):
         return pickle.loads(pickle.dumps(arguments))
 
     def submit(self, entries: np.ndarray, arguments: Sequence[Any] | None = None) -> None:
+        assert len(entries)
+        self.asked += entries.tolist()
         for position, entry in enumerate(entries.tolist()):
             given = None if arguments is None else arguments[position]
             execute = {
@@ -274,11 +299,17 @@ class FakeHost(Host):
     # -- ends
 
     def close(self) -> None:
+        self.note("close")
+        self.closing = True
+        if self.closes:
+            self.end()
+
+    def end(self) -> None:
         self.waiting.clear()
-        self.post(Closed(self.host_id, []))
+        self.post(Closed(self.host_id, self.close_errors))
 
     def release(self) -> None:
-        pass
+        self.note("release")
 
 
 class FakeWorker(FakeHost):
@@ -287,23 +318,33 @@ class FakeWorker(FakeHost):
     Attributes:
         frames: unread replies.
         rung: its descriptor is readable.
-        killed: for each kill, True if it was with a dump.
         alive: it was started, and has not died since.
-        refusals: number of further starts that fail.
+        dies: a kill ends it.
+        refusals: number of further starts that fail; refused_later: by the fork server, not by
+            this process.
+        current: the entry that it executes, and since when (ns).
+        unread: completions that wait to be read, each as a call.
     """
 
     on_bell = True
-    alive = False
-    refusals = 0
+    alive = refused_later = False
+    dies = True
+    refusals: float = 0
     traffic = 0
+    current = (0, 0)
 
     def start(self) -> None:
+        self.built = False
         if self.refusals:
             self.refusals -= 1
-            raise OSError("no more processes")
+            if not self.refused_later:
+                raise OSError(REFUSAL)
+            refused = Death(f"could not be forked: {REFUSAL}", refused=True)
+            self.post(Died(self.host_id, refused))
+            return
         self.alive = True
         self.frames: list[Any] = []
-        self.killed: list[bool] = []
+        self.unread: list[Callable[[], object]] = []
         self.rung = False
         shared = self.shared
         memory = memoryview(bytearray(rings_size(self.num_envs)))
@@ -336,28 +377,41 @@ class FakeWorker(FakeHost):
             self.post(Reported(self.host_id, entries))
 
     def current_request(self) -> tuple[int, int]:
-        return 0, 0
+        return self.current
 
     def catch_up(self) -> bool:
-        found = bool(self.frames) or bool(self.shared.bell.with_news())
+        found = bool(self.frames or self.unread or self.shared.bell.with_news())
+        while self.unread:
+            self.unread.pop(0)()
         self.on_readable()
         self.poll()
         return found
 
     def kill(self, *, dump: bool) -> None:
-        self.killed.append(dump)
+        self.note("dump and kill" if dump else "kill")
+        if self.dies:
+            self.end()
 
     def destroy(self) -> None:
-        raise NotImplementedError("a kill is all it takes")
+        self.note("destroy")
 
-    def die(self, cause: str = "was killed by SIGKILL") -> None:
-        """End the worker; the host reads pending replies first."""
+    def end(self) -> None:
+        if self.closing:
+            super().end()
+        else:
+            self.die()
+
+    def die(self, *requests: int) -> None:
+        """End the worker, which may have executed `requests`; the host reads pending replies
+        first.
+        """
+        self.current = (0, 0)
         self.on_readable()
         self.poll()
         self.alive = False
         self.shared.rings[self.host_id] = None
         self.waiting.clear()
-        self.post(Died(self.host_id, Death(cause, -9)))
+        self.post(Died(self.host_id, Death("was killed by SIGKILL", -9, "last words", requests)))
 
     # -- the worker's side
 
@@ -408,6 +462,7 @@ class FakeGroup:
 
     Args:
         rows: envs of each host.
+        up: start it.
         inline: for each host, True if it is inline; reads_extras likewise.
     """
 
@@ -416,6 +471,9 @@ class FakeGroup:
         rows: Sequence[int],
         inline: Sequence[bool] = (),
         reads_extras: Sequence[bool] = (),
+        *,
+        up: bool = True,
+        awaits: bool = False,
         **fields: Any,
     ) -> None:
         self.now = 1000.0
@@ -458,22 +516,24 @@ class FakeGroup:
         supervisor = Supervisor(tables)
         poller = Poller(requests, bell, 0, clock=tables.clock)
         self.shared = shared = Shared(
-            completions, arena, bell, bell_memory, requests.rings, len(rows)
+            completions, arena, bell, bell_memory, requests.rings, len(rows), []
         )
         self.hosts: list[Any] = []
         for host_id, count in enumerate(rows):
             kind = FakeInline if inline and inline[host_id] else FakeWorker
             reads = bool(reads_extras[host_id]) if reads_extras else False
             host = kind(host_id, sum(rows[:host_id]), count, shared, reads_extras=reads)
+            host.awaits = awaits
             self.hosts.append(host)
             supervisor.add(host, self.config)
             poller.add(host)
         self.core = Core(tables, supervisor, poller, zero_copy=False)
         self.steps = self.core.steps
         self.running: list[Running] = []
-        opened = self.begin(self.core.start(self.now))
-        self.turn()
-        assert opened.done, "fake hosts start at once"
+        if up:
+            opened = self.begin(self.core.start(self.now))
+            self.turn()
+            assert opened.done, "fake hosts start at once"
 
     def begin(self, procedure: Procedure[Any]) -> Running:
         """Run a procedure until it waits; the driver's turns resume it."""

@@ -1,50 +1,26 @@
-"""The life of hosts, with stand-ins: no process, no driver, and a manual clock."""
+"""The life of hosts: no process, no driver, and a manual clock."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeGuard
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
+from group.fake_host import ACTION_SPACE, PLAIN, FakeGroup, Running
 
-from rlightning_aio._core.group.episodes.continuity import Continuity
-from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
-from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.host_record import HostLoss
-from rlightning_aio._core.group.state.request_states import COLLECTOR
-from rlightning_aio._core.group.state.requests import Requests
-from rlightning_aio._core.group.state.slab_layout import SlabLayout
-from rlightning_aio._core.group.state.stats import Stats
 from rlightning_aio._core.group.supervision import hang_detector
-from rlightning_aio._core.group.supervision.supervisor import Supervisor
-from rlightning_aio._core.group.tables import Tables
-from rlightning_aio._core.hosts.arena import Arena
-from rlightning_aio._core.hosts.base import Host
-from rlightning_aio._core.hosts.messages import (
-    Attached,
-    Built,
-    Closed,
-    Death,
-    Died,
-    EnvStarted,
-    ErrorText,
-    NotBuilt,
-)
-from rlightning_aio.config import EnvConfig
+from rlightning_aio._core.hosts.messages import Attached, Died, ErrorText, NotBuilt
+from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed
-from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import RowLayout
-from rlightning_aio.types import EnvMeta
+from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-    from rlightning_aio._core.group.drivers.wait import Procedure
-
-KILLED = Death("was killed by SIGKILL", -9)
 
 
 def is_replaced(loss: HostLoss | None) -> TypeGuard[HostLoss]:
@@ -55,225 +31,47 @@ def is_given_up(loss: HostLoss | None) -> TypeGuard[HostLoss]:
     return loss is not None and not loss.replaced
 
 
-@dataclass
-class StandIn(Host):
-    """See `hosts.base.Killable`. It does what the test says, and records its orders.
+class Fleet(FakeGroup):
+    """A group whose clock and driver are the test's, and which notes the outcome of each death."""
 
-    Attributes:
-        post: takes its completions; log: its orders.
-        builds, closes: at once; otherwise not before it is killed.
-        dies: a kill ends it.
-        awaits: its envs are awaitable.
-        refusal: the error of a start; refused_later: by the fork server, not by this process.
-        asked: its entries.
-        close_errors: of its envs.
-        current: the entry that it executes, and since when (ns).
-        traffic: see `hosts.base.Killable.traffic`.
-        unread: completions that wait to be read, each as a call.
-    """
-
-    host_id: int
-    first_slot: int
-    num_envs: int
-    post: Callable[[Any], None]
-    log: list[str]
-    builds: bool = True
-    closes: bool = True
-    dies: bool = True
-    awaits: bool = False
-    refusal: OSError | None = None
-    refused_later: bool = False
-    close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
-    current: tuple[int, int] = (0, 0)
-    traffic: int = 0
-    unread: list[Callable[[], object]] = field(default_factory=list)
-    closing: bool = False
-    built: bool = False
-    asked: list[int] = field(default_factory=list[int])
-
-    def start(self) -> None:
-        self.built = False
-        if self.refusal is None:
-            self.log.append(f"start {self.host_id}")
-            if self.builds:
-                self.build()
-        elif self.refused_later:
-            cause = f"could not be forked: {self.refusal}"
-            self.post(Died(self.host_id, Death(cause, refused=True)))
-        else:
-            raise self.refusal
-
-    def build(self) -> None:
-        self.built = True
-        metas = [
-            EnvMeta(
-                env_id=f"{self.host_id}.{k}",
-                observation_space=OBSERVATION_SPACE,
-                action_space=ACTION_SPACE,
-            )
-            for k in range(self.num_envs)
-        ]
-        started = [
-            EnvStarted(
-                meta,
-                LAYOUT,
-                reads_extras=False,
-                transforms_actions=False,
-                is_awaitable=self.awaits,
-            )
-            for meta in metas
-        ]
-        self.post(Built(self.host_id, started))
-
-    def attach(self, order: Any) -> None:
-        self.log.append(f"attach {self.host_id}")
-        assert len(order.rows) == self.num_envs
-        if self.built:
-            self.post(Attached(self.host_id))
-
-    def submit(self, entries: np.ndarray, arguments: Any = None) -> None:
-        assert len(arguments or entries) == len(entries) > 0
-        self.asked += entries.tolist()
-
-    def current_request(self) -> tuple[int, int]:
-        return self.current
-
-    def catch_up(self) -> bool:
-        unread, self.unread = self.unread, []
-        for post in unread:
-            post()
-        return bool(unread)
-
-    def kill(self, *, dump: bool) -> None:
-        self.log.append(f"dump and kill {self.host_id}" if dump else f"kill {self.host_id}")
-        if self.dies:
-            self.end()
-
-    def destroy(self) -> None:
-        self.log.append(f"destroy {self.host_id}")
-
-    def end(self) -> None:
-        self.current = (0, 0)
-        ended = Closed(self.host_id, self.close_errors) if self.closing else None
-        self.post(ended or Died(self.host_id, KILLED))
-
-    def close(self) -> None:
-        self.log.append(f"close {self.host_id}")
-        self.closing = True
-        if self.closes:
-            self.end()
-
-    def release(self) -> None:
-        self.log.append(f"release {self.host_id}")
-
-
-class Fleet:
-    """A supervisor over stand-ins, with a clock and the core's part of the work.
-
-    Args:
-        counts: envs of each host.
-        awaits: the envs are awaitable.
-
-    Attributes:
-        losses: the outcome of each death.
-    """
-
-    def __init__(
-        self, counts: tuple[int, ...] = (1, 1), *, awaits: bool = False, **fields: Any
-    ) -> None:
-        self.now = 1000.0
-        self.log: list[str] = []
+    def __init__(self, counts: tuple[int, ...] = (1, 1), **fields: Any) -> None:
+        super().__init__(counts, up=False, **{"start_timeout": 10.0, **fields})
+        self.log = self.shared.log
+        self.requests, self.lifetime = self.core.requests, self.core.lifetime
+        self.supervisor = self.core.supervisor
         self.losses: list[HostLoss | None] = []
-        self.running: list[Running] = []
-        config = EnvConfig(
-            **{"name": "e", "backend": "gymnasium", "task": "x", "start_timeout": 10.0, **fields}
-        )
-        size = sum(counts)
-        envs = EnvTable([config] * size, [f"e-{slot}" for slot in range(size)])
-        conditions = Conditions()
-        self.requests = Requests(np.repeat(np.arange(len(counts)), counts), len(counts))
-        self.lifetime = Lifetime(conditions)
-        tables = Tables(
-            envs,
-            self.requests,
-            SlabLayout(size),
-            Continuity(envs),
-            conditions,
-            Observed(),
-            self.lifetime,
-            Arena(),
-            Stats(envs, self.requests),
-            clock=lambda: self.now,
-            driver=Mock(),
-        )
-        self.completions = tables.completions
-        self.supervisor = Supervisor(tables)
-        self.hosts: list[StandIn] = []
-        for host_id, count in enumerate(counts):
-            host = StandIn(host_id, sum(counts[:host_id]), count, self.completions.append, self.log)
-            host.awaits = awaits
-            self.hosts.append(host)
-            self.supervisor.add(host, config)
+        handle_exit = self.supervisor.handle_exit
 
-    def begin(self, procedure: Procedure[Any]) -> Running:
-        running = Running(procedure)
-        self.running.append(running)
-        running.resume(None)
-        self.turn()
-        return running
+        def noted(exited: Died) -> HostLoss | None:
+            self.losses.append(handle_exit(exited))
+            return self.losses[-1]
 
-    def turn(self) -> None:
-        """Act as the driver until nothing is posted and no time has come."""
-        for _ in range(50):
+        self.supervisor.handle_exit = noted
+        self.supervisor.overdue.begin = lambda now: None  # Its times would come between others.
+
+    def turn(self, *, newest_first: bool = False) -> None:
+        while True:
             self.drain()
-            due = [running for running in self.running if running.is_due(self.now)]
-            if not due:
+            super().turn(newest_first=newest_first)
+            if not self.shared.completions:
                 return
-            for running in due:
-                running.resume(self.now)
-        raise AssertionError("the supervisor turns in circles instead of waiting")
 
     def drain(self) -> None:
-        """Act as the core: start a replacement, and send it what the dead worker owed."""
-        while self.completions:
-            completion = self.completions.popleft()
-            for running in self.running:
-                running.woken = True
-            if not isinstance(completion, Died):
-                self.supervisor.handle(completion)
-                continue
-            loss = self.supervisor.handle_exit(completion)
-            self.losses.append(loss)
-            if loss is not None:
-                self.carry_out(loss)
-
-    def carry_out(self, loss: HostLoss) -> None:
-        self.requests.in_flight[loss.host_id] = 0
-        if not loss.replaced:
-            self.requests.fail(loss.owed, COLLECTOR, loss.error(loss.owed))
-            return
-        self.supervisor.replace(loss.host_id)
-        entries = self.requests.ask_again(loss.host_id, loss.owed)
-        if len(entries):
-            self.supervisor.submit(loss.host_id, entries, None)
+        self.core.apply_completions()
+        self.wake()
 
     def start(self) -> Running:
-        return self.begin(self.supervisor.start(self.now))
-
-    def pass_time(self, seconds: float) -> None:
-        self.now += seconds
-        self.turn()
+        return self.begin(self.core.start(self.now))
 
     def ask(self, *slots: int) -> list[int]:
         """Send steps; return their entries."""
-        asked = np.array(slots)
-        entries = self.requests.issue(asked, Operation.STEP, COLLECTOR, self.now)
-        self._hand_over(asked, entries)
-        return entries.tolist()
+        ids = [f"fake-{slot}" for slot in slots]
+        batch = BatchedData(ids, [PolicyResponse(env_id, PLAIN) for env_id in ids])
+        self.steps.step_async(batch, self.now)
+        return self.entries(*slots)
 
-    def _hand_over(self, slots: np.ndarray, entries: np.ndarray) -> None:
-        for host_id, part in self.requests.by_host(slots):
-            self.supervisor.submit(host_id, entries[part], None)
+    def entries(self, *slots: int) -> list[int]:
+        return self.requests.numbering.entry[list(slots)].tolist()
 
     def check(self) -> None:
         self.supervisor.check(self.now)
@@ -289,18 +87,16 @@ class Fleet:
 
     def die(self, host_id: int, *requests: int) -> HostLoss | None:
         """Let a worker die while it executes `requests`; return the outcome."""
-        self.completions.append(Died(host_id, Death(KILLED.cause, -9, "last words", requests)))
+        self.hosts[host_id].die(*requests)
         self.drain()
         return self.losses[-1]
 
     def reply(self, slot: int) -> None:
-        """Complete a step and collect it."""
-        host_id = self.requests.hosts.item(slot)
-        assert self.requests.complete_one(host_id, self.requests.numbering.entry.item(slot)) == slot
-        self.requests.hand_out(self.requests.collector.pop_ready(1))
-        self.supervisor.note_step(slot)
+        """Complete a request and collect it."""
+        self.finish(slot)
+        self.begin(self.steps.collect(self.now, CollectRules())).result()
 
-    def close(self) -> Running:
+    def end(self) -> Running:
         return self.begin(self.supervisor.shutdown.close(self.now))
 
 
@@ -317,11 +113,13 @@ def fleet() -> Iterator[Callable[..., Fleet]]:
         return made[-1]
 
     yield make
-    for fleet in made:
-        closing = fleet.close()
-        fleet.pass_time(5)
-        fleet.pass_time(5)
+    while made:
+        ours = made.pop()
+        closing = ours.end()
+        ours.pass_time(5)
+        ours.pass_time(5)
         assert closing.done
+        del ours
 
 
 # -- start
@@ -339,7 +137,7 @@ def test_all_are_started_before_any_is_waited_for(fleet: Callable[..., Fleet]) -
     ours.turn()
     assert ours.log[3:] == ["attach 0", "attach 1", "attach 2"]
     metas = start.result()
-    assert [meta.env_id for meta in metas] == ["0.0", "0.1", "1.0", "2.0"]
+    assert [meta.env_id for meta in metas] == ["fake-0", "fake-1", "fake-2", "fake-3"]
     assert ours.start().result() is metas
     assert len(ours.log) == 6
 
@@ -364,15 +162,17 @@ def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], d
         assert ours.log[5:] == ["kill 1"]
         ours.pass_time(0.3)
     assert ours.log[-2:] == ["release 0", "release 1"]
-    with pytest.raises(StartFailed, match=r"env 'e-1' .* did not start within 10.0 s"):
+    with pytest.raises(StartFailed, match=r"env 'fake-1' .* did not start within 10.0 s"):
         start.result()
 
 
 def test_a_host_that_cannot_be_started_fails_the_start(fleet: Callable[..., Fleet]) -> None:
     """Hosts before it are closed, hosts after it are never started."""
     ours = fleet((1, 1, 1), up=False)
-    ours.hosts[1].refusal = OSError("no such program")
-    with pytest.raises(StartFailed, match="entry 'e': no such program; check its `interpreter`"):
+    ours.hosts[1].refusals = 1
+    with pytest.raises(
+        StartFailed, match="entry 'fake': no more processes; check its `interpreter`"
+    ):
         ours.start().result()
     assert "start 2" not in ours.log
     assert "close 2" not in ours.log
@@ -390,11 +190,13 @@ def test_an_env_that_cannot_be_built_fails_the_start(
     ours = fleet((1, 2), up=False)
     ours.hosts[1].builds = False
     start = ours.start()
-    ours.completions.append(NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n")))
+    ours.shared.completions.append(
+        NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n"))
+    )
     ours.turn()
     with pytest.raises(kind, match="no licence") as caught:
         start.result()
-    assert kind is ConfigError or "env 'e-2'" in str(caught.value)
+    assert kind is ConfigError or "env 'fake-2'" in str(caught.value)
     assert "close 0" in ours.log
 
 
@@ -468,7 +270,7 @@ def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fl
     assert ours.log == []
     loss = ended_as_hung(ours)
     assert loss.owed.tolist() == [1]
-    assert loss.error(loss.owed).env_id == "e-1"
+    assert loss.error(loss.owed).env_id == "fake-1"
 
 
 def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
@@ -486,7 +288,7 @@ def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
         ours.check()
     assert ours.log == []
     loss = ended_as_hung(ours)
-    assert loss.error(loss.owed).env_id == "e-1"
+    assert loss.error(loss.owed).env_id == "fake-1"
 
 
 def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet]) -> None:
@@ -500,7 +302,7 @@ def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet
     ours.check()
     (loss,) = ours.losses
     assert is_replaced(loss)
-    assert loss.error(loss.owed).env_id == "e-1"
+    assert loss.error(loss.owed).env_id == "fake-1"
 
 
 def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -> None:
@@ -514,12 +316,12 @@ def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -
         ours.check()
     assert ours.log == []
     loss = ended_as_hung(ours)
-    assert loss.why[3:] == (None, ("e-0", "e-2"))
+    assert loss.why[3:] == (None, ("fake-0", "fake-2"))
     assert loss.death.cause == "hung and was killed"
     error = loss.error(loss.owed)
     assert isinstance(error, EnvHung)
-    assert (error.env_id, error.suspects) == ("e-0", ("e-0", "e-2"))
-    assert "no env's code was running; envs that owed a reply: e-0, e-2" in str(error)
+    assert (error.env_id, error.suspects) == ("fake-0", ("fake-0", "fake-2"))
+    assert "no env's code was running; envs that owed a reply: fake-0, fake-2" in str(error)
 
 
 def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Fleet]) -> None:
@@ -533,7 +335,7 @@ def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Flee
     ours.check()
     assert ours.log == []
     loss = ended_as_hung(ours)
-    assert loss.why[3:] == ("e-2", ())
+    assert loss.why[3:] == ("fake-2", ())
     assert loss.death.cause == "hung in a step and was killed"
 
 
@@ -546,8 +348,8 @@ def test_a_late_trainer_reads_pending_replies_before_it_kills(
     ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
     ours.check()
     ours.now += 60
-    ours.hosts[0].unread.append(lambda: ours.reply(0))
-    ours.hosts[1].unread.append(lambda: ours.reply(1))
+    for host in ours.hosts:
+        host.finish()
     ours.check()
     assert ours.requests.in_flight == [0, 0]
     assert ours.log == []
@@ -575,11 +377,9 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
     for ours in (free, limited):
         (entry,) = ours.ask(0)
         if ours is limited:
-            assert ours.requests.end(0, entry) == 0
-            ours.requests.withdraw(0)
-            ours.requests.issue(np.array([0]), Operation.RESET, COLLECTOR, ours.now)
-            assert list(ours.requests.by_host(np.array([0])))
-            entry = ours.requests.numbering.entry.item(0)
+            ours.reply(0)
+            ours.begin(ours.core.reset(ours.now, None, None, ["fake-0"]))
+            (entry,) = ours.entries(0)
         ours.hosts[0].current = (entry, int(ours.now * 1e9))
         ours.now += 1e6
         ours.check()
@@ -594,7 +394,7 @@ def test_a_worker_of_one_env_has_no_suspects(fleet: Callable[..., Fleet]) -> Non
     ours = fleet((1, 2), awaits=True)
     losses = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
     found = [v.why[3:] for v in losses if v]
-    assert found == [("e-0", ()), (None, ())]
+    assert found == [("fake-0", ()), (None, ())]
 
 
 def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None:
@@ -606,9 +406,7 @@ def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None
         if ours.supervisor.next_check() is not None:
             ours.wait()
         for slot in (0, 1):  # Resets, which prove nothing.
-            entry = ours.requests.numbering.entry.item(slot)
-            assert ours.requests.complete_one(0, entry) == slot
-            ours.requests.hand_out(ours.requests.collector.pop_ready(1))
+            ours.reply(slot)
     ours.ask(0)
     ours.reply(0)
     ours.ask(0)
@@ -626,7 +424,7 @@ def test_a_shortage_of_half_a_minute_costs_no_restarts(
 ) -> None:
     """Attempts become rarer, other hosts continue, and only then it counts as a death."""
     ours = fleet(max_restarts=2)
-    ours.hosts[0].refusal, ours.hosts[0].refused_later = OSError("too many open files"), later
+    ours.hosts[0].refusals, ours.hosts[0].refused_later = math.inf, later
     ours.ask(0, 1)
     ours.die(0)
     assert is_replaced(ours.losses[0])
@@ -646,8 +444,8 @@ def test_a_shortage_of_half_a_minute_costs_no_restarts(
     assert is_given_up(loss)
     assert loss.owed.tolist() == [0]
     error = str(loss.error(loss.owed))
-    why = "it could not be forked: too many open" if later else "too many open"
-    assert f"could not be replaced: can't start a worker for entry 'e': {why}" in error
+    why = "it could not be forked: no more processes" if later else "no more processes"
+    assert f"could not be replaced: can't start a worker for entry 'fake': {why}" in error
     assert "after 2 restarts in a row" in error
     assert ours.requests.in_flight == [0, 1]
     assert ours.supervisor.next_check() is None
@@ -659,13 +457,15 @@ def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet], late
     ours = fleet(max_restarts=1)
     ours.hosts[0].refused_later = later
     for _ in range(3):
-        ours.hosts[0].refusal = OSError("too many open files")
+        ours.hosts[0].refusals = math.inf
         (entry,) = ours.ask(0)
         ours.die(0, entry)
         while ours.now < ours.supervisor.records[0].refused_since + 20:
             ours.wait()
-        ours.hosts[0].refusal = None
+        ours.hosts[0].refusals = 0
         ours.wait()
+        ours.reply(0)
+        ours.ask(0)
         ours.reply(0)
     assert ours.supervisor.records[0].restarts == 3
 
@@ -690,12 +490,12 @@ def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     """Failed attempts don't affect them; requests that the dead worker owed are sent again."""
     ours = fleet((2, 1), max_restarts=9, step_timeout=1.0)
     (entry,) = ours.ask(0)
-    ours.hosts[0].refusal = OSError("no more processes")
+    ours.hosts[0].refusals = math.inf
     ours.die(0, entry)
     (later,) = ours.ask(1)
-    asked = [ours.requests.numbering.entry.item(0), later]
+    asked = [*ours.entries(0), later]
     ours.wait()
-    ours.hosts[0].refusal, ours.hosts[0].builds = None, False
+    ours.hosts[0].refusals, ours.hosts[0].builds = 0, False
     ours.wait()
     assert ours.log == ["start 0", "attach 0"]
     ours.now += 5
@@ -723,7 +523,7 @@ def test_a_replacement_gets_no_requests_that_were_aborted(fleet: Callable[..., F
     aborted = ours.supervisor.detector.abort(np.array([0]), ours.now)
     assert [host_id for host_id, _ in aborted] == [0]
     host.build()
-    ours.completions.append(Attached(0))
+    ours.shared.completions.append(Attached(0))
     ours.drain()
     assert host.asked == asked
 
@@ -765,7 +565,7 @@ def test_a_replacement_is_not_late_if_the_trainer_is(
     host.builds = False
     ours.ask(0)
     ours.die(0)
-    host.unread += [host.build, lambda: ours.completions.append(Attached(0))]
+    host.unread += [host.build, lambda: ours.shared.completions.append(Attached(0))]
     ours.now += 60
     ours.check()
     assert ours.log == ["start 0", "attach 0"]
@@ -808,7 +608,7 @@ def test_a_first_start_has_its_time_from_when_it_was_ordered(
     host.built = False
     ours.pass_time(0)
     ours.pass_time(9)
-    ours.completions.append(Attached(0))
+    ours.shared.completions.append(Attached(0))
     ours.turn()
     starting.result()
     assert ours.log == ["start 0", "attach 0"]
@@ -833,7 +633,7 @@ def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
     stuck = ErrorText("ValueError", "stuck", "")
     ours.hosts[0].close_errors = [(1, stuck)]
     ours.hosts[1].closes, ours.hosts[1].close_errors = False, [(0, stuck)]
-    closing = ours.close()
+    closing = ours.end()
     assert ours.log == ["close 0", "close 1"]
     with pytest.raises(GroupClosed):
         ours.lifetime.check_open()
@@ -842,8 +642,8 @@ def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
     ours.pass_time(0.1)
     assert closing.done
     assert ours.log[2:] == ["kill 1", "release 0", "release 1"]
-    assert ours.supervisor.close_errors == [("e-1", stuck), ("e-2", stuck)]
-    assert ours.close().done
+    assert ours.supervisor.close_errors == [("fake-1", stuck), ("fake-2", stuck)]
+    assert ours.end().done
     assert len(ours.log) == 5
 
 
@@ -851,7 +651,7 @@ def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
     """Not even with a host that can't be killed."""
     ours = fleet()
     ours.hosts[0].closes = ours.hosts[0].dies = False
-    closing = ours.close()
+    closing = ours.end()
     ours.pass_time(1.5)
     ours.pass_time(0.2)
     assert not closing.done
@@ -865,7 +665,7 @@ def test_a_death_while_closing_closes_the_host(fleet: Callable[..., Fleet]) -> N
     ours = fleet((1, 1), max_restarts=0)
     assert is_given_up(ours.die(1))
     ours.hosts[0].closes = False
-    closing = ours.close()
+    closing = ours.end()
     assert ours.die(0) is None
     ours.turn()
     assert closing.done
@@ -877,9 +677,9 @@ def test_a_death_while_closing_closes_the_host(fleet: Callable[..., Fleet]) -> N
 def test_closing_does_not_wait_for_a_restart(fleet: Callable[..., Fleet]) -> None:
     """A host that is down has nothing to close, and is not started again."""
     ours = fleet(max_restarts=9)
-    ours.hosts[0].refusal = OSError("no more processes")
+    ours.hosts[0].refusals = math.inf
     ours.die(0)
-    closing = ours.close()
+    closing = ours.end()
     assert closing.done
     assert ours.log == ["close 1", "release 0", "release 1"]
     ours.now += 50
@@ -898,8 +698,7 @@ def test_a_worker_that_crashes_again_and_again_does_not_fill_the_log(
         assert is_replaced(ours.die(0, entry))
         while ours.supervisor.next_check() is not None:
             ours.wait()
-        assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(0)) == 0
-        ours.requests.hand_out(ours.requests.collector.pop_ready(1))
+        ours.reply(0)
         ours.now += 10 - ours.now % 10
         ours.check()
     lines = [record.getMessage() for record in caplog.records]
@@ -909,4 +708,4 @@ def test_a_worker_that_crashes_again_and_again_does_not_fill_the_log(
     ours.supervisor.crash_log.flush(ours.now, everything=True)
     counted += [int(record.getMessage().split()[2]) for record in caplog.records[len(lines) :]]
     assert sum(counted) == 27
-    assert all("while executing e-0" in line for line in lines[3:])
+    assert all("while executing fake-0" in line for line in lines[3:])
