@@ -153,29 +153,6 @@ def test_a_hang_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) -> 
     ours.close()
 
 
-def test_a_loop_stores_only_steps_that_were_taken() -> None:
-    """With CleanRL's lines."""
-    envs = mortals(AutoresetMode.SAME_STEP, dies=True)
-    rng, stored = np.random.default_rng(3), []
-    obs, _ = envs.reset()
-    for _ in range(12):
-        actions = rng.choice([0, 2, 3, 4, 5, 6], 3, p=[0.1, 0.1, 0.1, 0.3, 0.2, 0.2])
-        next_obs, rewards, terminations, truncations, infos = envs.step(actions)
-        real_next_obs = next_obs.copy()
-        for idx, trunc in enumerate(truncations | terminations):
-            if trunc:
-                real_next_obs[idx] = infos["final_obs"][idx]
-        stored += zip(obs, real_next_obs, actions, rewards, terminations, strict=True)
-        obs = next_obs
-    envs.close()
-    for before, after, action, reward, terminated in stored:
-        env = Mortal(int(before[0]), dies=False)
-        env.count, env.sum = int(before[1]), int(before[2])
-        expected = env.step(action)
-        np.testing.assert_array_equal(after, expected[0])
-        assert (reward, terminated) == (expected[1], expected[2])
-
-
 @pytest.mark.parametrize("mode", MODES)
 def test_a_death_in_a_step_truncates_all_envs_of_its_worker(
     mode: AutoresetMode, twins: Any
@@ -321,54 +298,6 @@ def test_a_death_raises_if_configured() -> None:
         envs.step_wait()
     with pytest.raises(WorkerDied, match="env 'env-0'"):
         envs.reset()
-    envs.close()
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_resumed_episodes_continue_as_new_ones(mode: AutoresetMode) -> None:
-    """Lost steps are repeated with the same results."""
-    makers = [lambda: gym.make(TASK)] * 2
-    entry = {"on_worker_death": "resume", "snapshot_every": 1, "envs_per_process": 1}
-    envs = VectorEnv(makers, autoreset_mode=mode, **entry)
-    actions = ACTIONS[:2]
-    envs.reset(seed=[7, 7])
-    before = envs.step(actions)[0]
-    killed(envs.group, lambda: envs.step_async(actions))
-    observations, rewards, _, truncated, infos = envs.step_wait()
-    assert truncated.tolist() == [True, False]
-    assert rewards[0] == infos["worker_resumed"][0] == 0
-    if mode == AutoresetMode.NEXT_STEP:
-        np.testing.assert_array_equal(observations[0], before[0])
-        again, rewards, _, _, infos = envs.step(actions)
-        assert (rewards == 0).tolist() == [True, False]
-        assert "worker_resumed" not in infos
-        np.testing.assert_array_equal(again[0], before[0])
-    np.testing.assert_array_equal(envs.step(actions)[0][0], observations[1])
-    envs.close()
-
-
-@pytest.mark.simulators
-def test_stable_baselines3_gets_deaths_in_its_own_form() -> None:
-    """Episodes are done and truncated, with their last observation."""
-    pytest.importorskip("stable_baselines3")
-    from rlightning_aio.sb3 import make_vec_env
-
-    entry = {"placement": "process", "envs_per_process": 2}
-    envs = make_vec_env(TASK, 4, vec_env_kwargs=entry)
-    envs.seed(7)
-    before = envs.reset()
-    killed(envs.group, lambda: envs.step_async(ACTIONS))
-    observations, rewards, done, infos = envs.step_wait()
-    assert done.tolist() == [info["TimeLimit.truncated"] for info in infos] == LOST
-    assert ["worker_restarted" in info for info in infos] == LOST
-    for info, shown in zip(infos[:2], before, strict=False):
-        np.testing.assert_array_equal(info["terminal_observation"], shown)
-    assert rewards[:2].tolist() == [0, 0]
-    assert not (observations[:2] == before[:2]).all(axis=1).any()
-    _, rewards, done, infos = envs.step(ACTIONS)
-    assert not done.any()
-    assert (rewards != 0).all()
-    assert not any("worker_restarted" in info for info in infos)
     envs.close()
 
 
