@@ -13,15 +13,13 @@ from collecting.scripted import Script, Tickets, scripted_group
 from group import sample_envs
 from gymnasium.vector import AutoresetMode
 from kit.counting import ClientThread, CountingEnv
-from kit.faulty import CODES
 from kit.scripted import Scripted
-from kit.tokens import entry
 from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
-from rlightning_aio.errors import BadAction, EnvRaised
+from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
@@ -335,39 +333,6 @@ def test_the_step_limit_truncates() -> None:
     assert (rollout.end_observation[1] != rollout.observation[4]).any()
 
 
-@pytest.mark.one_driver_for_each_place
-@pytest.mark.parametrize("options", [{"min_results": 2}, {"wait_all": True}])
-async def test_a_lost_worker_cuts_a_chain(options: Any) -> None:
-    """The step in flight is in no rollout; the transition before it ends a chain."""
-    killed: list[int] = []
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        actions = np.zeros((len(batch), 2))
-        doomed = (batch.observation[:, 0] == 0) & (batch.observation[:, 3] == 2)
-        if doomed.any() and not killed:
-            killed.append(1)
-            actions[doomed, 0] = CODES["sigkill"]
-        return {"action": actions}
-
-    async with rl.build_env_group(entry(2, envs_per_process=1)) as group:
-        with group.auto_reset(100):
-            rollout = await Collector(group, policy, num_transitions=12, **options).collect()
-    if rollout.shape == (6, 2):
-        own = rollout.observation[:, 0]
-        steps = own[:, 3]
-        assert len(steps) == 6
-    else:
-        own = rollout.observation[rollout.index == 0]
-        steps = own[:, 3]
-    assert killed
-    assert steps[:4].tolist() == [0, 1, 0, 1]
-    lives = own[:, 1].tolist()
-    assert lives[0] == lives[1] != lives[2] == lives[3]
-    assert not rollout.done.any()
-    assert len(rollout.ends) == 3
-    assert rollout.end_observation[2, [0, 1, 3]].tolist() == [0, lives[0], 2]
-
-
 def test_clients_join_while_it_collects() -> None:
     """Their first result is a reset; clients can't be in blocks."""
 
@@ -495,26 +460,6 @@ def test_a_bad_answer_of_a_policy_raises_and_the_policy_is_called_again(
         with pytest.raises(error, match=named):
             collector.collect()
         assert collector.collect().index.tolist() == [0, 0, 1, 1]
-
-
-def test_an_env_that_raised_takes_part_again_after_a_reset() -> None:
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        steps = batch.observation[:, 1:3]
-        raising = (steps == [1, 2]).all(axis=1) & (batch.index == 0)
-        return {"action": np.stack([3.0 * raising, batch.index], axis=1)}
-
-    probe = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
-    for options in ({"min_results": 2}, {"wait_all": True}):
-        group = sync.build_env_group({**probe, "placement": "inline"})
-        with group, group.auto_reset(99):
-            collector = Collector(group, policy, num_transitions=8, **options)
-            with pytest.raises(EnvRaised) as raised:
-                collector.collect()
-            group.reset_async(env_ids=[raised.value.env_id])
-            rollout = collector.collect()
-            own = rollout.index == 0
-            assert rollout.observation[own][:4, 1:3].tolist() == [[1, 0], [1, 1], [2, 0], [2, 1]]
-            assert rollout.end_observation[-1][1:3].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize("sent", [1, 2])
