@@ -671,8 +671,8 @@ class Model:
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
-        # It may have raised before.
-        raised = env.entry.on_error == "restart" and bool(self._raising(env, request))
+        raised = self._may_be_rebuilt(env, request)  # Before that.
+        env.errors = env.errors[0], self._most_errors(env)
         found = [
             state
             for one in again
@@ -765,11 +765,11 @@ class Model:
             after = [state.copy() for state in (env.state, *env.loose)]
             for state in after:  # It may have been done with it.
                 state.play(request)
+            if self._may_be_rebuilt(env, request):  # And interrupted in the reset that follows.
+                env.errors = env.errors[0], self._most_errors(env)
+                after += [env.fresh(), env.fresh()]
+                after[-1].play(Request("reset"))
             env.loose += after
-            if env.entry.on_error == "restart" and self._raising(env, request):
-                # It may have raised, and was interrupted in the reset after it was rebuilt.
-                env.loose += [env.fresh(), env.fresh()]
-                env.loose[-1].play(Request("reset"))
             env.dirty = True
             return
         if request.resets and env.since_save:
@@ -812,10 +812,15 @@ class Model:
             env.seen = min(env.seen + 1, env.deaths)
         self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
 
+    def _may_be_rebuilt(self, env: Env, request: Request) -> bool:
+        """Whether it may have raised in a request, which is a restart; Ctrl-C is none."""
+        acts = self._raising(env, request) if env.entry.on_error == "restart" else []
+        return any(effect != "ctrl-c" for effect, _ in acts)
+
     def _most_errors(self, env: Env) -> int:
-        """How often in a row an env may have raised, also in its request before its worker died."""
-        request = env.request if env.entry.on_error == "restart" else None
-        if request is None or not self._raising(env, request):
+        """How often in a row an env may have raised, also in a request that ended otherwise."""
+        request = env.request
+        if request is None or not self._may_be_rebuilt(env, request):
             return env.errors[1]
         is_retried = env.entry.form == "awaitable" and request.resets
         return env.errors[1] + (env.entry.max_restarts if is_retried else 1)
