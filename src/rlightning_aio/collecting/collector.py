@@ -272,8 +272,12 @@ class Collector(Generic[G, R]):
         try:
             self._received, _ = yield self._receive
         except WorkerDied as error:
-            self._note_raised(error)
-            raise
+            if not self._was_raised_before(error):
+                raise
+            self._expecting = bool(self._group.pending)
+            if self._block or not self._has_others():
+                raise
+            return
         self._expecting = False
 
     def _start(self) -> Procedure[None]:
@@ -429,10 +433,14 @@ class Collector(Generic[G, R]):
         gone = {env_id for worker in self._group.get_workers() for env_id in worker["given_up"]}
         left = [env_id for env_id in idle if env_id not in gone]
         self._newest.check_resettable(left)
-        others = self._expecting or self._unanswered or any(map(_is_server, self._group.metas))
-        if left or not others:
+        if left or not self._has_others():
             self._group.reset_async(env_ids=left or idle)
             self._expecting = True
+
+    def _has_others(self) -> bool:
+        """Return True if results are there or may come."""
+        has_results = bool(self._expecting or self._unanswered)
+        return has_results or any(map(_is_server, self._group.metas))
 
     # -- blocks -------------------------------------------------------------------
 
@@ -508,21 +516,22 @@ class Collector(Generic[G, R]):
         except WorkerDied as error:
             if self._block:  # It needs all envs.
                 raise
-            was_raised = self._was_raised.issuperset(error.env_ids)
-            self._note_raised(error)
+            was_raised = self._was_raised_before(error)
             self._leave_out(part, error.env_ids)
-            if not (was_raised and (self._unanswered or self._expecting)):
+            if not (was_raised and self._has_others()):
                 raise
             return
         part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
         del self._unanswered[0]
 
-    def _note_raised(self, error: WorkerDied) -> None:
-        """Note that an error of a worker is raised: some of its envs may have replied before."""
+    def _was_raised_before(self, error: WorkerDied) -> bool:
+        """Note a death, for all envs of the worker: some may reply, or fail, at other times."""
+        before = self._was_raised.issuperset(error.env_ids)
         for worker in self._group.get_workers():
             if not set(error.env_ids).isdisjoint(worker["given_up"]):
                 self._was_raised.update(worker["given_up"])
+        return before
 
     def _leave_out(self, part: Part, given_up: Sequence[str]) -> None:
         """Go on without envs that were given up."""
