@@ -277,8 +277,10 @@ class Play(Session):
         """Note that none of these requests was sent."""
         pending = self.group.pending
         for env_id in requests:
-            require(env_id not in pending, "refused, and sent nevertheless", env_id)
-            self.model.withdraw(self.model.envs[env_id])
+            env = self.model.envs[env_id]
+            is_back = env.client is not None and env.client.may_be_back  # Without a request.
+            require(env_id not in pending or is_back, "refused, and sent nevertheless", env_id)
+            self.model.withdraw(env)
 
     def refuse_busy(self, requests: dict[str, Request]) -> None:
         """A call that was given up may still run in an env."""
