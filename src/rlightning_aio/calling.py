@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.sync import EnvGroup
 
-__all__ = ["collect_calls", "in_one_call", "send_calls"]
+__all__ = ["await_cancelled", "collect_calls", "in_one_call", "send_calls"]
 
 T = TypeVar("T")
 
@@ -55,3 +55,8 @@ def collect_calls(group: Any, deadline: float | None = None) -> Any:
     check_seconds("deadline", deadline)
     calls = group._core.calls  # noqa: SLF001
     return group._driver.run(calls.collect_calls(time.monotonic(), deadline))  # noqa: SLF001
+
+
+def await_cancelled(group: EnvGroup) -> None:
+    """Wait until no call runs that was cancelled; `EnvBusy` is raised for its envs until then."""
+    group._driver.run(group._core.calls.await_cancelled(time.monotonic()))  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]

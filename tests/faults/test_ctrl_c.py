@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ import rlightning_aio.sync
 from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvBusy, GroupClosed
 from rlightning_aio.protocol import kernel
+from rlightning_aio.vector import VectorEnv
 from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
@@ -180,13 +182,16 @@ def uses_of(group: Any, batch: BatchedData) -> dict[str, Callable[[], Any]]:
 class Waiting(Counts):
     """Presses Ctrl-C in the trainer, and waits for a file."""
 
+    waits_for: Any = None
+
     def wait(self, trainer: int, go_on: str) -> None:
         os.kill(trainer, signal.SIGINT)
         while not os.path.exists(go_on):  # noqa: PTH110  # In a worker.
             time.sleep(0.001)
 
     def save_state(self) -> Any:
-        self.wait(*self.waits_for)
+        if self.waits_for is not None:
+            self.wait(*self.waits_for)
         return 0
 
     def load_state(self, state: Any) -> None: ...
@@ -220,6 +225,26 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
                 assert time.monotonic() < until
             else:
                 break
+
+
+@pytest.mark.parametrize("interrupted", ["save_state", "load_state"])
+def test_a_vector_env_waits_for_the_rest_of_a_call_that_was_interrupted(
+    interrupted: str, tmp_path: Path
+) -> None:
+    """Its users know nothing of requests."""
+    go_on = tmp_path / "go-on"
+    env = VectorEnv([Waiting])
+    env.reset()
+    state = env.save_state()
+    env.set_attr("waits_for", [(os.getpid(), str(go_on))])
+    with pytest.raises(KeyboardInterrupt):
+        env.save_state() if interrupted == "save_state" else env.load_state(state)
+    timer = threading.Timer(0.1, go_on.touch)
+    timer.start()
+    env.reset()
+    env.step([1])
+    timer.join()
+    env.close()
 
 
 def test_an_interrupt_names_the_env_that_was_waited_for() -> None:

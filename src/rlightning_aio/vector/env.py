@@ -435,9 +435,12 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """
         self._begin("save_state")
         self._check_whole()
+        self._has_leftovers = True
+        snapshot = self.group.snapshot()
+        self._has_leftovers = False
         return {
             "kind": self._kind,
-            "group": self.group.snapshot(),
+            "group": snapshot,
             "observations": copying.deepcopy(self._observations),
             "deaths": self._deaths.save_state(),
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from rlightning_aio.calling import collect_calls
+from rlightning_aio.calling import await_cancelled, collect_calls
 from rlightning_aio.errors import EnvFault, NothingPending
 
 if TYPE_CHECKING:
@@ -24,3 +24,4 @@ def drop_outstanding(group: EnvGroup) -> None:
                 break
             except EnvFault:
                 continue
+    await_cancelled(group)

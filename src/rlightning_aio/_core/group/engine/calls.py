@@ -5,13 +5,15 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
+
+from rlightning_aio._core.group.state.request_states import NOBODY
 from rlightning_aio.errors import EpisodeLost, NothingPending, RLightningError
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
@@ -139,6 +141,11 @@ class Calls:
         for ticket in tickets:
             self._requests.settle(ticket)
         return values_of(tickets)
+
+    def await_cancelled(self, now: float) -> Procedure[None]:
+        """Wait until no call runs in any env that nobody waits for."""
+        owner = self._requests.owner
+        yield from self._waiting.until(now, lambda: int(np.count_nonzero(owner == NOBODY)))
 
     def _num_outstanding(self) -> int:
         return sum(ticket.remaining for ticket in self._sent)
