@@ -14,7 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from kit.scripted import Counts
+from kit.scripted import Awaitable, Counts
 
 from rlightning_aio.errors import EnvError
 from rlightning_aio.spaces import Anything
@@ -64,30 +64,22 @@ class Room(gym.Env[Any, Any]):
             time.sleep(3600)
 
 
-class AwaitedRoom:
+class AwaitedRoom(Awaitable):
     """The same with coroutines; a death is that of its process, so it has none."""
 
-    observation_space = Anything()
-    action_space = Anything()
-
     def __init__(self) -> None:
-        self.room = Room()
+        super().__init__(Room)
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        await asyncio.sleep(0)
-        if options is not None and options.get("reset") == "hang":
-            await asyncio.sleep(3600)
-        return self.room.reset(seed=seed, options=options)
+        await self.pause((options or {}).get("reset"))
+        return await super().reset(seed=seed, options=options)
 
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(0)
-        if action == "hang":
-            await asyncio.sleep(3600)
-        return self.room.step(action)
+    async def pause(self, action: Any = None) -> None:
+        await asyncio.sleep(3600 if action == "hang" else 0)
 
     async def tool(self, number: int) -> int:
         """Something to call."""
-        return self.room.tool(number)
+        return self.env.tool(number)
 
     async def stall(self) -> None:
         """Something that does not return."""
