@@ -314,40 +314,29 @@ def test_others_continue_while_a_worker_is_replaced(start: Start, tmp_path: Path
 
 
 @on_one_driver
-def test_more_than_max_restarts_in_a_row_is_raised(start: Start) -> None:
-    """An env that always kills its worker is given up, with the count and the cause."""
-    group, tokens = start(entry(1, max_restarts=2)), Tokens()
-    for _ in range(2):
-        batch, _ = group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
-        assert marked(batch["faulty-0"])
-    with pytest.raises(WorkerDied, match=r"exited with code 3.*2 restarts"):
-        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
-    with pytest.raises(WorkerDied):
-        group.step(tokens.steps(["faulty-0"]))
-
-
-@on_one_driver
-def test_a_completed_step_resets_the_count_of_restarts(start: Start) -> None:
-    """Deaths with steps in between are not limited."""
-    group, tokens = start(entry(1, max_restarts=1)), Tokens()
-    for _ in range(4):
-        batch, _ = group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
-        assert marked(batch["faulty-0"])
-        tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
-
-
-@on_one_driver
-def test_steps_of_neighbours_do_not_reset_the_count_of_an_env_that_always_dies(
-    start: Start,
+@pytest.mark.parametrize(
+    ("size", "most", "steps", "given_up"),
+    [(1, 2, "0! 0!", True), (1, 1, "0! 0 0! 0 0! 0", False), (2, 2, "0 1! 0 1! 0", True)],
+    ids=["in a row", "with steps in between", "with steps of a neighbour in between"],
+)
+def test_restarts_in_a_row_are_counted_for_each_env(
+    start: Start, size: int, most: int, steps: str, given_up: bool
 ) -> None:
-    """Restarts are counted for the env that was executed, not for its worker."""
-    group, tokens = start(entry(2, max_restarts=2)), Tokens()
-    for _ in range(2):
-        group.step(tokens.steps(["faulty-0"]))
-        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
-    group.step(tokens.steps(["faulty-0"]))
-    with pytest.raises(WorkerDied, match="env 'faulty-1'"):
-        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
+    """An env that always kills its worker is given up, with the count and the cause."""
+    group, tokens = start(entry(size, max_restarts=most)), Tokens()
+    last = f"faulty-{size - 1}"
+    for step in steps.split():
+        env_id, dies = f"faulty-{step[0]}", step.endswith("!")
+        batch, _ = group.step(tokens.steps([env_id], {env_id: "exit 3"} if dies else {}))
+        assert marked(batch.values()[0]) or not dies
+    if not given_up:
+        tokens.check(batch)
+        assert marked(group.step(tokens.steps([last], {last: "exit 3"}))[0].values()[0])
+        return
+    with pytest.raises(WorkerDied, match=rf"env '{last}'.*exited with code 3.*{most} restarts"):
+        group.step(tokens.steps([last], {last: "exit 3"}))
+    with pytest.raises(WorkerDied):
+        group.step(tokens.steps([last]))
 
 
 @on_one_driver
