@@ -92,7 +92,7 @@ class Host:
         knows: which env's code it executes; an actor knows no more than the batch.
 
     Attributes:
-        struck: it was killed from outside.
+        struck: it was killed from outside; aborted: perhaps by an abort, for which it is replaced.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Host:
         self.knows = knows
         self._count = count
         self._asked = 0
-        self.struck = False
+        self.struck = self.aborted = False
 
     @property
     def deaths(self) -> int:
@@ -512,6 +512,7 @@ class Model:
             env.kept.append(env.request)
         env.request, env.limbo, env.dirty, env.deadly = None, False, True, True
         env.errors = 0, env.errors[1] + 1
+        env.host.aborted = True
         self.counts["aborted"] += 1
 
     # -- results
@@ -600,9 +601,10 @@ class Model:
         """What of a request an env may raise."""
         if env.put_away and request.kind == "step":
             request = self._begun_again(env, request)
-        acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
+        states = [state.copy() for state in (env.state, *env.loose)]  # They stay as they are.
+        acts = [act for state in states for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
-            acts += state.faults(Request("reset"))
+            acts += state.copy().faults(Request("reset"))
         if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
             acts += env.fresh().faults(self._begun_again(env, request))
         found = [act for act in acts if act[0] in (*RAISING, "rubbish")]
@@ -662,7 +664,8 @@ class Model:
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
         if not env.torn:
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
-            require(env.entry.on_death != "raise", "marked, where a death is to be raised")
+            is_replaced = env.entry.on_death != "raise" or env.host.aborted
+            require(is_replaced, "marked, where a death is to be raised")
         self.judge_heads(row)
         self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
         shows = "worker_resumed" in row.info
@@ -777,6 +780,9 @@ class Model:
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
         acts = self._raising(env, request)
+        if request.resets or env.put_away:
+            for state in (env.state, *env.loose, *env.torn):  # No grudge survives a reset.
+                state.faults(Request("reset"))
         kinds = (*RAISING, UNSHOWN) if NOT_SHOWN in str(fault) else RAISING
         raising = [act for act in acts if act[0] in kinds]
         is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
