@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import statistics
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +35,7 @@ from memory import resident_kib
 from waiting import MEAN, Awaiting, Sleeping
 
 import rlightning_aio as rl
+from rlightning_aio.cli.measurement import Figures
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -259,10 +259,7 @@ def figures_of(rounds: list[tuple[dict[str, float], Load]]) -> dict[str, Any]:
     for values, load in rounds:
         values[ALL] *= load.cores
     columns = {name: [values[name] for values, _ in rounds] for name in COLUMNS}
-    return {
-        name: {"median": statistics.median(found), "low": min(found), "high": max(found)}
-        for name, found in columns.items()
-    }
+    return {name: Figures(found).as_json() for name, found in columns.items()}
 
 
 def tables(results: dict[str, Any]) -> str:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
 from contextlib import ExitStack
 
 import psutil
 
 from rlightning_aio import sync
+from rlightning_aio.cli.measurement import Figures
 
 
 def processor_seconds() -> float:
@@ -59,8 +59,8 @@ def main() -> None:
             figures.append(1e6 * seconds / arguments.steps / arguments.envs)
     found = {
         str(every): {
-            "us_per_step": statistics.median(figures),
-            "ratio": statistics.median(a / b for a, b in zip(figures, spent[0], strict=True)),
+            "us_per_step": Figures(figures).median,
+            "ratio": Figures(figures).over(Figures(spent[0])).median,
         }
         for every, figures in zip(["never", *arguments.every], spent, strict=True)
     }

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import statistics
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,8 @@ import numpy as np
 from contenders import EnvPool, MakeVec, OursSync, Work
 from harness import Contender, arguments, machine_facts, modules_of, number_text, say, take_turns
 from no_work import NO_WORK, AwaitsNothing
+
+from rlightning_aio.cli.measurement import Figures
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -162,8 +163,8 @@ for kind, count in EACH:
 
 def medians(rounds: list[tuple[Any, Any]]) -> tuple[float, float]:
     """µs of the trainer and other µs of processor time, in a step of all."""
-    outside = statistics.median(value[0] for value, _ in rounds)
-    all_us = statistics.median(1e6 * load.cores / value[1] for value, load in rounds)
+    outside = Figures([value[0] for value, _ in rounds]).median
+    all_us = Figures([1e6 * load.cores / value[1] for value, load in rounds]).median
     return outside, all_us - outside
 
 
@@ -183,14 +184,14 @@ def tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
         pair = [
             turns.get(f"{kind}, {name_of(task, count)}", []) for kind in ("make_vec", "EnvPool")
         ]
-        values = [[value[0] for value, _ in rounds] for rounds in pair]
-        texts = [number_text(statistics.median(found)) if found else "" for found in values]
-        ratios = [ours / theirs for ours, theirs in zip(*values, strict=False)]
+        values = [Figures([value[0] for value, _ in rounds]) for rounds in pair]
+        texts = [number_text(found.median) if found.values else "" for found in values]
         judged = "| | | |"
-        if ratios:
-            middle = statistics.median(ratios)
-            met = "met" if middle <= bound else "missed"
-            judged = f"{middle:.2f} | {min(ratios):.2f} to {max(ratios):.2f} | ≤ {bound} | {met} |"
+        if all(found.values for found in values):
+            ratios = values[0].over(values[1])
+            met = "met" if ratios.median <= bound else "missed"
+            spread = f"{min(ratios.values):.2f} to {max(ratios.values):.2f}"
+            judged = f"{ratios.median:.2f} | {spread} | ≤ {bound} | {met} |"
         lines.append(f"| {name_of(task, count)} | {' | '.join(texts)} | {judged}")
         for kind, rounds in zip(("make_vec", "EnvPool"), pair, strict=True):
             if rounds:
@@ -205,7 +206,7 @@ def tables(turns: dict[str, list[tuple[Any, Any]]]) -> str:
         spent = [value[0] / count for value, _ in turns.get(name_of(kind, count), [])]
         if not spent:
             continue
-        middle, judged = statistics.median(spent), "| |"
+        middle, judged = Figures(spent).median, "| |"
         if bound is not None:
             judged = f"≤ {bound} | {'met' if middle <= bound else 'missed'} |"
         spread = f"{min(spent):.2f} to {max(spent):.2f}"
