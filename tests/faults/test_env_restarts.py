@@ -269,6 +269,29 @@ def test_an_env_that_raises_in_the_reset_after_a_hang_is_rebuilt(
     assert batch.observation.tolist() == [[3, 0]]
 
 
+class HangsToo(AwaitedLives):
+    """Action 3 hangs."""
+
+    async def pause(self, action: Any = None) -> None:
+        if action == 3:
+            await asyncio.Event().wait()
+
+
+@pytest.mark.parametrize("placement", ["process", "loop"])
+@pytest.mark.parametrize("driver", ["uvloop"])
+def test_a_hang_between_exceptions_is_no_completed_step(build: Start, placement: str) -> None:
+    """So they are exceptions in a row."""
+    limits = {"on_env_error": "restart", "max_restarts": 1, "step_timeout": 0.5}
+    group = build({"name": "e", "task": HangsToo, "placement": placement, **limits})
+    group.init()
+    batch, _ = group.reset()
+    for action in (1, 3):
+        batch, _ = group.step(batch.respond(action=[action]))
+        assert batch.restarted.tolist() == [True]
+    with pytest.raises(EnvRaised, match="in step"):
+        group.step(batch.respond(action=[1]))
+
+
 @pytest.mark.parametrize("task", [Lives, AwaitedLives])
 @on_one_driver
 def test_an_env_is_not_rebuilt_after_ctrl_c(build: Start, task: type) -> None:

@@ -117,7 +117,9 @@ class Intake:
             self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted.cause)
             self._results.mark_restarted(Report(slot, completion.restarted, None))
         if self._conditions.unusual:
-            self._note_answered(self._requests.alone(slot))
+            self._note_answered(
+                self._requests.alone(slot), by_reset=completion.restarted is not None
+            )
 
     def _on_value(self, completion: Value) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
@@ -276,12 +278,17 @@ class Intake:
         self._layout.write_seeds(slots, seeds)
         self._supervisor.submit(host_id, entries, None)
 
-    def _note_answered(self, slots: NDArray[np.intp]) -> None:
-        """Mark results that report a loss, and let steps show that a replacement works."""
+    def _note_answered(self, slots: NDArray[np.intp], *, by_reset: bool = False) -> None:
+        """Mark results that report a loss, and let steps show that a replacement works.
+
+        Args:
+            slots: whose results are there.
+            by_reset: their hosts have answered by resets, whatever was asked.
+        """
         if self._continuity.exceptional:
             for report in self._continuity.take_answers(slots):
                 self._results.mark_restarted(report)
-        if self._supervisor.any_deaths:
+        if self._supervisor.any_deaths and not by_reset:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:
                     self._supervisor.note_step(slot)
