@@ -5,12 +5,17 @@
 
 from __future__ import annotations
 
-from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.batch.data import columns_of_responses, origin_of, parts_of
+from rlightning_aio.batch.data import (
+    columns_of_responses,
+    names_of,
+    parts_of,
+    slots_of,
+    slots_of_results,
+)
 from rlightning_aio.batch.endings import all_agents, summed_rewards
 from rlightning_aio.batch.parts import (
     column_of_parts,
@@ -27,8 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.batch.data import BatchedData, Issuer
-    from rlightning_aio.batch.names import EnvNames
+    from rlightning_aio.batch.data import BatchedData
 
 __all__ = [
     "all_agents",
@@ -36,10 +40,8 @@ __all__ = [
     "are_over",
     "columns_of_responses",
     "ended_episodes",
-    "has_ended",
     "lost_rows",
     "names_of",
-    "plain_columns",
     "reported_info_list",
     "reported_infos",
     "slots_of",
@@ -58,26 +60,6 @@ def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
     return reported_infos_of_parts(parts_of(batch))
 
 
-def plain_columns(batch: BatchedData) -> ResultColumns | None:
-    """The columns of a batch whose properties of the same names equal them; None for others."""
-    parts = parts_of(batch)
-    if len(parts) != 1:
-        return None
-    part = parts[0]
-    unlike = part.positions is not None or part.whole_results or part.agents
-    return None if unlike or part.observation is None or not len(part.slots) else part
-
-
-def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
-    """Mask of rows whose episode has ended and was not reset since; shaped like `is_reset`."""
-    parts = parts_of(batch)
-    if not parts:
-        return np.zeros(0, np.bool_)
-    return (
-        parts[0].has_ended if len(parts) == 1 else column_of_parts(parts, attrgetter("has_ended"))
-    )
-
-
 def ended_episodes(
     batch: BatchedData, rows: Sequence[int]
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -89,27 +71,6 @@ def ended_episodes(
     places = rows_in_order(parts_of(batch))
     chosen = [places[row] for row in rows]
     return [(part.episode_of_all(row), part.reported_info_of(row)) for part, row in chosen]
-
-
-def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
-    """Slots of the envs, each once, if the batch was made by `group`."""
-    origin = origin_of(batch)
-    if origin is None or origin.group is not group or origin.repeats:
-        return None
-    return origin.slots
-
-
-def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
-    """Slots of the envs of a batch of results, in order."""
-    origin = origin_of(batch)
-    assert origin is not None
-    return origin.slots
-
-
-def names_of(batch: BatchedData) -> EnvNames | None:
-    """Names of the envs of the group when it returned the batch; None for plain values."""
-    origin = origin_of(batch)
-    return None if origin is None else origin.names
 
 
 def are_over(batch: BatchedData) -> list[bool]:

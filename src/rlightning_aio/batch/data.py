@@ -8,6 +8,7 @@ The functions below the class use its private attributes, and nothing else does.
 from __future__ import annotations
 
 import re
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Protocol, overload
 
 import msgspec
@@ -46,8 +47,13 @@ __all__ = [
     "answer_of",
     "batch_of_results",
     "columns_of_responses",
+    "has_ended",
+    "names_of",
     "origin_of",
     "parts_of",
+    "plain_columns",
+    "slots_of",
+    "slots_of_results",
     "sources_of",
     "with_repeats",
 ]
@@ -435,6 +441,47 @@ def sources_of(batch: BatchedData) -> Sources | None:
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
     """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
     return batch._columns
+
+
+def plain_columns(batch: BatchedData) -> ResultColumns | None:
+    """The columns of a batch whose properties of the same names equal them; None for others."""
+    parts = batch._parts
+    if len(parts) != 1:
+        return None
+    part = parts[0]
+    unlike = part.positions is not None or part.whole_results or part.agents
+    return None if unlike or part.observation is None or not len(part.slots) else part
+
+
+def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
+    """Mask of rows whose episode has ended and was not reset since; shaped like `is_reset`."""
+    parts = batch._parts
+    if not parts:
+        return np.zeros(0, np.bool_)
+    return (
+        parts[0].has_ended if len(parts) == 1 else column_of_parts(parts, attrgetter("has_ended"))
+    )
+
+
+def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
+    """Slots of the envs, each once, if the batch was made by `group`."""
+    origin = batch._origin
+    if origin is None or origin.group is not group or origin.repeats:
+        return None
+    return origin.slots
+
+
+def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
+    """Slots of the envs of a batch of results, in order."""
+    origin = batch._origin
+    assert origin is not None
+    return origin.slots
+
+
+def names_of(batch: BatchedData) -> EnvNames | None:
+    """Names of the envs of the group when it returned the batch; None for plain values."""
+    origin = batch._origin
+    return None if origin is None else origin.names
 
 
 def _entry_of(env_id: str) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio.batch.contents import has_ended
+from rlightning_aio.batch.data import has_ended
 from rlightning_aio.collecting.trees import allocated, check_alike, grown, scattered
 from rlightning_aio.protocol.columns import gather
 from rlightning_aio.trees import mapped
