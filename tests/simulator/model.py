@@ -599,8 +599,7 @@ class Model:
 
     def _raising(self, env: Env, request: Request) -> list[Act]:
         """What of a request an env may raise."""
-        if env.put_away and request.kind == "step":
-            request = self._begun_again(env, request)
+        request = self._executed(env, request)
         states = [state.copy() for state in (env.state, *env.loose)]  # They stay as they are.
         acts = [act for state in states for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
@@ -612,6 +611,11 @@ class Model:
         if shows and any("bound" in info for state in env.saves for info in state.infos):
             found.append((UNSHOWN, 0))
         return found
+
+    def _executed(self, env: Env, request: Request) -> Request:
+        """What an env does for a request: one that was put away begins again."""
+        begins = env.put_away and request.kind == "step"
+        return self._begun_again(env, request) if begins else request
 
     def _begun_again(self, env: Env, request: Request) -> Request:
         """The reset that follows an exception; an awaitable env begins the same episode again."""
@@ -780,9 +784,10 @@ class Model:
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
         acts = self._raising(env, request)
-        if request.resets or env.put_away:
-            for state in (env.state, *env.loose, *env.torn):  # No grudge survives a reset.
-                state.faults(Request("reset"))
+        for state in (env.state, *env.loose):  # What has raised has no grudge any more.
+            state.faults(self._executed(env, request))
+        for state in env.torn:
+            state.faults(Request("reset"))
         kinds = (*RAISING, UNSHOWN) if NOT_SHOWN in str(fault) else RAISING
         raising = [act for act in acts if act[0] in kinds]
         is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
