@@ -846,7 +846,7 @@ class Model:
         hung = isinstance(fault, EnvHung)
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind == "call"
-        if entry.on_death == "raise" or not in_call:
+        if not env.gone and (entry.on_death == "raise" or not in_call):  # Judged once for all.
             errors = [self._most_errors(one) for one in self.envs.values() if one.host is host]
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
             require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
