@@ -414,12 +414,8 @@ class _OfVector(VecEnv):
         if self._separate is not None:
             name = name_of(wrapper_class)
             return [has_wrapper(self._separate[k], name) for k in places]
-        if isinstance(self._inner, gym.vector.AsyncVectorEnv):
-            raise ValueError(
-                f"AsyncVectorEnv can't say whether its envs are in a {wrapper_class.__name__}: "
-                "give VecEnv a list of callables, one for each env, or put it in a VecMonitor, "
-                "after which Stable-Baselines3 doesn't ask"
-            )
+        # An AsyncVectorEnv can't be asked. After True, evaluations would take rewards from infos
+        # alone; after False, they warn, and take those of the steps.
         ask: Any = getattr(self._inner, "env_is_wrapped", None)
         return [ask is not None and ask(wrapper_class)] * len(places)
 
