@@ -7,6 +7,7 @@ Rule: torch is recognised by name and never imported, so that users without it p
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
@@ -145,10 +146,19 @@ def holds_tensor(value: Any) -> bool:
 
 
 def converted(function: Callable[[Any], Any], value: Any) -> Any:
-    """Apply `function` to all that the dicts, tuples and lists of `value` hold, in new ones."""
+    """Apply `function` to all that the dicts, tuples and lists of `value` hold, in new ones.
+
+    A dict of another class stays one of that class.
+    """
     if isinstance(value, dict):
-        parts = cast("dict[Any, Any]", value).items()
-        return {key: converted(function, inner) for key, inner in parts}
+        held = cast("dict[Any, Any]", value)
+        found = {key: converted(function, inner) for key, inner in held.items()}
+        if type(held) is dict:
+            return found
+        other = copy(held)
+        for key, inner in found.items():  # A Counter's `update` would add.
+            other[key] = inner
+        return other
     if type(value) in (tuple, list):
         return type(value)([converted(function, inner) for inner in value])
     if isinstance(value, tuple) and hasattr(cast("Any", value), "_make"):  # A graph, for one.

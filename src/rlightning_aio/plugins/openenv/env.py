@@ -30,7 +30,6 @@ from rlightning_aio.plugins.openenv.session import (
     get_json,
     pauses,
 )
-from rlightning_aio.trees import converted
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -324,4 +323,8 @@ def _value_in(space: gym.Space[Any], value: Any) -> Any:
 
 def _plain(value: Any) -> Any:
     """An action as JSON has it."""
-    return converted(lambda one: one.tolist() if hasattr(one, "tolist") else one, value)
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in cast("Mapping[Any, Any]", value).items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in cast("list[Any]", value)]
+    return value.tolist() if hasattr(value, "tolist") else value
