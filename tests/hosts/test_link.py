@@ -86,6 +86,7 @@ class Scene:
 
     def __init__(self) -> None:
         self.completions: Any = deque()
+        self.rings_of_group: list[Any] = [None]
         self.arena = Arena()
         self.bell_offset = self.arena.append(bell_size(1))
         memory = self.arena.map(self.bell_offset, bell_size(1))
@@ -99,7 +100,7 @@ class Scene:
             arena=self.arena,
             bell=self.bell,
             bell_offset=self.bell_offset,
-            rings=[None],
+            rings=self.rings_of_group,
             num_hosts=1,
             configs=[CONFIG],
             objection=lambda meta: None,
@@ -422,6 +423,20 @@ def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) 
     started.host.submit(steps(3))
     started.host.poll()
     assert started.posted() == []
+
+
+def test_the_ring_of_a_dead_worker_takes_requests_until_its_death_is_posted(started: Scene) -> None:
+    """The group puts them there as long as it knows of no death."""
+    started.channel.close()
+    started.read()
+    assert not started.watched
+    (ring,) = started.rings_of_group
+    started.host.submit(steps(1))
+    ring.wake()
+    started.host.on_exit(3, "")
+    assert started.rings_of_group == [None]
+    (died,) = started.posted()
+    assert set(steps(1).tolist()) <= set(died.death.requests)
 
 
 @pytest.mark.parametrize(

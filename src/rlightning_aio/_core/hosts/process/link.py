@@ -65,9 +65,12 @@ class Link:
         return self._socket.fileno()
 
     def hang_up(self) -> None:
-        """Close the channel; unread data is lost."""
+        """Take the ring away, and close the channel; unread data is lost. To be called once."""
+        self._all_rings[self._host_id] = None
+        self._close()
+
+    def _close(self) -> None:
         if self._socket is not None:
-            self._all_rings[self._host_id] = None
             self._driver.unwatch(self)
             self._socket.close()
             self._socket = None
@@ -154,8 +157,8 @@ class Link:
                 data = b""
             if not data:
                 # The fork server keeps the other end open until it has handled the exit, and it
-                # reports the cause.
-                self.hang_up()
+                # reports the cause. Until that is read, the ring takes further requests.
+                self._close()
                 return
             self.traffic += len(data)
             if data == BELL and self._frames.is_empty:
