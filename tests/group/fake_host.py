@@ -416,8 +416,9 @@ class FakeWorker(FakeHost):
     # -- the worker's side
 
     def take_requests(self) -> None:
-        """Wake the worker, which reads the requests in its ring."""
-        super().submit(np.array(self.worker_rings.requests(), np.int64))
+        """Wake the worker, which reads the requests in its ring; a second time, there are none."""
+        if entries := self.worker_rings.requests():
+            super().submit(np.array(entries, np.int64))
 
     def report(self, entry: int) -> None:
         self.worker_rings.report(entry, self.ring)
