@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from gymnasium.wrappers import vector as wrappers
 from kit.processes import kill, stop
 from vector.toys import Counted, Mortal, assert_alike
 
-from rlightning_aio.errors import WorkerDied
+from rlightning_aio.errors import SnapshotError, WorkerDied
 from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
@@ -239,6 +240,27 @@ def test_a_state_between_a_death_and_the_step_that_resets_is_restored() -> None:
     for _ in range(2):
         envs.load_state(kept)
         assert_alike([envs.step(actions) for _ in range(3)], expected)
+    envs.close()
+
+
+def test_no_state_is_saved_before_a_resumed_episode_is_shown() -> None:
+    """It would be that of another moment than the observations that the user has."""
+    resume = {"on_worker_death": "resume", "snapshot_every": 9}
+    envs = VectorEnv([Counted] * 4, envs_per_process=2, **resume)
+    actions = np.zeros(4, np.int64)
+    envs.reset(seed=0)
+    envs.step(actions)
+    kill(envs.group.get_workers()[0]["pid"])
+    while not envs.group.num_restarts:
+        with suppress(SnapshotError, WorkerDied):
+            envs.save_state()
+    with pytest.raises(SnapshotError, match="whose episode was lost"):
+        envs.save_state()
+    assert envs.step(actions)[3].tolist() == LOST
+    state = envs.save_state()
+    expected = envs.step(actions)
+    envs.load_state(state)
+    assert_alike([envs.step(actions)], [expected])
     envs.close()
 
 

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, utils
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import reported_infos
-from rlightning_aio.calling import collect_calls, in_one_call
+from rlightning_aio.calling import collect_calls, in_one_call, snapshot_as_shown
 from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.errors import BadAction, EnvFault, SnapshotError
 from rlightning_aio.protocol.columns import leaves
@@ -429,14 +429,15 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Return the state of all envs, as a copy that can be pickled; see `EnvGroup.snapshot`.
 
         Raises:
-            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`.
+            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`; also if a worker
+                has died and its envs are to resume earlier states, which the next step shows.
             ResetNeeded: the results of the last step or reset were lost.
             AlreadyPendingCallError: another call is pending.
         """
         self._begin("save_state")
         self._check_whole()
         self._has_leftovers = True
-        snapshot = self.group.snapshot()
+        snapshot = snapshot_as_shown(self.group)
         self._has_leftovers = False
         return {
             "kind": self._kind,

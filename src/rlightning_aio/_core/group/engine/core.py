@@ -196,10 +196,12 @@ class Core:
 
     # -- states of envs ---------------------------------------------------------------
 
-    def snapshot(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
-        """Take a snapshot of envs."""
+    def snapshot(
+        self, now: float, env_ids: Sequence[str] | None, *, shown: bool = False
+    ) -> Procedure[bytes]:
+        """Take a snapshot of envs; for `shown` see `Snapshots.take`."""
         with self.observed.call("snapshot", now):
-            return (yield from self._snapshots.take(now, env_ids))
+            return (yield from self._snapshots.take(now, env_ids, shown=shown))
 
     def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None

@@ -64,11 +64,11 @@ class Snapshots:
         self._continuity = tables.continuity
         self._waiting = waiting
 
-    def take(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
-        """See `EnvGroup.snapshot`."""
+    def take(self, now: float, env_ids: Sequence[str] | None, *, shown: bool) -> Procedure[bytes]:
+        """See `EnvGroup.snapshot`; `shown`: raise if an env is to resume, and hasn't said so."""
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         self._check_restorable(slots)
-        snapshots, _ = yield from self._take(now, slots)
+        snapshots, _ = yield from self._take(now, slots, shown=shown)
         for snapshot, why_not in snapshots:
             if why_not:
                 raise SnapshotError(
@@ -87,7 +87,7 @@ class Snapshots:
                 )
 
     def _take(
-        self, now: float, slots: NDArray[np.intp]
+        self, now: float, slots: NDArray[np.intp], *, shown: bool = False
     ) -> Procedure[tuple[list[tuple[EnvSnapshot, str]], float]]:
         """Take one snapshot per env; return the time, too.
 
@@ -102,7 +102,7 @@ class Snapshots:
             self._calls.send(now, slots, op, nothing, "nothing", ticket)
             # A worker that has replied may die before others reply.
             positions.extend(self._continuity.positions(slots))
-            losses.extend(self._continuity.why_lost(slot, unless_saved=True) for slot in each)
+            losses.extend(self._continuity.why_lost(slot, unless_saved=not shown) for slot in each)
 
         ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
