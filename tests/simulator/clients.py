@@ -145,6 +145,11 @@ class Client:
     def is_alive(self) -> bool:
         return self.process is not None and self.process.alive
 
+    @property
+    def is_leaving(self) -> bool:
+        """It ends in order after the next request, at the latest."""
+        return self.is_alive and self._lent is not None and self._lent.is_finished
+
     def is_code(self, code: int) -> bool:
         """Return True if one of its processes has this code."""
         return self.env.codes[0] < code <= self._code

@@ -199,7 +199,7 @@ class Play(Session):
     async def expect(self, client: Client) -> None:
         """Have a client be there, and what it still owes collected."""
         for _ in range(30):
-            if client.hangs and client.process is not None:
+            if (client.hangs or client.is_leaving) and client.process is not None:
                 client.process.end(-9)
             if not client.is_alive:
                 client.start(self.address)

@@ -208,6 +208,9 @@ class Vectors(Session):
         with self.perhaps_none():
             try:
                 self.rows.load_state(state)
+            except KeyboardInterrupt:
+                self.shown = []  # As in a reset.
+                raise
             except ResetNeeded:
                 require(any(env.losses for env in self.envs), "none has died")
                 return
