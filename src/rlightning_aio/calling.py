@@ -69,4 +69,4 @@ def snapshot_as_shown(group: EnvGroup) -> bytes:
     said so yet, it raises `SnapshotError`.
     """
     core, driver = group._core, group._driver  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-    return driver.run(core.snapshot(time.monotonic(), None, shown=True))
+    return driver.run(core.snapshot(time.monotonic(), None, as_shown=True))

@@ -220,8 +220,11 @@ class Training(InContext):
     def check_first(self, fault: WorkerDied) -> None:
         """Check that no death is raised twice while envs of other workers are left.
 
-        A start, and a block, need all envs.
+        A start, and a block, need all envs; an awaitable env that hangs is tried again each time.
         """
+        gone = {env_id for worker in self.group.get_workers() for env_id in worker["given_up"]}
+        if gone.isdisjoint(fault.env_ids):
+            return
         dead = {id(env.host) for env in self.envs if env.gone}
         own = {id(self.by_id[env_id].host) for env_id in fault.env_ids}
         left = any(id(env.host) not in dead | own for env in self.envs)

@@ -145,10 +145,14 @@ class Vectors(Session):
         except EnvFault as fault:
             self.fail(fault)
             return
-        self.is_whole = True
+        except KeyboardInterrupt:
+            if self.still_saves:  # Perhaps it has only waited for that.
+                self.shown = []
+            raise
+        self.is_whole, self.still_saves = True, False
         self.take(acts, found)
 
-    plain = False
+    plain = still_saves = False
 
     def step_rows(self, actions: Any, rng: Random) -> Any:
         if rng.random() < 0.5:
@@ -199,9 +203,11 @@ class Vectors(Session):
         if self.saved is None or rng.random() < 0.5:
             if not self.is_whole:
                 return
+            self.still_saves = True  # After Ctrl-C.
             with self.perhaps_none():
                 state = self.rows.save_state()
                 self.saved = state, deepcopy((self.trails, self.shown, self.over, self.lost))
+                self.still_saves = False
             return
         state, model = self.saved
         is_restored, is_whole, self.is_whole = False, self.is_whole, False

@@ -197,11 +197,11 @@ class Core:
     # -- states of envs ---------------------------------------------------------------
 
     def snapshot(
-        self, now: float, env_ids: Sequence[str] | None, *, shown: bool = False
+        self, now: float, env_ids: Sequence[str] | None, *, as_shown: bool = False
     ) -> Procedure[bytes]:
-        """Take a snapshot of envs; for `shown` see `Snapshots.take`."""
+        """Take a snapshot of envs; for `as_shown` see `Snapshots.take`."""
         with self.observed.call("snapshot", now):
-            return (yield from self._snapshots.take(now, env_ids, shown=shown))
+            return (yield from self._snapshots.take(now, env_ids, as_shown=as_shown))
 
     def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None

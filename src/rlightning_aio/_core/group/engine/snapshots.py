@@ -64,11 +64,13 @@ class Snapshots:
         self._continuity = tables.continuity
         self._waiting = waiting
 
-    def take(self, now: float, env_ids: Sequence[str] | None, *, shown: bool) -> Procedure[bytes]:
-        """See `EnvGroup.snapshot`; `shown`: raise if an env is to resume, and hasn't said so."""
+    def take(
+        self, now: float, env_ids: Sequence[str] | None, *, as_shown: bool
+    ) -> Procedure[bytes]:
+        """See `EnvGroup.snapshot`; `as_shown`: raise if an env is to resume, and hasn't said so."""
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         self._check_restorable(slots)
-        snapshots, _ = yield from self._take(now, slots, shown=shown)
+        snapshots, _ = yield from self._take(now, slots, as_shown=as_shown)
         for snapshot, why_not in snapshots:
             if why_not:
                 raise SnapshotError(
@@ -87,7 +89,7 @@ class Snapshots:
                 )
 
     def _take(
-        self, now: float, slots: NDArray[np.intp], *, shown: bool = False
+        self, now: float, slots: NDArray[np.intp], *, as_shown: bool = False
     ) -> Procedure[tuple[list[tuple[EnvSnapshot, str]], float]]:
         """Take one snapshot per env; return the time, too.
 
@@ -102,7 +104,9 @@ class Snapshots:
             self._calls.send(now, slots, op, nothing, "nothing", ticket)
             # A worker that has replied may die before others reply.
             positions.extend(self._continuity.positions(slots))
-            losses.extend(self._continuity.why_lost(slot, unless_saved=not shown) for slot in each)
+            losses.extend(
+                self._continuity.why_lost(slot, unless_saved=not as_shown) for slot in each
+            )
 
         ticket, later = yield from self._waiting.ask(now, slots, send, "snapshot")
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
