@@ -604,6 +604,8 @@ class Model:
         acts = [act for state in states for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
             acts += state.copy().faults(Request("reset"))
+            if request.resets:  # Sent when the loss was known.
+                acts += state.copy().faults(request)
         if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
             acts += env.fresh().faults(self._begun_again(env, request))
         found = [act for act in acts if act[0] in (*RAISING, "rubbish")]

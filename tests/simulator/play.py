@@ -121,6 +121,10 @@ class Play(Session):
         """Raise what tasks have raised, and forget those that have ended."""
         if wait and self.tasks:
             _, late = await asyncio.wait(self.tasks, timeout=self.hang)
+            if late and self.clients and not self.group.pending:
+                for task in late:  # A collect whose result another call took waits for clients.
+                    task.cancel()
+                _, late = await asyncio.wait(late, timeout=self.hang)
             require(not late, "a call hangs", late)
         for task in [task for task in self.tasks if task.done()]:
             self.tasks.remove(task)
