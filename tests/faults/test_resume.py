@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import NormalizeObservation
 from kit.driven import Driven, on_one_driver
-from kit.processes import kill
+from kit.processes import kill, kill_first_worker
 from kit.scripted import Counts
 
 from rlightning_aio.config import parse_configs
@@ -132,7 +132,7 @@ def test_a_resumed_env_reports_the_number_of_lost_steps(start: Start) -> None:
         for _ in range(7):
             batch, _ = group.step(batch.respond(action=[0, 0]))
             shown.append(batch)
-        kill(group.get_workers()[0]["pid"])
+        kill_first_worker(group)
         again, flags = group.step(batch.respond(action=[0, 0]))
         assert again.restarted.all()
         assert again.is_reset.all()
@@ -156,7 +156,7 @@ def test_a_step_limit_does_not_count_lost_steps(start: Start) -> None:
     with group.auto_reset(12):
         for turn in range(40):
             if turn in (8, 21):
-                kill(group.get_workers()[0]["pid"])
+                kill_first_worker(group)
             batch, _ = group.step(batch.respond(action=[0]))
             lengths += [info["episode"]["l"] for info in batch.info() if "episode" in info]
             assert bool(batch.limit_reached[0]) == ("episode" in batch.info()[0])
@@ -174,7 +174,7 @@ def test_wrappers_and_generators_are_resumed(start: Start) -> None:
         seen = []
         for turn in range(16):
             if turn in deaths:
-                kill(group.get_workers()[0]["pid"])
+                kill_first_worker(group)
                 if turn != 11:
                     batch, _ = group.step(batch.respond(action=[1]))
                     assert batch.info()[0]["worker_resumed"] == 0
@@ -196,7 +196,7 @@ def test_a_restored_env_resumes_from_the_restored_state(start: Start) -> None:
         batch, _ = group.step(batch.respond(action=[0]))
     batch, _ = group.restore(snapshot)
     batch, _ = group.step(batch.respond(action=[0]))
-    kill(group.get_workers()[0]["pid"])
+    kill_first_worker(group)
     batch, _ = group.step(batch.respond(action=[0]))
     assert batch.observation[0][0] == 3
     assert batch.info()[0]["worker_resumed"] == 1
@@ -211,7 +211,7 @@ def test_a_snapshot_of_an_env_that_was_taken_back_is_of_one_moment(start: Start)
     with group.group.auto_reset(10):
         for _ in range(7):
             batch, _ = group.step(batch.respond(action=[0, 0]))
-        kill(group.get_workers()[0]["pid"])
+        kill_first_worker(group)
         batch, _ = group.step(batch.take([0]).respond(action=[0]))
         assert batch.info()[0]["worker_resumed"] == 3
         for snapshot in (group.snapshot(["e-0"]), group.snapshot(["e-1"])):
