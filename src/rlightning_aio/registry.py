@@ -97,9 +97,8 @@ class Backend:
             return None
         try:
             return version(self.module)
-        except (
-            PackageNotFoundError
-        ):  # pyzmq has the module zmq; finding it reads all lists of files.
+        except PackageNotFoundError:
+            # pyzmq has the module zmq. To find that out reads the lists of all installed files.
             names = packages_distributions().get(self.module)
             return version(names[0]) if names else "unknown"
 

@@ -58,6 +58,8 @@ class Stats:
         # What is not in the sums yet, and for how many results more there is room.
         self._kept: deque[Sample] = deque()
         self._room = _MOST_ROWS
+        # Episodes end in any of that.
+        self._keeps_ends = False
         # A signal handler may ask for figures while they are summed.
         self._lock = threading.RLock()
 
@@ -98,7 +100,8 @@ class Stats:
                     or part.restarted is not None
                 ):
                     with self._lock:
-                        self.settle()
+                        if self._keeps_ends:  # They are older.
+                            self.settle()
                         self.episodes.add_reported(part, part.episode_return, part.episode_length)
                 else:
                     episodes = flags, part.episode_return, part.episode_length
@@ -117,6 +120,8 @@ class Stats:
             )
             self._samples.append(sample)
             self._kept.append(sample)
+            if episodes:
+                self._keeps_ends = True
             self._room -= max(len(slots), _LEAST_ROWS)
             if self._room <= 0:
                 self.settle()
@@ -124,7 +129,7 @@ class Stats:
     def settle(self) -> None:
         """Add what is kept to the sums."""
         with self._lock:
-            self._room = _MOST_ROWS
+            self._room, self._keeps_ends = _MOST_ROWS, False
             kept: list[Sample] = []
             while self._kept:  # The trainer may append meanwhile.
                 kept.append(self._kept.popleft())
