@@ -157,13 +157,14 @@ class Play(Session):
         while self.calls:
             await self.interruptible(self.op_collect_calls(Random(0)))
         for client in self.clients:
-            await self.lose(client)
+            await self.interruptible(self.lose(client))
         while self.model.pending(COLLECTOR):
             await self.interruptible(self.collect(deadline=self.hang))
         if self.context is not None:
             self.leave()
         for client in self.clients:
-            await self.expect(client)
+            while not await self.interruptible(self.expect(client)):
+                pass
         for env in self.model.envs.values():
             # Errors of the env, or of a call that was given up, may come first; and each call may
             # send no more of the order to start than a narrow channel takes.
@@ -200,15 +201,15 @@ class Play(Session):
         require(took <= 1.5 * heartbeat + 30.0, "a dead client is found late", client.name, took)
         self.counts["clients found dead"] += 1
 
-    async def expect(self, client: Client) -> None:
-        """Have a client be there, and what it still owes collected."""
+    async def expect(self, client: Client) -> bool:
+        """Have a client be there, and what it still owes collected; True."""
         for _ in range(30):
             if (client.hangs or client.is_leaving) and client.process is not None:
                 client.process.end(-9)
             if not client.is_alive:
                 client.start(self.address)
             if client.env.idle and await self.reset([client.env]) and not client.is_out:
-                return
+                return True
             await self.collect(deadline=30.0)
             self.check_pending()
         raise Violation(f"client {client.name} does not come")

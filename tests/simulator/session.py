@@ -135,8 +135,7 @@ class Session:
                 await self.done(self.close_group())
             except KeyboardInterrupt:  # No call came after it that could raise it.
                 raised = self.counts["Ctrl-C in a wait"] + self.counts["Ctrl-C in a send"]
-                pressed = self.world and self.world.counts["interrupts"]
-                require(pressed and pressed > raised, "nobody has pressed Ctrl-C")
+                require(self.num_interrupts > raised, "nobody has pressed Ctrl-C")
         texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
         self.counts["close raised"] += len(texts)
         for text in texts:
@@ -171,6 +170,11 @@ class Session:
 
     def note_interrupt(self) -> None:
         """Ctrl-C was raised."""
+
+    @property
+    def num_interrupts(self) -> int:
+        """How often Ctrl-C was pressed; it is raised now or by a later call."""
+        return 0 if self.world is None else self.world.counts["interrupts"]
 
     async def done(self, answer: Any) -> Any:
         """What a call returns, whichever kind of group it is of."""

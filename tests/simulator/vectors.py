@@ -139,14 +139,16 @@ class Vectors(Session):
             with self.expected(ResetNeeded, "a step of envs that were not reset"):
                 self.step_rows(actions, rng)
             return
-        self.is_whole = False
+        self.is_whole, pressed = False, self.num_interrupts
         try:
             found = self.step_rows(actions, rng)
         except EnvFault as fault:
             self.fail(fault)
             return
         except KeyboardInterrupt:
-            if self.still_saves:  # Perhaps it has only waited for that.
+            # Perhaps it has only waited for a save, or heard what was pressed before, and was not
+            # sent.
+            if self.still_saves or pressed == self.num_interrupts:
                 self.shown = []
             raise
         self.is_whole, self.still_saves = True, False
