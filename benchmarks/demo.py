@@ -7,7 +7,6 @@ two take turns, and the table is filled in live. Ctrl-C ends it early, with the 
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from contenders import GymnasiumAsync, MakeVec, Work
-from harness import Contender, Stage, number_text, throughput
+from harness import Contender, Figures, Stage, number_text, throughput
 from headline import GYMNASIUM, OURS
 from rich.console import Console
 from rich.live import Live
@@ -116,8 +115,7 @@ class Rates(NamedTuple):
 
     def ratio(self) -> float:
         """Return how many times as fast ours is; both have played the same rounds."""
-        pairs = zip(self.ours, self.theirs, strict=False)
-        return statistics.median(ours / theirs for ours, theirs in pairs)
+        return Figures(self.ours).over(Figures(self.theirs[: len(self.ours)])).median
 
 
 def table_of(rates: list[Rates]) -> Table:
@@ -131,7 +129,7 @@ def table_of(rates: list[Rates]) -> Table:
         if not found.ours:
             table.add_row(line.title, "starts")
             continue
-        medians = [number_text(statistics.median(one)) for one in found]
+        medians = [number_text(Figures(one).median) for one in found]
         table.add_row(line.title, *medians, f"{found.ratio():.1f}")
     return table
 

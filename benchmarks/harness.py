@@ -378,6 +378,10 @@ def number_text(value: float) -> str:
     return f"{value:.3g}"
 
 
+JUDGED = ("| compared | median | lowest to highest | target | |", "|---|---:|---:|---:|---|")
+"""The head of a table of targets."""
+
+
 def tables(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
     results = report["results"]
@@ -400,11 +404,7 @@ def tables(report: dict[str, Any]) -> str:
         row = f"| {name} | {number_text(found['median'])} | {spread} |"
         lines.append(row + "".join(f" {text(found[key])} |" for _, key, text in more))
     if report["targets"]:
-        lines += [
-            "",
-            "| compared | median | lowest to highest | target | |",
-            "|---|---:|---:|---:|---|",
-        ]
+        lines += ["", *JUDGED]
         lines += [target_row(target, report["unit"]) for target in report["targets"]]
     lines += [f"\n{name}: {why}" for name, why in report["skipped"].items()]
     return "\n".join(lines)
@@ -414,10 +414,15 @@ def target_row(target: dict[str, Any], unit: str) -> str:
     """A target as a row of a table."""
     sign, suffix = ("minus", f" {unit}") if target["difference"] else ("/", "")
     bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}{suffix}"
-    spread = f"{number_text(target['low'])} to {number_text(target['high'])}"
-    met = "met" if target["met"] else "missed"
     compared = f"{target['subject']} {sign} {target['reference']}"
-    return f"| {compared} | {number_text(target['median'])} | {spread} | {bound} | {met} |"
+    return judged_row(compared, Figures(target["values"]), bound, met=target["met"])
+
+
+def judged_row(compared: str, found: Figures, bound: str, *, met: bool) -> str:
+    """Figures and their bound as a row of a table."""
+    spread = f"{number_text(min(found.values))} to {number_text(max(found.values))}"
+    cells = (compared, number_text(found.median), spread, bound, "met" if met else "missed")
+    return f"| {' | '.join(cells)} |"
 
 
 def machine_text(machine: dict[str, Any]) -> str:

@@ -24,7 +24,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness import ONE_THREAD, machine_facts, machine_text, number_text, say
+from harness import (
+    JUDGED,
+    ONE_THREAD,
+    Figures,
+    judged_row,
+    machine_facts,
+    machine_text,
+    number_text,
+    say,
+)
 from training_workloads import (
     BASELINES,
     BETTER,
@@ -140,8 +149,8 @@ def judged(target: Target, found: dict[str, list[dict[str, Any]]]) -> dict[str, 
         values, bound = [a / b for a, b in zip(mine, theirs, strict=True)], target.bound
     else:
         values, bound = mine, target.bound
-    extreme = max(values) if target.at_most else min(values)
-    held = extreme if target.every else statistics.median(values)
+    extreme, middle = (max if target.at_most else min)(values), Figures(values).median
+    held = extreme if target.every else middle
     return {
         "subject": target.subject,
         "what": target.what,
@@ -150,7 +159,7 @@ def judged(target: Target, found: dict[str, list[dict[str, Any]]]) -> dict[str, 
         "every": target.every,
         "bound": bound,
         "values": values,
-        "median": statistics.median(values),
+        "median": middle,
         "met": held <= bound if target.at_most else held >= bound,
     }
 
@@ -177,24 +186,19 @@ def _lines(part: dict[str, Any]) -> Iterator[str]:
     yield "|---|---:|---:|---:|---:|---:|"
     for name, turns in part["results"].items():
         kinds = ("wall", "learner", "outside", "rate")
-        cells = [number_text(statistics.median(turn[kind] for turn in turns)) for kind in kinds]
+        cells = [number_text(Figures([turn[kind] for turn in turns]).median) for kind in kinds]
         returns = [turn["return"] for turn in turns]
         spread = f"{number_text(min(returns))} to {number_text(max(returns))}"
         cells.append(f"{number_text(statistics.fmean(returns))} ({spread})")
         yield f"| {name} | {' | '.join(cells)} |"
     if part["targets"]:
-        yield ""
-        yield "| compared | median | lowest to highest | target | |"
-        yield "|---|---:|---:|---:|---|"
+        yield from ("", *JUDGED)
     for target in part["targets"]:
-        values = target["values"]
         who = f"{target['subject']}, {target['what']}"
         against = f" / {target['reference']}" if target["reference"] not in ("", SPREAD) else ""
         sign = "≤" if target["at_most"] else "≥"
         bound = f"{sign} {number_text(target['bound'])}{', each' if target['every'] else ''}"
-        spread = f"{number_text(min(values))} to {number_text(max(values))}"
-        met = "met" if target["met"] else "missed"
-        yield f"| {who}{against} | {number_text(target['median'])} | {spread} | {bound} | {met} |"
+        yield judged_row(who + against, Figures(target["values"]), bound, met=target["met"])
 
 
 def plot(report: dict[str, Any], path: Path) -> None:
