@@ -216,6 +216,9 @@ class Vectors(Session):
         with self.perhaps_none():
             try:
                 self.rows.load_state(state)
+            except EnvFault as fault:
+                is_whole &= fault.results is None  # Else others show what was restored.
+                raise
             except KeyboardInterrupt:
                 self.shown = []  # As in a reset.
                 raise
