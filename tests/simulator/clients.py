@@ -245,7 +245,8 @@ class Client:
         if request is not None and request.kind != "join":
             self.dropped.append(request)
         self.troubles += 1
-        self.is_in = self.is_in or (request is not None and request.kind == "join")
+        # A first result answers a step, too.
+        self.is_in |= request is not None and (request.kind == "join" or self.may_be_back)
         self.is_out, self.withdrawn = True, None
 
     def judge(self, model: Model, request: Request, row: Row) -> None:
