@@ -1,9 +1,10 @@
 """Frames: messages in the channel between a host and its local worker.
 
-A frame is a 16-byte header (payload length, kind, an entry or another number) and a payload. A
-*bell* is a frame without payload that only wakes the other side. Payloads are pickles, because both
-ends are processes of the same user on the same machine, connected by an anonymous socket pair.
-Frames never cross a network (see `net` for that).
+A frame is a 16-byte header (payload length, kind, an entry or another number) and a payload. `BELL`
+has none, and only wakes the other side; when a worker sends it, the bell of `rings` decides.
+Payloads are pickles, because both ends are processes of the same user on the same machine,
+connected by an anonymous socket pair. Of what crosses a network (see `net`), only the replies of
+Ray actors hold frames.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Rule: pickle is fast and suffices for objects of importable modules; cloudpickle is for code of the
 user (classes and functions of a script, lambdas). `pickle.loads` reads both.
-Left out on purpose: data from a network, which is never unpickled.
+Left out on purpose: data from a network. Only what Ray has carried is unpickled.
 """
 
 from __future__ import annotations

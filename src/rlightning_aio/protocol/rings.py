@@ -106,7 +106,7 @@ class TrainerRings:
         return Ring(self._words, self._requests, self._reports, self._own, wake)
 
     def request(self, entries: NDArray[np.int64]) -> bool:
-        """Append `entries` in order; True if the worker sleeps and must be rung."""
+        """Append `entries` in order; True if the worker sleeps and must be woken."""
         count, sent = len(entries), self._own[SENT]
         start = sent & self._mask
         room = self._capacity - start
@@ -128,12 +128,12 @@ class TrainerRings:
         return tuple((ring[start:] + ring[:start])[-sent:] if sent else ())
 
     def worker_sleeps(self) -> bool:
-        """Return True if the worker must be rung to see a new entry or frame."""
+        """Return True if the worker must be woken to see a new entry or frame."""
         self._fence()
         return self._words[WORKER_ASLEEP] != 0
 
     def count_frame(self) -> bool:
-        """Count a frame that was written to the channel; True if the worker must be rung."""
+        """Count a frame that was written to the channel; True if the worker must be woken."""
         self._frames_sent += 1
         self._words[FRAMES_TO_WORKER] = self._frames_sent
         return self.worker_sleeps()
@@ -246,7 +246,7 @@ class WorkerRings:
         )
 
     def report(self, request: int, ring: Callable[[], object]) -> None:
-        """Report an entry that came in a frame and whose reply is in its row; see `serve`."""
+        """Report an entry whose reply is in its row, and which `serve` has not executed."""
         sent = self.own[REPORTED]
         self._reports[sent & self._mask] = request
         self.own[REPORTED] = sent + 1

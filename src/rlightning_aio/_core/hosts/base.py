@@ -73,7 +73,7 @@ class Driver(Protocol):
         ...
 
     def wake(self) -> None:
-        """Wake all waiters, as if a source had posted a completion."""
+        """Wake the calls that wait for sources, as if one had posted a completion."""
         ...
 
     def read(self) -> None:

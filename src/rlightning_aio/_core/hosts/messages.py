@@ -3,7 +3,8 @@
 Orders go to hosts, completions come back. Each completion reports the outcome of one request, or
 an event of a host. Hosts append them in order to the one queue of their group. Data of a request or
 a result that has no place in a row travels *out of band*.
-Left out on purpose: transport (see `link`), and the effects of messages (see `engine.intake`).
+Left out on purpose: transport, which each host has its own of, and the effects of messages (see
+`engine.intake`).
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ __all__ = ["Core"]
 
 
 class Core:
-    """The operations of an `EnvGroup`; methods have its names, and those of `steps` too.
+    """The operations of an `EnvGroup`, by its names; others are those of `steps` and `calls`.
 
     Args:
         tables, supervisor, poller: of the group.

@@ -134,9 +134,8 @@ class Intake:
         if fault is not None:
             self._fail(self._requests.alone(slot), lambda _: fault)
             return
-        self._requests.anything_ended = (
-            True  # What is in flight has changed, and nobody gets a reply.
-        )
+        # What is in flight has changed, and nobody gets a reply.
+        self._requests.anything_ended = True
         self._send_again(completion.host_id, self._requests.alone(slot))
 
     def apply_error(self, slot: int, error: ErrorText) -> EnvRaised | None:

@@ -1,10 +1,10 @@
 """`Continuity`: where each env is in its episode, and what its next result must report.
 
-For every env it counts steps and remembers whether the last returned result ended the episode;
-these are arrays, updated when a batch is returned. For the few envs that lost an episode, or show
-a state that was put back, it runs the transition table `LEGAL`. It also keeps the checkpoints from
-which a replaced worker resumes. Left out: hosts, time and I/O; callers say what was sent, answered
-and returned.
+For every env it counts steps, up to the limits of `auto_reset`, and remembers whether the last
+returned result ended the episode; these are arrays, updated when a batch is returned. For the few
+envs that lost an episode, or show a state that was put back, it runs the transition table `LEGAL`.
+It also keeps the checkpoints from which a replaced worker resumes. Left out: hosts, time and I/O;
+callers say what was sent, answered and returned.
 """
 
 from __future__ import annotations
@@ -150,8 +150,8 @@ class _Loss:
         from_checkpoint: it was built anew from its last checkpoint, which it can show.
         resumes: the request that was lost with the worker was to show a state.
         seed: of the reset that reports it; `AS_BEFORE` where its env may know that.
-        position: of the state that the reply in flight will show; of this phase only, as
-        steps_lost: see `Report`.
+        position, steps_lost: of this phase only: the position of the state that the reply in flight
+            will show; see `Report`.
     """
 
     phase: LossPhase
@@ -356,7 +356,7 @@ class Continuity:
     # -- replies ----------------------------------------------------------------------
 
     def lose(self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False) -> None:
-        """Record that the episodes of `slots` are lost; nothing is in flight there.
+        """Record that the episodes of `slots` are lost; no request that reports it is in flight.
 
         `from_checkpoint`: the envs are built anew, from their checkpoints where they have any.
         """
@@ -509,7 +509,7 @@ class Continuity:
         self._ended[part.slots[ended]] = True
 
     def positions(self, slots: NDArray[np.intp]) -> list[Position]:
-        """Return the positions of `slots`, all idle; after a loss, those of their checkpoints."""
+        """Return the positions at the last results of `slots`, or of checkpoints after a loss."""
         found: list[Position] = []
         for slot in slots.tolist():
             loss = self._losses.get(slot)
@@ -522,7 +522,7 @@ class Continuity:
         return found
 
     def why_lost(self, slot: int, *, unless_saved: bool = False) -> Loss | None:
-        """Why an idle env lost its episode; None if not, or if one `unless_saved` is to go on."""
+        """Return why an env lost its episode; None if not, or if it goes on, `unless_saved`."""
         loss = self._losses.get(slot)
         if loss is None or (unless_saved and loss.from_checkpoint and self._checkpoint(slot)):
             return None

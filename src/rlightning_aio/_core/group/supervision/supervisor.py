@@ -424,7 +424,7 @@ class Supervisor:
         record.restart_at = now + pause
 
     def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
-        """Count a death, decide if the host is replaced, and report it."""
+        """Count a death, decide if the host is replaced, log that, and return what it means."""
         requests = self._requests
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.

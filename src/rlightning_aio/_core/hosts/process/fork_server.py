@@ -2,8 +2,8 @@
 
 One runs for each combination of interpreter and environment variables. It has imported the modules
 of the simulator, so a worker starts in milliseconds. It passes on what workers write to stdout and
-stderr, and keeps the last lines of each. When the trainer closes its end of the socket or dies, all
-workers are killed.
+stderr, and keeps the end of each. When the trainer closes its end of the socket or dies, it shuts
+down the channels of all workers, and kills those that don't end soon.
 Rule: it has one thread when it forks. It builds no env.
 """
 

@@ -2,7 +2,8 @@
 
 Rule: one thread, no asyncio. Requests are executed in the order of sending, and every
 request gets exactly one reply with its own entry. An idle worker spins for a moment (see
-`spinner`), then sleeps on its channel.
+`spinner`), then sleeps on its channel. Left out: awaitable envs, whose requests
+`awaiting.worker_loop` executes at the same time, on an event loop.
 """
 
 from __future__ import annotations

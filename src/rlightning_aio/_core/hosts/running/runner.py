@@ -537,7 +537,7 @@ def attach_all(
 
 
 def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
-    """Seed a replacement, restore its envs that have a checkpoint, and go on filming others."""
+    """Seed a replacement, restore its envs that have a checkpoint, and film those that were."""
     if order.seed is not None:
         # Not the numbers of an episode that begins with that seed.
         seed_generators(order.seed, order.restarts, 1)
