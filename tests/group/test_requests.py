@@ -89,7 +89,7 @@ class Driven:
     def _ask(self, slots: list[int], op: int, owner: int) -> None:
         asked = np.array(slots)
         self.table.issue(asked, op, owner, 1.0)
-        for _ in self.table.by_host(asked):
+        for _ in self.table.put_in_flight(asked):
             pass
 
     def _call(self) -> None:

@@ -78,10 +78,11 @@ class Origin(msgspec.Struct):
     """Group and slots of a batch, so that the answer to it needs no look-up.
 
     Attributes:
+        issuer: stands for the group that has returned it: its `Tables`.
         repeats: True if `slots` may have an env twice; the group then looks the envs up.
     """
 
-    group: Issuer | None
+    issuer: Issuer | None
     slots: NDArray[np.intp]
     names: EnvNames
     repeats: bool = False
@@ -388,7 +389,7 @@ class BatchedData:
         if sources is not None:
             sources = taken_sources(sources, chosen)
         slots = origin.slots[chosen]
-        return with_repeats(batch_of_results(parts, origin.group, slots, origin.names, sources))
+        return with_repeats(batch_of_results(parts, origin.issuer, slots, origin.names, sources))
 
     # -- columns of responses -----------------------------------------------------
 
@@ -463,10 +464,10 @@ def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
     )
 
 
-def slots_of(batch: BatchedData, group: Issuer) -> NDArray[np.intp] | None:
-    """Slots of the envs, each once, if the batch was made by `group`."""
+def slots_of(batch: BatchedData, issuer: Issuer) -> NDArray[np.intp] | None:
+    """Slots of the envs, each once, if the batch is from the group of `issuer`."""
     origin = batch._origin
-    if origin is None or origin.group is not group or origin.repeats:
+    if origin is None or origin.issuer is not issuer or origin.repeats:
         return None
     return origin.slots
 
@@ -492,7 +493,7 @@ def _entry_of(env_id: str) -> str:
 
 def batch_of_results(
     parts: Sequence[ResultColumns],
-    group: Issuer | None,
+    issuer: Issuer | None,
     slots: NDArray[np.intp],
     names: EnvNames,
     sources: Sources | None = None,
@@ -501,7 +502,7 @@ def batch_of_results(
 
     Args:
         parts: one for each layout, with the positions of its rows unless it is the only one.
-        group: the group that returns the batch.
+        issuer: of the group that returns the batch; see `Origin`.
         slots: slot of each row.
         names: of the envs of the group.
         sources: see `Sent`.
@@ -509,7 +510,7 @@ def batch_of_results(
     batch = BatchedData.__new__(BatchedData)
     batch._ids = batch._values = batch._columns = batch._env_ids = batch._infos = None
     batch._parts = parts
-    batch._origin = Origin(group, slots, names)
+    batch._origin = Origin(issuer, slots, names)
     batch._sources = sources
     return batch
 
@@ -522,12 +523,12 @@ def with_repeats(batch: BatchedData) -> BatchedData:
     return batch
 
 
-def answer_of(batch: BatchedData, group: Issuer) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
-    """Distinct slots, and columns of responses, to results of `group`; None for other batches."""
+def answer_of(batch: BatchedData, issuer: Issuer) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
+    """Distinct slots, and columns of responses, to results of `issuer`; None for other batches."""
     if type(batch) is not BatchedData or batch._columns is None:
         return None
     origin = batch._origin
-    if origin is None or origin.group is not group or origin.repeats:
+    if origin is None or origin.issuer is not issuer or origin.repeats:
         return None
     return origin.slots, batch._columns
 
@@ -580,7 +581,7 @@ def _taken_responses(batch: BatchedData, columns: dict[str, Any], chosen: list[i
         env_ids = batch.env_ids()
         found._env_ids = [env_ids[k] for k in chosen]
     else:
-        found._origin = Origin(origin.group, origin.slots[chosen], origin.names)
+        found._origin = Origin(origin.issuer, origin.slots[chosen], origin.names)
     found._ids = [batch.ids()[k] for k in chosen]
     return with_repeats(found)
 

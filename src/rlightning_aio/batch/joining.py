@@ -45,7 +45,7 @@ def joined(batches: Sequence[BatchedData]) -> BatchedData:
         return batches[0]
     origins = [origin_of(batch) for batch in batches]
     last = origins[-1]
-    if last is None or any(o is None or o.group is not last.group for o in origins):
+    if last is None or any(o is None or o.issuer is not last.issuer for o in origins):
         raise ValueError("only batches of results of one group can be joined")
     slots = np.concatenate([cast("Origin", origin).slots for origin in origins])
     placed = [part for k, batch in enumerate(batches) for part in _placed(batch, batches[:k])]
@@ -53,7 +53,7 @@ def joined(batches: Sequence[BatchedData]) -> BatchedData:
     if len(parts) == 1:
         parts = [replace(parts[0], positions=None)]
     sources = joined_sources([(sources_of(batch), len(batch)) for batch in batches])
-    return with_repeats(batch_of_results(parts, last.group, slots, last.names, sources))
+    return with_repeats(batch_of_results(parts, last.issuer, slots, last.names, sources))
 
 
 def _placed(batch: BatchedData, before: Sequence[BatchedData]) -> list[ResultColumns]:

@@ -35,8 +35,8 @@ def can_await(batch: BatchedData) -> bool:
     except RuntimeError:
         return False
     origin = origin_of(batch)
-    group = None if origin is None else origin.group
-    return group is None or group.shares_thread
+    issuer = None if origin is None else origin.issuer
+    return issuer is None or issuer.shares_thread
 
 
 def answers_of(

@@ -63,7 +63,7 @@ class EnvGroup(GroupInterface):
         try:
             metas = await self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
-            self._closed()
+            self._after_close()
             raise
         self._driver.call_time.begin(time.monotonic())
         return metas
@@ -165,7 +165,7 @@ class EnvGroup(GroupInterface):
         try:
             await self._driver.run_last(self._core.close(time.monotonic()))
         finally:
-            self._closed()
+            self._after_close()
 
 
 class EnvHandle(EnvHandleInterface):

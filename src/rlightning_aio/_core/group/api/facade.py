@@ -423,7 +423,8 @@ class Facade:
         self._driver.forget()
         self._core.supervisor.shutdown.disown()
 
-    def _closed(self) -> None:
+    def _after_close(self) -> None:
+        """End timelines, and warn of what closing has raised."""
         if not self._core.lifetime.closed:
             return  # `close` raised before it closed anything.
         self._finalizer.detach()

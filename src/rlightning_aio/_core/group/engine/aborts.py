@@ -81,7 +81,7 @@ class Aborts:
             self._requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
-        self._waiting.wake_server()  # It may have results of these that it has not handed out.
+        self._waiting.wake_serving()  # It may have results of these that it has not handed out.
         chosen = set(slots.tolist())
         now = yield from self._waiting.until(now, lambda: len(aborted.faults.keys() & chosen))
         self._arrivals.admit(slots, self._intake.now)

@@ -58,7 +58,7 @@ class StepEnd(NamedTuple):
 
 
 class _Reply(Protocol):
-    """A future of an agent that waits for an `StepEnd`; done early if the agent is cancelled."""
+    """A future of an agent that waits for a `StepEnd`; done early if the agent is cancelled."""
 
     def done(self) -> bool: ...
 
@@ -130,7 +130,7 @@ class AgentSteps:
             self._is_served = True
             return True
         if len(self._asked) == 1:
-            self._waiting.wake_server()
+            self._waiting.wake_serving()
         return False
 
     def loss(self, env_id: str) -> Outcome | None:

@@ -165,8 +165,8 @@ class Dispatch:
         entries: NDArray[np.int64],
         arguments: Sequence[Any] | None = None,
     ) -> None:
-        """Give submitted requests to their hosts, one call per run of slots of the same host."""
-        for host_id, part in self._requests.by_host(slots):
+        """Give issued requests to their hosts, one call per run of slots of the same host."""
+        for host_id, part in self._requests.put_in_flight(slots):
             given = None if arguments is None else arguments[part]
             self._supervisor.submit(host_id, entries[part], given)
 
@@ -177,7 +177,7 @@ class Dispatch:
         packed: Packed,
         resets: NDArray[np.bool_],
     ) -> None:
-        """Give submitted steps to their hosts; without their arguments where they became resets."""
+        """Give issued steps to their hosts; without their arguments where they became resets."""
         positions, arguments = packed
         out_of_band = np.zeros(len(slots), np.bool_)
         out_of_band[positions] = True

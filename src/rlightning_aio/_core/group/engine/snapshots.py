@@ -112,13 +112,14 @@ class Snapshots:
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, str]] = []
         for slot, (num_steps, is_cut), loss, reply in replies:
-            versions, was_reset, state = cast("EnvState", reply)
+            versions, has_result, checkpoint = cast("EnvState", reply)
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
             env_id = self._envs.env_ids[slot]
-            why_not = "" if was_reset else "has no state yet"
-            if was_reset and loss is not None:
+            why_not = "" if has_result else "has no state yet"
+            if has_result and loss is not None:
                 why_not = f"has a state whose episode was lost ({loss.cause})"
-            snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), why_not))
+            snapshot = EnvSnapshot(env_id, identity, num_steps, is_cut, checkpoint)
+            snapshots.append((snapshot, why_not))
         return snapshots, later
 
     def restore(

@@ -135,6 +135,7 @@ class Waiting:
             else:
                 # Other calls may wait for fewer results.
                 first = min(self.wanted)
+                # A quick look; `spin` decides.
                 may_spin = len(in_flight) - in_flight.count(0) < poller.num_cores
                 if (may_spin and poller.spin(first)) or poller.arm(first):
                     now = yield TURN
@@ -209,12 +210,12 @@ class Waiting:
     ) -> Procedure[tuple[Ticket, float]]:
         """Send requests, and wait for all replies; return them in their ticket, and the time.
 
-        After an error or cancellation, `collect_async` gets what `give_up` leaves to it.
+        After an error or cancellation, `collect_async` gets what `Requests.give_up` leaves to it.
 
         Args:
             now: monotonic seconds.
             slots: whose requests.
-            send: submits all of them for the ticket that it gets, or raises before the first.
+            send: sends all of them for the ticket that it gets, or raises before the first.
             method: see `Tickets.open`.
         """
         ticket = self._requests.tickets.open(slots, method=method)
@@ -262,7 +263,7 @@ class Waiting:
             self._leave(ticket)
         self._requests.settle(ticket)
 
-    def wake_server(self) -> None:
+    def wake_serving(self) -> None:
         """Let the call of `serve` work in the next turn."""
         if self._served is None:
             return  # It has not begun.
@@ -306,8 +307,8 @@ class Waiting:
 class Poller:
     """Gets results from the hosts of one group with as few wake-ups as possible.
 
-    It spins briefly, arms the bell of the workers, polls hosts that ring no bell, and executes the
-    requests of inline hosts.
+    It reads what hosts have ready, spins briefly for more, arms the bell of the workers, and
+    executes the requests of inline hosts.
 
     Args:
         requests: counts the requests in flight at each host.
@@ -436,4 +437,5 @@ class Poller:
             bell.disarm()
             return False
         wanted = min(wanted, total)
+        # As `TrainerBell.goal`, without a call.
         return bell.arm(bell.read[-1] + wanted, at_last=wanted == total)

@@ -62,7 +62,7 @@ def _asked(slots: NDArray[np.intp], owner: int) -> Changes:
 
 
 def _given_up(requests: Requests, ticket: Ticket) -> Changes:
-    slots = ticket.submitted(requests.owner)
+    slots = ticket.own_slots(requests.owner)
     slots = slots[requests.state[slots] != State.IDLE]  # An interrupt came before it was sent.
     values = slots if ticket.calls else slots[:0]
     return [(Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, np.setdiff1d(slots, values))]

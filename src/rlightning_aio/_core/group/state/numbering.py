@@ -76,6 +76,6 @@ class Numbering:
     def into_resets(
         self, slots: NDArray[np.intp], entries: NDArray[np.int64], which: NDArray[np.bool_]
     ) -> None:
-        """Make resets of those steps, submitted and not yet handed over, that `which` marks."""
+        """Make resets of those steps, issued and not yet handed over, that `which` marks."""
         entries += which  # RESET == STEP + 1
         self.entry[slots] = entries

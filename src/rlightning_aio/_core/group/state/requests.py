@@ -62,7 +62,7 @@ class Ticket(msgspec.Struct):
     errors: dict[int, EnvFault] = {}
     values: dict[int, Any] = {}
 
-    def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
+    def own_slots(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
         """Return the slots whose requests are its own, by the `owner` of each request."""
         if self.apart:
             return np.flatnonzero(owner == self.owner)
@@ -104,7 +104,7 @@ class Tickets:
         self._next_owner = 1
 
     def open(self, slots: NDArray[np.intp], *, method: str = "", apart: bool = False) -> Ticket:
-        """Open a ticket for a call whose requests are about to be submitted.
+        """Open a ticket for a call whose requests are about to be issued.
 
         Args:
             slots: whose requests.
@@ -307,8 +307,8 @@ class Requests:
             self._fence,
         )
 
-    def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
-        """Each host with its part of submitted `slots`: in flight from now on.
+    def put_in_flight(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
+        """Count issued requests of `slots` as in flight; return each host with its part of them.
 
         One part for each run of slots of one host.
         """
@@ -557,7 +557,7 @@ class Requests:
 
     def give_up(self, ticket: Ticket) -> None:
         """Close a ticket that no longer waits: its steps and resets go to the collector."""
-        slots = ticket.slots = ticket.submitted(self.owner)
+        slots = ticket.slots = ticket.own_slots(self.owner)
         self.settle(ticket)
         if ticket.calls:
             self.owner[self.owed(slots)] = NOBODY

@@ -74,7 +74,8 @@ class SlabLayout:
         self.slab = np.zeros(size, np.intp)
         self.row = np.zeros(size, np.intp)
         self.row_is_slot = False
-        self._places: list[tuple[int, int]] = []
+        # Offset in the arena, and number of rows, of each slab there.
+        self._parts: list[tuple[int, int]] = []
 
     def lay_out(self, started: Sequence[EnvStarted], arena: Arena) -> None:
         """Give each local env a row in the slab of its layout.
@@ -89,7 +90,7 @@ class SlabLayout:
         for layout, rows in sizes:
             size = layout.size(rows)
             offset = arena.append(size)
-            self._places.append((offset, rows))
+            self._parts.append((offset, rows))
             self.slabs.append(Slab(layout, arena.map(offset, size), rows))
         self._note_rows()
 
@@ -97,7 +98,7 @@ class SlabLayout:
         """The message that gives a host of local envs their rows."""
         slots = range(first_slot, first_slot + num_envs)
         rows = tuple((int(self.slab[slot]), int(self.row[slot])) for slot in slots)
-        return AttachOrder(tuple(self._places), rows)
+        return AttachOrder(tuple(self._parts), rows)
 
     def add(self, slab: Slab, first_slot: int) -> None:
         """Add the slab of a host that envs join, with one row for each of its slots in order."""

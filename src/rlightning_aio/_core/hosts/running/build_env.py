@@ -45,8 +45,8 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
     """
     if not inline:
         seed_generators()
-    for place in range(len(order.worker_indices)):
-        yield built_env(order, place, inline=inline)
+    for index in range(len(order.worker_indices)):
+        yield built_env(order, index, inline=inline)
 
 
 def not_built(
@@ -57,23 +57,23 @@ def not_built(
     return NotBuilt(host_id, min(num_built, most - 1), ErrorText.of(error))
 
 
-def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunner:
+def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunner:
     """Build one env of a host.
 
     Args:
         order: of the host.
-        place: the env's index in the host.
+        index: of the env in the host.
         inline: see `EnvRunner`.
 
     Raises:
         TypeError: the env is awaitable and its placement can't await it, or the reverse.
     """
-    config, index = order.config, order.worker_indices[place]
+    config, worker_index = order.config, order.worker_indices[index]
     if makers := makers_of(config):
-        config = config.model_copy(update={"task": makers[place]})
+        config = config.model_copy(update={"task": makers[index]})
 
     def make() -> BaseEnv:
-        env = _built(order, config, index, order.preprocess_fns[place])
+        env = _built(order, config, worker_index, order.preprocess_fns[index])
         env.trainer_pid = None if inline else order.trainer_pid
         return env
 
@@ -109,10 +109,10 @@ def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
     return AwaitedRunner
 
 
-def _built(order: StartOrder, config: EnvConfig, index: int, preprocess_fn: Any) -> BaseEnv:
+def _built(order: StartOrder, config: EnvConfig, worker_index: int, preprocess_fn: Any) -> BaseEnv:
     if order.tasks:
         # Only if one is missing: a module that registers it here would cause a warning.
         with contextlib.suppress(UnregisteredEnv):
-            return build_env(config, order.env_class, index, preprocess_fn)
+            return build_env(config, order.env_class, worker_index, preprocess_fn)
         register_tasks(order.tasks)
-    return build_env(config, order.env_class, index, preprocess_fn)
+    return build_env(config, order.env_class, worker_index, preprocess_fn)
