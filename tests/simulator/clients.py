@@ -236,13 +236,13 @@ class Client:
     def note_aborted(self) -> None:
         """Note that the trainer has dropped a result, or has ended the session."""
         request, self.env.request = self.env.request, None
-        for state in (self.env.state, *self.env.loose):
-            if request is not None and request.kind != "join":
+        if request is not None and request.kind != "join":
+            states = [self.env.state, *self.env.loose]
+            for state, one in itertools.product(states, request.alternatives()):
                 done = state.copy()
-                done.play(request)
+                done.play(one)
                 done.count = state.count if request.kind == "step" else 0
                 self.env.loose.append(done)
-        if request is not None and request.kind != "join":
             self.dropped.append(request)
         self.troubles += 1
         # A first result answers a step, too.
@@ -296,11 +296,13 @@ class Client:
 
     def _after_dropped(self, state: State) -> Iterator[State]:
         """The states after each end of what was dropped, which may have come to this session."""
-        for begin in range(len(self.dropped) + 1):
-            again = state.copy()
-            for request in self.dropped[begin:]:
-                again.play(request)
-            yield again
+        each = [request.alternatives() for request in self.dropped]
+        for begin in range(len(each) + 1):
+            for requests in itertools.product(*each[begin:]):
+                again = state.copy()
+                for request in requests:
+                    again.play(request)
+                yield again
 
     def _judge_lost(self, model: Model, request: Request, row: Row) -> None:
         # A reset may be sent to one that is about to come back.
@@ -310,7 +312,8 @@ class Client:
         seen = [self.last, *(state.scripts.words for state in self.env.loose)]
         if request.resets or self.is_out:  # Which may have dropped a first result.
             seen += [expected.outcome.words for _, _, expected in self._played(model, request)]
-            seen += [state.scripts.words for state in self._firsts()]
+            ends = (self._after_dropped(state) for state in self._firsts())
+            seen += [end.scripts.words for end in itertools.chain.from_iterable(ends)]
         require(row.words in seen, "not its last observation", seen)
         self.is_in, self.is_out, self.env.dirty, self.withdrawn = False, True, False, None
         model.counts["clients lost"] += 1
