@@ -191,7 +191,7 @@ def test_an_env_that_was_not_built_anew_saves_nothing_before_its_reset() -> None
     assert continuity.why_lost(0, unless_saved=True) == KILLED
     continuity.report_losses(SLOT, STEP)
     continuity.save(0, b"somewhere", 2, before=True, is_step=False)
-    assert continuity.checkpoints([0]) == (b"state",)
+    assert continuity.checkpoints([0]) == (None,)
 
 
 def test_a_restore_that_was_given_up_leaves_no_checkpoint() -> None:
@@ -203,4 +203,14 @@ def test_a_restore_that_was_given_up_leaves_no_checkpoint() -> None:
     reset = entry(3, 0, Operation.RESET)
     continuity.save(0, b"a reset", reset, before=False, is_step=False)
     continuity.drop_unfinished([0], {reset})
-    assert continuity.checkpoints([0]) == (b"state",)
+    assert continuity.checkpoints([0]) == (None,)
+
+
+@pytest.mark.parametrize("phase", [LossPhase.SHOWING, LossPhase.RESUMING, LossPhase.RESETTING])
+def test_a_death_resumes_no_episode_whose_request_has_raised(phase: LossPhase) -> None:
+    """Its next step begins a new one, as without the death."""
+    continuity = in_phase(phase)
+    continuity.ended_without_result(0)
+    continuity.lose([0], AGAIN, from_checkpoint=True)
+    _, seeds = continuity.report_losses(SLOT, STEP)
+    assert seeds.tolist() == [NO_SEED]

@@ -358,22 +358,23 @@ class Continuity:
     def lose(self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False) -> None:
         """Record that the episodes of `slots` are lost; no request that reports it is in flight.
 
-        `from_checkpoint`: the envs are built anew, from their checkpoints where they have any.
+        `from_checkpoint`: the envs are built anew, from their checkpoints where they have any. Else
+        no checkpoint of theirs is used, whatever happens before they are reset.
         """
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
             loss.why, loss.from_checkpoint, loss.seed = why, from_checkpoint, NO_SEED
+            if not from_checkpoint:
+                self._forget(slot)
 
     def abandon(self, slots: Iterable[int], why: Loss) -> None:
         """Record that the caller has ended the episodes of `slots`, whose requests end without a
-        reply, or whose results were dropped. No checkpoint of them is used.
+        reply, or whose results were dropped.
         """
         slots = list(slots)
         self.lose(slots, why)
         for slot in slots:
             self._losses[slot].seed = AS_BEFORE
-            for kept in (self._pending, self._checkpoints, self._restored):
-                kept.pop(slot, None)
 
     def take_answers(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
@@ -399,15 +400,20 @@ class Continuity:
         reports = loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING)
         why = loss.why if reports else None
         self._move(slot, LossEvent.RAISED).from_checkpoint = False
+        self._forget(slot)
         return why
+
+    def _forget(self, slot: int) -> None:
+        """Forget from where the episode before would go on."""
+        for kept in (self._pending, self._checkpoints, self._restored):
+            kept.pop(slot, None)
 
     def give_up(self, slots: Iterable[int]) -> None:
         """Forget losses and checkpoints of `slots`, whose host will not be replaced."""
         for slot in slots:
             if slot in self._losses:
                 self._move(slot, LossEvent.GIVEN_UP)
-            self._pending.pop(slot, None)
-            self._checkpoints.pop(slot, None)
+            self._forget(slot)
 
     def _move(self, slot: int, event: LossEvent) -> _Loss:
         """Apply an event of one slot by the table."""
