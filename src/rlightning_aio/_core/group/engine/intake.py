@@ -114,7 +114,7 @@ class Intake:
         if completion.is_loss:
             self._results.mark_away(slot)
         if completion.restarted is not None:
-            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted.cause)
+            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
             self._results.mark_restarted(Report(slot, completion.restarted, None))
         if self._conditions.unusual:
             self._note_answered(

@@ -115,8 +115,8 @@ class Lifetime:
 
 NO_SPAN: Final = contextlib.nullcontext()
 """The span of other work while no observer is attached."""
-Fate: TypeAlias = Literal["hung", "raised", "died", "given up", "up"]
-"""What may happen to a host after its first start."""
+Fate: TypeAlias = Literal["hung", "raised", "rebuilt", "died", "given up", "up"]
+"""What may happen to a host after its first start, or to one of its envs."""
 
 
 class Observer(Protocol):

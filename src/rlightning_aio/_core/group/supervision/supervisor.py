@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.outcomes import Loss
 
 __all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
 
@@ -452,10 +453,11 @@ class Supervisor:
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return loss
 
-    def note_rebuilt(self, host_id: int, slot: int, cause: str) -> None:
+    def note_rebuilt(self, host_id: int, slot: int, why: Loss) -> None:
         """Record that a host has rebuilt one of its envs."""
         self.records[host_id].restarts += 1
-        self._tables.observed.note_fate("hung", host_id, slot, cause)
+        fate: Fate = "hung" if why.kind == "env_hung" else "rebuilt"
+        self._tables.observed.note_fate(fate, host_id, slot, why.cause)
 
     def note_lost_env(self, host_id: int, slot: int) -> None:
         """Record that a host will not rebuild one of its envs."""
