@@ -35,6 +35,7 @@ from rlightning_aio._core.hosts.messages import (
 from rlightning_aio.errors import EnvAway, env_raised
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, answers_with_value
+from rlightning_aio.protocol.slab import AS_BEFORE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -149,7 +150,7 @@ class Intake:
             return fault
         kind, blame = fault.outcome.kind, fault.outcome.blame
         why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
-        self._continuity.abandon([slot], why)
+        self._continuity.lose([slot], why, seed=AS_BEFORE)
         return None if self._supervisor.env_errors.count_restart(slot, error, fault) else fault
 
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:

@@ -30,7 +30,7 @@ from rlightning_aio._core.group.state.conditions import (
 )
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, op_of
-from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
+from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable
@@ -355,26 +355,19 @@ class Continuity:
 
     # -- replies ----------------------------------------------------------------------
 
-    def lose(self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False) -> None:
+    def lose(
+        self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False, seed: int = NO_SEED
+    ) -> None:
         """Record that the episodes of `slots` are lost; no request that reports it is in flight.
 
         `from_checkpoint`: the envs are built anew, from their checkpoints where they have any. Else
-        no checkpoint of theirs is used, whatever happens before they are reset.
+        no checkpoint of theirs is used, whatever happens before they are reset. `seed`: of `_Loss`.
         """
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
-            loss.why, loss.from_checkpoint, loss.seed = why, from_checkpoint, NO_SEED
+            loss.why, loss.from_checkpoint, loss.seed = why, from_checkpoint, seed
             if not from_checkpoint:
                 self._forget(slot)
-
-    def abandon(self, slots: Iterable[int], why: Loss) -> None:
-        """Record that the caller has ended the episodes of `slots`, whose requests end without a
-        reply, or whose results were dropped.
-        """
-        slots = list(slots)
-        self.lose(slots, why)
-        for slot in slots:
-            self._losses[slot].seed = AS_BEFORE
 
     def take_answers(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
