@@ -784,7 +784,7 @@ class Model:
         if request.resets and env.since_save:
             env.saves, env.since_save = env.before_reset, 0
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
-            env.torn = env.after_loss()
+            env.torn = [*env.after_loss(), env.fresh()]
         acts = self._raising(env, request)
         for state in (env.state, *env.loose):  # What has raised has no grudge any more.
             state.faults(self._executed(env, request))
@@ -813,7 +813,7 @@ class Model:
         check_raised(fault, effect, token)
         if effect == UNSHOWN:
             env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
-            env.torn = env.after_loss()
+            env.torn = [*env.after_loss(), env.fresh()]
             self.counts["resumed, and not shown"] += 1
         if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
             check_outcome(fault, request, effect, token)

@@ -246,7 +246,8 @@ class Training(InContext):
         else:
             raise Violation("no rollout is collected any more")
         if not (self.disturbed or self.clients or any(env.deaths for env in self.envs)):
-            await self.replay()
+            # An env may press Ctrl-C in a step that the recorded run didn't wait for.
+            await self.interruptible(self.replay())
         await super().finish()
 
     async def replay(self) -> None:
