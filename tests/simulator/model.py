@@ -276,6 +276,15 @@ class State:
             self.counted[k] = self.counted[k] and not ends[k]
 
 
+def distinct(states: Iterable[State]) -> list[State]:
+    """The same without those that are like an earlier one."""
+    by_content: dict[str, State] = {}
+    for state in states:
+        subs = [vars(sub) for sub in state.scripts.subs]
+        by_content.setdefault(repr((subs, vars(state) | {"scripts": None})), state)
+    return list(by_content.values())
+
+
 @dataclass
 class Env:
     """An env of the group, as far as its results are known.
@@ -470,7 +479,7 @@ class Model:
                 request.due = env.state.cut or (context.on_done and env.state.ended)
         if request.resets and env.saves and env.since_save:  # That is saved before a reset.
             env.before_reset = [state.copy() for state in env.possible()]
-            env.saves += env.before_reset
+            env.saves = distinct([*env.saves, *env.before_reset])
         acts = env.state.copy().faults(request)
         effects = [effect for effect, _ in acts]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
