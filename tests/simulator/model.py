@@ -817,7 +817,8 @@ class Model:
         self, env: Env, request: Request, fault: EnvRaised, raising: list[Act]
     ) -> None:
         """Check an exception that is one of those that an env was to raise."""
-        likely = [act for act in raising if str(act[1]) in fault.exception_text]
+        found = fault.exception_text.partition(AGAIN)[0]
+        likely = [act for act in raising if raised_text(*act) == found]
         effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
         check_raised(fault, effect, token)
         if effect == UNSHOWN:
@@ -866,14 +867,25 @@ class Model:
                     other.gone = True
 
 
+def raised_text(effect: str, token: int) -> str:
+    """What an env says that raises; nothing at Ctrl-C."""
+    texts = {
+        "raise": f"as asked for: {token}",
+        "raise oddly": f"odd {token}",
+        UNSHOWN: f"the result can't be pickled: {NOT_SHOWN}",
+    }
+    return texts.get(effect, "")
+
+
 def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
     """Compare an error with what an env was to raise."""
-    text, kind, builtin = {
-        "raise": (f"as asked for: {token}", *_raised_class(token)),
-        "raise oddly": (f"odd {token}", "Odd", EnvRaised),
-        "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
-        UNSHOWN: (f"the result can't be pickled: {NOT_SHOWN}", "TypeError", TypeError),
+    kind, builtin = {
+        "raise": _raised_class(token),
+        "raise oddly": ("Odd", EnvRaised),
+        "ctrl-c": ("KeyboardInterrupt", EnvRaised),
+        UNSHOWN: ("TypeError", TypeError),
     }[effect]
+    text = raised_text(effect, token)
     found = fault.exception_text.partition(AGAIN)[0]
     require(found == text, "another error", fault.exception_text, text)
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
