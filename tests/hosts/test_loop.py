@@ -486,7 +486,7 @@ async def test_a_reset_that_takes_too_long_is_repeated_by_a_new_env(place: dict[
         assert batch.observation.tolist() == [[2, 1, 0, 7], [2, 1, 0, 8]]
 
 
-@pytest.mark.parametrize(("max_restarts", "after"), [(0, "reset"), (1, "step")])
+@pytest.mark.parametrize(("max_restarts", "after"), [(0, "reset"), (1, "step"), (0, "call")])
 async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
     place: dict[str, Any], max_restarts: int, after: str
 ) -> None:
@@ -500,7 +500,9 @@ async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
                 assert batch.restarted.all()
             with pytest.raises(EnvHung, match=f"after {max_restarts + failed} restarts in a row"):
                 await group.step(steps(e_1=HANG))
-            if after == "step":
+            if after == "call":  # It is answered by an env that has begun no episode.
+                assert await group.call("get_attr", "episodes", env_ids=["e-1"]) == [0]
+            if after != "reset":
                 batch, _ = await group.step(steps(e_1=STEP))
                 assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
             else:

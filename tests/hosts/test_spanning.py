@@ -11,7 +11,7 @@ from hosts.spanning import ADD, CRASH, HANG, OWN, RAISE
 from timelines import Seen
 
 import rlightning_aio as rl
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import EnvRaised, EpisodeLost
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -82,3 +82,20 @@ async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
         assert batch.restarted.tolist() == [False]
         batch, _ = await group.step(steps(e_0=ADD, e_1=ADD))
         assert batch.observation.tolist() == [1, 1]
+
+
+async def test_no_call_is_answered_for_an_episode_by_an_env_that_was_built_since(
+    config: dict[str, Any],
+) -> None:
+    """And the new env is reset before it is stepped."""
+    async with rl.build_env_group(config) as group:
+        async with group.episode("e-0", seed=5) as episode:
+            await episode.step(CRASH)
+            with pytest.raises(EpisodeLost, match="ended while it was idle: hosts"):
+                await episode.call("get_attr", "env_id")
+        assert group.num_restarts == 1
+        batch, _ = await group.step(steps(e_0=ADD))
+        assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
+        assert "ended while it was idle: hosts.spanning.Crash" in batch.info("worker_restarted")[0]
+        assert (batch.info("seed"), batch.info("options")) == ([5], [None])
+        assert group.num_restarts == 1

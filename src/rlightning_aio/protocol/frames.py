@@ -38,6 +38,7 @@ class FrameKind(IntEnum):
     RESTARTED = 14  # worker; the request's entry: why its env was rebuilt, and as for RESULT
     FAULTED = 15  # worker; the request's entry: an error of this package, and if it is for good
     ABORT = 16  # trainer; the request's entry
+    LOST = 17  # worker; index of an env: why its episode is lost
 
 
 class Frame(NamedTuple):

@@ -17,6 +17,7 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     ErrorText,
     Faulted,
+    Lost,
     NewSchema,
     NotBuilt,
     Raised,
@@ -90,6 +91,7 @@ _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
     Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
     Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
     Faulted: lambda it: (FrameKind.FAULTED, it.entry, pickle.dumps((it.fault, it.for_good))),
+    Lost: lambda it: (FrameKind.LOST, it.env_index, pickle.dumps(it.why)),
     Closed: lambda it: (FrameKind.CLOSED, 0, pickle.dumps(it.errors)),
 }
 """By the class of a completion: kind, number and payload of its frame."""
@@ -111,6 +113,7 @@ _DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
     FrameKind.VALUE: lambda host, entry, payload: Value(host, entry, pickle.loads(payload)),
     FrameKind.ERROR: lambda host, entry, payload: Raised(host, entry, pickle.loads(payload)),
     FrameKind.FAULTED: lambda host, entry, payload: Faulted(host, entry, *pickle.loads(payload)),
+    FrameKind.LOST: lambda host, index, payload: Lost(host, index, pickle.loads(payload)),
     FrameKind.CLOSED: lambda host, _, payload: Closed(host, pickle.loads(payload)),
 }
 """By the kind of a frame: its completion, of a host, a number and a payload."""

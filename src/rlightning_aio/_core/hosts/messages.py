@@ -50,6 +50,7 @@ __all__ = [
     "Faulted",
     "FilmOrder",
     "Joined",
+    "Lost",
     "NewSchema",
     "NotBuilt",
     "OutOfBand",
@@ -347,6 +348,14 @@ class Faulted(NamedTuple):
     for_good: bool = False
 
 
+class Lost(NamedTuple):
+    """An env was rebuilt to answer a call: its episode is lost, and the call begins no other."""
+
+    host_id: int
+    env_index: int
+    why: Loss
+
+
 class Withdrawn(NamedTuple):
     """A request will not be answered: its env is away, or it was aborted, and the caller knows."""
 
@@ -374,7 +383,7 @@ class Joined(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Saved | Reported | Result | Value | Raised | Faulted | Withdrawn | Joined
+    | Saved | Reported | Result | Value | Raised | Faulted | Lost | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

@@ -23,6 +23,7 @@ from rlightning_aio._core.hosts.messages import (
     ErrorText,
     Faulted,
     Joined,
+    Lost,
     NewSchema,
     NotBuilt,
     Raised,
@@ -84,6 +85,7 @@ class Intake:
             Value: self._on_value,
             Raised: self._on_raised,
             Faulted: self._on_faulted,
+            Lost: self._on_lost,
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Joined: self._on_joined,
@@ -194,6 +196,12 @@ class Intake:
         if completion.for_good:
             self._supervisor.note_lost_env(completion.host_id, slot)
         self._fail(self._requests.alone(slot), lambda _: completion.fault)
+
+    def _on_lost(self, completion: Lost) -> None:
+        slot = self._supervisor.records[completion.host_id].slots[completion.env_index]
+        if self._continuity.why_lost(slot) is None:  # Else that is known, as after an abort.
+            self._supervisor.note_rebuilt(completion.host_id, slot, completion.why)
+            self._continuity.lose([slot], completion.why, seed=AS_BEFORE)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)

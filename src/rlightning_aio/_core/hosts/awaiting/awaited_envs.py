@@ -31,13 +31,13 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     watched,
 )
 from rlightning_aio._core.hosts.limits import RestartPolicy, hung, limits_of, restart_pause
-from rlightning_aio._core.hosts.messages import ErrorText, Faulted, NotBuilt, Raised, Result
+from rlightning_aio._core.hosts.messages import ErrorText, Faulted, Lost, NotBuilt, Raised, Result
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvHung, WorkerDied
 from rlightning_aio.outcomes import Loss, Outcome
-from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
@@ -452,6 +452,8 @@ class AwaitedEnvs:
                 kind, message = WorkerDied, f"env {record.name!r} could not be rebuilt: {error!r}"
                 continue
             if not is_reset:
+                if answers_with_value(op_of(entry)):
+                    self._post(Lost(self._host_id, record.index, record.lost))
                 self._give(record, env)
                 return
             outcome = await self._reset(record, env)
