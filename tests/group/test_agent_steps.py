@@ -154,6 +154,19 @@ async def test_agents_of_a_worker_that_dies_lose_their_own_episodes() -> None:
         assert [lost.results.ids() for lost in found[:2]] == [["Counter-0"], ["Counter-1"]]
 
 
+async def test_an_episode_whose_worker_dies_in_its_reset_is_lost() -> None:
+    """Its first result is that of a replacement, which has not got its seed."""
+    async with rl.build_env_group(Counter, num_workers=1) as group:
+        async with group.episode(group.env_ids[0], 5, {"deed": DIE}) as episode:
+            assert episode.is_over
+            assert episode.lost is not None
+            assert episode.lost.kind == "env_died"
+            with pytest.raises(EpisodeLost, match="is lost: its env exited with code 3"):
+                await episode.step(GO)
+        async with group.episode(group.env_ids[0], 5) as episode:
+            assert (episode.is_over, episode.lost) == (False, None)
+
+
 async def test_each_agent_has_its_own_error_of_a_worker_that_is_not_replaced() -> None:
     fields: dict[str, Any] = {"envs_per_process": 2, "on_worker_death": "raise"}
     async with rl.build_env_group(Counter, num_workers=4, **fields) as group:

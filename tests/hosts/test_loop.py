@@ -294,6 +294,27 @@ async def test_an_episode_tells_that_it_was_lost(place: dict[str, Any]) -> None:
         assert batch.observation.tolist() == [[2, 1, 1, 3]]
 
 
+@pytest.mark.parametrize("end", ["abort", "drain"])
+@pytest.mark.parametrize("what", ["step", "call"])
+async def test_an_episode_tells_that_another_task_has_aborted_it(what: str, end: str) -> None:
+    """It is over, and further steps of it are refused."""
+    async with rl.build_env_group(entry()) as group, group.episode("e-0", seed=3) as episode:
+        Scripted.gates["e-0"] = asyncio.Event()
+        asked = episode.step(HANG) if what == "step" else episode.call("wait")
+        asking = asyncio.ensure_future(asked)
+        while not group.get_workers()[0]["owed"]:  # noqa: ASYNC110  # Twice.
+            await asyncio.sleep(0)
+        await getattr(group, end)()
+        with pytest.raises(EpisodeLost, match=f"the {what} of env 'e-0'"):
+            await asking
+        assert episode.is_over
+        assert episode.lost is not None
+        assert (episode.lost.kind, episode.lost.cause) == ("cancelled", "was aborted")
+        with pytest.raises(EpisodeLost, match="is lost: its env was aborted"):
+            await episode.step(STEP)
+        assert group.pending == []
+
+
 async def test_steps_that_have_not_begun_are_aborted_as_well() -> None:
     """Of envs that queue, or that are just being rebuilt."""
     config = entry(num_workers=3, max_concurrency=1)

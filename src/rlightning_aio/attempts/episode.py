@@ -119,9 +119,7 @@ class AttemptInPlay(AttemptEpisode):
             EnvFault: that has failed.
         """
         await self._timed(self._episode.__aenter__())
-        lost: Any = self.last.info.get("outcome")
-        if isinstance(lost, Outcome):  # Its worker died in the reset, and was replaced.
-            self.fault = lost
+        self.fault = self._episode.lost  # Its worker may have died in the reset.
         self.first = copied(self.last.observation)  # Its env may change it, and its row will.
 
     async def leave(self) -> None:

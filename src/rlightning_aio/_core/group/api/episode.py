@@ -67,7 +67,8 @@ class EnvEpisode:
             step was lost.
         is_over: the newest result has ended the episode, of all agents and sub-environments; a
             step limit of `auto_reset` ends it, too, and so does a loss.
-        lost: the outcome, if the env was replaced or its client is gone: the episode has no end.
+        lost: the outcome, if the env was replaced, its client is gone, or its request was aborted:
+            the episode has no end.
     """
 
     last: EnvRet | MultiAgentEnvRet
@@ -90,10 +91,12 @@ class EnvEpisode:
 
     async def __aenter__(self) -> Self:
         try:
-            self.last, self.is_over, _ = await self._asked(self._start)
+            self.last, self.is_over, loss = await self._asked(self._start)
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
+        if loss is not None:  # The env was replaced in the reset, perhaps without its seed.
+            self._lose(loss.outcome.ravel().tolist()[0])
         return self
 
     async def __aexit__(self, *exc: object) -> None:
@@ -110,6 +113,9 @@ class EnvEpisode:
         step, reply = self._agents.ask(self.env.env_id, what)
         try:
             return await reply
+        except EpisodeLost as aborted:
+            self._lose(aborted.outcome)
+            raise
         except BaseException:
             if step.is_outstanding:
                 self._given_up.append(step)
@@ -131,8 +137,7 @@ class EnvEpisode:
             if loss is None:
                 self.last, self.is_over = ret, is_over
                 return ret
-            outcomes: list[Outcome] = loss.outcome.ravel().tolist()
-            self._lose(outcomes[0])
+            self._lose(loss.outcome.ravel().tolist()[0])
         raise self._error(loss)
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
@@ -148,6 +153,9 @@ class EnvEpisode:
         if self.lost is None:
             try:
                 value = await self.env.call(name, *args, **kwargs)
+            except EpisodeLost as aborted:
+                self._lose(aborted.outcome)
+                raise
             except asyncio.CancelledError:
                 self._has_given_up_call = True
                 raise

@@ -74,11 +74,12 @@ class Aborts:
         """
         slots = self._requests.owed(slots)
         aborted = self._requests.aborted
-        for slot in slots.tolist():
+        new = slots[~aborted.among(slots)]  # Another call may be ending the rest.
+        for slot in new.tolist():
             aborted.add(slot, self._fault(slot))
-        self._stats.note_failures(slots, _WHY.kind)
-        self._abandon(slots)
-        for host_id, entry in self._supervisor.detector.abort(slots, now):
+        self._stats.note_failures(new, _WHY.kind)
+        self._abandon(new)
+        for host_id, entry in self._supervisor.detector.abort(new, now):
             self._requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
@@ -90,11 +91,14 @@ class Aborts:
 
     def _fault(self, slot: int) -> EpisodeLost:
         doing = Operation(self._requests.numbering.op(slot)).name.lower()
-        return EpisodeLost(
+        env_id = self._envs.env_ids[slot]
+        fault = EpisodeLost(
             f"the {doing} of {self._envs.describe(slot)} was aborted by the group's abort() or "
             "drain(), or by the end of its episode(); its episode is over: reset it to go on",
-            env_id=self._envs.env_ids[slot],
+            env_id=env_id,
         )
+        fault.outcome = _WHY.outcome(env_id)
+        return fault
 
     def _abandon(self, slots: NDArray[np.intp]) -> None:
         """Note that episodes are over; only its user resets a robot, or the env of a client."""
