@@ -371,6 +371,28 @@ def test_an_unread_death_does_not_cost_the_fork_server(
     assert ours.log == ["dump and kill 0", "start 0", "attach 0"]
 
 
+def test_an_aborted_request_that_exceeds_its_limit_is_no_hang(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """Its worker is replaced as after any abort, at once and only once."""
+    ours = fleet((1,), step_timeout=0.1, on_worker_death="raise")
+    (entry,) = ours.ask(0)
+    ours.hosts[0].current = (entry, int(ours.now * 1e9))
+    ours.hosts[0].dies = False
+    aborting = ours.begin(ours.core.abort(ours.now, None))
+    ours.now += 0.1
+    for _ in range(2):
+        ours.check()
+        assert ours.log == ["kill 0"]
+    ours.hosts[0].end()
+    ours.drain()
+    ours.turn()
+    assert aborting.done
+    (loss,) = ours.losses
+    assert is_replaced(loss)
+    assert loss.death.cause == "was killed because a step was aborted"
+
+
 def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]) -> None:
     """So may a call, and a reset if only steps have a limit."""
     free, limited = fleet(), fleet(step_timeout=5.0)

@@ -99,8 +99,11 @@ class HangDetector:
         if not aborted or record.dying:
             record.abort_by = None
         elif self._now >= by and not read_news(record):
-            record.abort_by, record.aborted_slot = None, aborted[0]
-            self.kill(record, dump=False)
+            self._kill_aborted(record, aborted[0])
+
+    def _kill_aborted(self, record: HostRecord, slot: int) -> None:
+        record.abort_by, record.aborted_slot = None, slot
+        self.kill(record, dump=False)
 
     def kill(self, record: HostRecord, *, dump: bool) -> None:
         """Kill a host; with `dump`, its worker writes its stacks first."""
@@ -113,8 +116,8 @@ class HangDetector:
 
     def _expiry(self, record: HostRecord) -> float | None:
         """Return the time when the worker's current request exceeds its limit."""
-        if record.stage is not Stage.UP or record.is_hung:
-            return None
+        if record.stage is not Stage.UP or record.is_hung or record.aborted_slot is not None:
+            return None  # It is being killed.
         assert record.killable is not None
         entry, since_ns = record.killable.current_request()
         shortest = min(record.limits.values())
@@ -145,6 +148,9 @@ class HangDetector:
                 return
         expiry = self._expiry(record)
         if expiry is None or self._now < expiry or read_news(record):
+            return
+        if entry and slot_of(entry) in self._requests.aborted.faults:  # It counts as aborted.
+            self._kill_aborted(record, slot_of(entry))
             return
         record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
