@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from group.sample_envs import Gate
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
 from kit.scripted import CUT, DIE, GO, RAISE
@@ -30,6 +31,7 @@ from rlightning_aio.metrics import FIGURES, _Reader
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 OF_LOOP = {"loop_lag_seconds_p99", "loop_lag_seconds_max"}
 OF_GROUP = {"batch_size", "seconds_waiting_for_envs", "seconds_in_trainer"} | OF_LOOP
@@ -323,6 +325,22 @@ def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None
     assert {kind: found[f"outcomes_{kind}"] for kind in kinds if counted[kind]} == counted
     assert set(counted) >= {"terminated", "truncated", "env_raised", "env_died", "env_hung"}
     assert sum(found[f"outcomes_{kind}"] for kind in kinds) == counted.total()
+
+
+@pytest.mark.parametrize("num_aborts", [1, 2])
+async def test_an_episode_that_is_aborted_counts_once(num_aborts: int, tmp_path: Path) -> None:
+    """However often that is asked for meanwhile, and though the next result tells of it."""
+    Gate(str(tmp_path), "gated-0").make()
+    config = {"name": "gated", "backend": "gated_where_there_is_one", "task": "-"}
+    config["env_kwargs"] = {"gates": str(tmp_path)}
+    async with rlightning_aio.build_env_group(config) as group:
+        await group.reset()
+        group.step_async(responses(["gated-0"], 1.0, what=DO_NOTHING))
+        await asyncio.gather(*(group.abort() for _ in range(num_aborts)))
+        (tmp_path / "gated-0").unlink()
+        batch, _ = await group.step(responses(["gated-0"], 1.0, what=DO_NOTHING))
+        assert [one.kind for one in batch.outcome] == ["cancelled"]
+        assert numbers(group).outcomes_cancelled == 1
 
 
 def test_other_threads_may_read(monkeypatch: pytest.MonkeyPatch) -> None:

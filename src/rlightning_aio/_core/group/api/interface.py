@@ -242,7 +242,7 @@ class GroupInterface(Facade):
         Returns the envs' last observations at the time of the snapshot, and flags that are all
         False, as `reset` does: with `is_reset`, because no transition ends here, and without
         reward. Cancelled, the envs start a new episode with their next step, marked as after a
-        restart.
+        restart; once all are restored, it leaves these results to `collect_async`.
 
         Raises:
             SnapshotError: the bytes are damaged, or of another number of envs, another task,

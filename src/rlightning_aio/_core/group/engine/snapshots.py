@@ -62,6 +62,7 @@ class Snapshots:
         self._dispatch = dispatch
         self._calls = calls
         self._continuity = tables.continuity
+        self._stats = tables.stats
         self._waiting = waiting
 
     def take(
@@ -143,6 +144,7 @@ class Snapshots:
             raise
         except BaseException:
             self._continuity.lose(slots.tolist(), _CANCELLED)
+            self._stats.note_cancelled(slots)
             raise
         positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
         return slots, positions, now

@@ -119,6 +119,8 @@ class EpisodeCounts:
     ) -> tuple[NDArray[np.intp], NDArray[np.int64]]:
         """Return the slots whose episodes are over, and the outcomes that `BatchedData` has.
 
+        Without those that the caller has ended: `note_failures` has counted them.
+
         Args:
             part: of any results.
             over: as the flags say.
@@ -130,14 +132,15 @@ class EpisodeCounts:
         if part.restarted is not None:
             over = over.copy()
             over[part.restarted] = True
-        rows: NDArray[np.intp] = over.nonzero()[0]
-        for row in dict.fromkeys(cast("list[int]", rows.tolist())):
+        for row in dict.fromkeys(over.nonzero()[0].tolist()):
             if part.may_hold(row, ("outcome",)):
                 with suppress(Exception):  # The info may be malformed; its reader gets it.
                     reported: Any = part.reported_info_of(row).get("outcome")
                     if isinstance(reported, Outcome):
                         codes[row] = _CODE_OF[reported.kind]
-        return part.slots[rows], codes[over]
+                        is_lost = part.restarted is not None and part.restarted[row]
+                        over[row] &= not (is_lost and reported.kind == "cancelled")
+        return part.slots[over.nonzero()[0]], codes[over]
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count the verdicts in `info` on the episodes that have `ended`."""

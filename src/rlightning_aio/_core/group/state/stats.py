@@ -149,6 +149,11 @@ class Stats:
         with self._lock:
             self.episodes.note_failures(slots, kind)
 
+    def note_cancelled(self, slots: NDArray[np.intp]) -> None:
+        """Count episodes of `slots` that their caller has ended; no result of them counts."""
+        with self._lock:
+            self.episodes.note_failures(slots, "cancelled")
+
     def times_so_far(self, now_ns: int) -> NDArray[np.float64]:
         """Return where the time of the envs has gone; see `EnvTimes.so_far`."""
         # Read first: a request that ends meanwhile is in the sums, and its env was taken from then.
