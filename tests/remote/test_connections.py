@@ -101,6 +101,37 @@ def with_a_client() -> Iterator[tuple[Any, Any, ClientThread, Any]]:
         friend.join()
 
 
+def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The client answers and leaves after the server has found no message, and before it looks at
+    its connections.
+    """
+    gate = threading.Event()
+    env = CountingEnv(on_step=lambda: gate.wait(HANG) or None)
+    with sync.build_env_group(ENTRY) as group:
+        friend = ClientThread(group["robots-0"].address, "arm", env)
+        batch, _ = group.reset()
+        group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+        server: Any = group["robots-0"]._server
+        connections = server._listener.connections
+        update = connections.update
+
+        def update_late(now: float) -> bool:
+            monkeypatch.undo()
+            env.finished = True
+            gate.set()
+            friend.join()
+            assert connections._events.poll(1000 * HANG)
+            return update(now)
+
+        monkeypatch.setattr(connections, "update", update_late)
+        server.tick(time.monotonic())
+        batch, _ = group.collect_async(deadline=HANG)
+    assert batch.observation.tolist() == [[0, -1, 1]]
+    assert "client_lost" not in batch.values()[0].info
+
+
 def step_until_one_is_cut_off(group: Any, listener: Any, batch: Any) -> None:
     """Then step for a while longer, in which further messages of the peer could arrive."""
     while not listener.connections.num_cut:

@@ -194,6 +194,8 @@ class Listener:
             # Until the next update, descriptors of their own report connections.
             self._updated_at = now
             self._update_connections(now)
+            # One that has ended meanwhile may have sent something before that.
+            has_message = has_message or is_readable(self._router)
         for _ in range(_MESSAGES_PER_PUMP):
             if not has_message:
                 break
