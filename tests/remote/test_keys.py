@@ -6,8 +6,9 @@ import os
 import shutil
 import stat
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -22,9 +23,6 @@ def laid_out(tmp_path: Path) -> tuple[AllowedKeys, Path, bytes, bytes]:
     """Return the allowed keys, their directory, and the public keys of arm and leg."""
     arm, leg = make_keys(tmp_path, ["arm", "leg"])
     allowed = tmp_path / "server" / "clients"
-    # Make them look old.
-    for path in allowed.iterdir():
-        os.utime(path, ns=(0, 0))
     return (
         AllowedKeys(allowed),
         allowed,
@@ -75,16 +73,31 @@ def test_each_change_of_a_file_counts_at_once(tmp_path: Path) -> None:
     assert (keys.holds(arm), keys.holds(leg)) == (False, True)
 
 
-def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_path: Path) -> None:
+def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Although its stamps have not changed, the size included."""
-    keys, directory, arm, leg = laid_out(tmp_path)
-    path = directory / "arm.key"
-    os.utime(path)
-    stamp = path.stat()
-    assert keys.holds(arm)
+    listed, directory, arm, leg = laid_out(tmp_path)
+    keys: Any = listed
     (directory / "leg.key").unlink()
+    path = directory / "arm.key"
+    path.touch()
+    stamps: Any = keys._stamps()  # noqa: SLF001
+    monkeypatch.setattr(keys, "_stamps", lambda: stamps)
+    assert keys.holds(arm)
     path.write_text(path.read_text().replace(arm.decode(), leg.decode()))
-    os.utime(path, ns=(stamp.st_mtime_ns, stamp.st_mtime_ns))
+    assert (keys.holds(arm), keys.holds(leg)) == (False, True)
+
+
+def test_a_file_that_is_written_over_and_looks_as_old_as_before_counts(tmp_path: Path) -> None:
+    """As by `rsync --inplace --times`; keys are all of one size."""
+    keys, directory, arm, leg = laid_out(tmp_path)
+    (directory / "leg.key").unlink()
+    path = directory / "arm.key"
+    os.utime(path, ns=(0, 0))
+    assert (keys.holds(arm), keys.holds(leg)) == (True, False)
+    path.write_text(path.read_text().replace(arm.decode(), leg.decode()))
+    os.utime(path, ns=(0, 0))
     assert (keys.holds(arm), keys.holds(leg)) == (False, True)
 
 
@@ -93,6 +106,8 @@ def test_files_that_have_not_changed_are_not_read_again(
 ) -> None:
     """A lookup only compares their stamps."""
     keys, _, arm, _ = laid_out(tmp_path)
+    later = time.time_ns() + 2_000_000_000
+    monkeypatch.setattr(time, "time_ns", lambda: later)
     assert keys.holds(arm)
     monkeypatch.setattr("rlightning_aio.remote.keys.read_public_key", None)
     assert keys.holds(arm)

@@ -202,9 +202,13 @@ def _is_key(text: bytes) -> bool:
 
 
 class _Stamp(NamedTuple):
-    """Properties of a file; at least one changes when it is written."""
+    """Properties of a file; at least one changes when it is written.
 
-    modified_ns: int
+    Unlike the time of its contents, that of its last change can't be set, and access rights change
+    it.
+    """
+
+    changed_ns: int
     size: int
     inode: int
 
@@ -254,7 +258,7 @@ class AllowedKeys:
                             said = file.stat()
                         except OSError:
                             continue  # Deleted since it was listed, or a link to nowhere.
-                        stamps[file.name] = _Stamp(said.st_mtime_ns, said.st_size, said.st_ino)
+                        stamps[file.name] = _Stamp(said.st_ctime_ns, said.st_size, said.st_ino)
         except OSError as error:
             # A directory that can't be read admits no client.
             if not self._is_unreadable:
@@ -272,7 +276,7 @@ class AllowedKeys:
                 read[name] = known
                 continue
             # A second write within one tick of the file system's clock does not change the stamp.
-            is_settled = time.time_ns() - stamp.modified_ns > _TICK_NS
+            is_settled = time.time_ns() - stamp.changed_ns > _TICK_NS
             read[name] = stamp if is_settled else _UNSETTLED, self._key_in(name)
         self._read = read
         self._faulty &= read.keys()
