@@ -500,6 +500,31 @@ async def test_time_during_which_the_event_loop_was_blocked_is_nobodys() -> None
         assert not batch.restarted.any()
 
 
+async def test_the_event_loop_may_be_blocked_while_an_env_that_was_lost_begins_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The reset of the new env needs some turns of the loop, and time for them."""
+    asyncio.get_running_loop().set_debug(False)  # It would keep what it warns of.
+    began, reset = asyncio.Event(), Scripted.reset
+
+    async def reset_in_turns(self: Scripted, **arguments: Any) -> rl.EnvRet:
+        began.set()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        return await reset(self, **arguments)
+
+    async with rl.build_env_group(entry(step_timeout=SOON, reset_timeout=SOON)) as group:
+        await group.reset()
+        monkeypatch.setattr(Scripted, "reset", reset_in_turns)
+        stepping = asyncio.ensure_future(group.step(steps(e_0=HANG)))
+        await began.wait()
+        time.sleep(2 * SOON)  # noqa: ASYNC251
+        batch, _ = await stepping
+        assert batch.restarted.all()
+        assert batch.observation[0, 0] == 2
+        assert group.num_restarts == 1
+
+
 async def test_a_reset_that_takes_too_long_is_repeated_by_a_new_env(place: dict[str, Any]) -> None:
     async with rl.build_env_group(entry(num_workers=2, reset_timeout=SOON, **place)) as group:
         batch, _ = await group.reset(seed=7, options={"hang": 1})

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import time
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from rlightning_aio._core.hosts.awaiting.event_loop import OWNER, new_task
+from rlightning_aio._core.hosts.awaiting.event_loop import OWNER, new_task, wait_fairly
 from rlightning_aio._core.hosts.messages import ErrorText
 
 if TYPE_CHECKING:
@@ -229,13 +228,7 @@ async def end_all(envs: Collection[AwaitedEnv], seconds: float) -> None:
     if stopping:
         await asyncio.wait(stopping, timeout=CANCEL_SECONDS)
     by_task = {env.closing(): env for env in envs}
-    late = {task for task in by_task if not task.done()}
-    more = seconds
-    for _ in range(2):
-        if late:
-            began = time.monotonic()
-            late = (await asyncio.wait(late, timeout=more))[1]
-            more = time.monotonic() - began - more
+    late = await wait_fairly(by_task, seconds)
     for task in late:
         by_task[task].cut_short(seconds)
     if late:

@@ -28,6 +28,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     new_task,
     tasks_of,
     time_collector,
+    wait_fairly,
     watched,
 )
 from rlightning_aio._core.hosts.limits import RestartPolicy, hung, limits_of, restart_pause
@@ -472,7 +473,10 @@ class AwaitedEnvs:
 
         env.give(Operation.RESET, entry, env.runner.reset_with, then)
         limit = self._limits.get(Operation.RESET)
-        await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
+        if limit is None:
+            await asyncio.wait({ended})
+        else:
+            await wait_fairly({ended}, 1.1 * limit.seconds)  # As `TimeLimit` would have it.
         if not ended.done():
             self._put_away(record, env, why)
             return None

@@ -33,6 +33,7 @@ __all__ = [
     "run_loop",
     "tasks_of",
     "time_collector",
+    "wait_fairly",
     "watched",
 ]
 
@@ -43,6 +44,7 @@ OWNER: Final[ContextVar[object]] = ContextVar("rlightning_aio_env", default=None
 log = logging.getLogger("rlightning_aio")
 
 T = TypeVar("T")
+F = TypeVar("F", bound=asyncio.Future[Any])
 
 
 def run_loop(main: Coroutine[Any, Any, T]) -> T:
@@ -212,6 +214,20 @@ class TimeLimit:
         for env, entry in late:
             if env.entry == entry:
                 self._expire(env, self.seconds)
+
+
+async def wait_fairly(futures: Collection[F], seconds: float) -> set[F]:
+    """Wait for `futures`; return those that are not done after some seconds.
+
+    If these end late, because the event loop was blocked, it waits as long as that again.
+    """
+    late, more = {one for one in futures if not one.done()}, seconds
+    for _ in range(2):
+        if late:
+            began = time.monotonic()
+            late = (await asyncio.wait(late, timeout=more))[1]
+            more = time.monotonic() - began - more
+    return late
 
 
 async def cancel(tasks: Collection[asyncio.Task[Any]], seconds: float) -> set[asyncio.Task[Any]]:
