@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio._core.group.drivers.wait import TURN
+from rlightning_aio._core.group.state.request_states import COLLECTOR, State
 from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 __all__ = ["Aborts"]
 
 _WHY: Final = Loss("was aborted", "cancelled", "caller")
+_TURNS: Final = 3
+"""Turns until a call has returned what it has, though it may look at the hosts before."""
 
 
 class Aborts:
@@ -70,9 +73,10 @@ class Aborts:
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.
 
-        Results that are ready stay. Cancelled, they end all the same.
+        Results that are ready stay; a call that has all of its own returns them before. Cancelled,
+        they end all the same.
         """
-        slots = self._requests.owed(slots)
+        asked, slots = slots, self._requests.owed(slots)
         aborted = self._requests.aborted
         new = slots[~aborted.among(slots)]  # Another call may be ending the rest.
         for slot in new.tolist():
@@ -86,8 +90,19 @@ class Aborts:
         self._waiting.wake_serving()  # It may have results of these that it has not handed out.
         chosen = set(slots.tolist())
         now = yield from self._waiting.until(now, lambda: len(aborted.faults.keys() & chosen))
+        for _ in range(_TURNS):
+            if self._is_returning(asked):
+                now = yield TURN
         self._arrivals.admit(slots, self._intake.now)
         return now
+
+    def _is_returning(self, slots: NDArray[np.intp]) -> bool:
+        """Return True if a call has all replies that it waits for, and some are of `slots`."""
+        requests = self._requests
+        ended = slots[requests.state[slots] > int(State.BUSY)]
+        owners: set[int] = {*requests.owner[ended].tolist()} - {COLLECTOR}
+        tickets = [requests.tickets.waiting[owner] for owner in owners]
+        return any(ticket.apart or not ticket.remaining for ticket in tickets)
 
     def _fault(self, slot: int) -> EpisodeLost:
         doing = Operation(self._requests.numbering.op(slot)).name.lower()
