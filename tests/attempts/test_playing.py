@@ -202,6 +202,48 @@ async def test_an_agent_that_takes_too_long(place: dict[str, Any], on_timeout: A
     assert attempt.outcome.seconds.agent > began + limit - thinking[0]
 
 
+async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward() -> None:
+    """What it had earned before counts as little as after any other failure."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(3)
+        with contextlib.suppress(rl.EnvRaised):
+            await episode.step("raise")
+        thinking.append(time.monotonic())
+        await asyncio.sleep(3600)
+
+    thinking: list[float] = []
+    async with rooms(PLACES["loop"]) as group:
+        limits = iter(LIMITS)
+        while not thinking:
+            rules = Rules(attempt_timeout=next(limits), on_timeout="end", retries=0)
+            ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+    assert (attempt.outcome.kind, attempt.reward) == ("env_raised", None)
+    assert attempt.rewards == [3.0]
+
+
+@pytest.mark.parametrize("what", ["a step", "a step that was not sent", "a call"])
+async def test_what_an_agent_leaves_to_a_task_of_its_own_ends_with_the_attempt(what: str) -> None:
+    """As by `asyncio.wait` with a time limit, or `asyncio.shield`; the next attempt has the env."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        asked = episode.call("stall") if what == "a call" else episode.step("hang")
+        left.append(asyncio.create_task(asked))
+        await asyncio.sleep(0)
+        if what != "a step that was not sent":
+            while not group.pending:  # noqa: ASYNC110  # It is sent in a later turn.
+                await asyncio.sleep(0)
+
+    left: list[asyncio.Task[Any]] = []
+    async with rooms(PLACES["loop"], num_workers=1) as group:
+        found = await played(group, tasks(3), agent, 1, Rules(retries=0))
+        assert group.pending == []
+        await asyncio.wait(left)
+    assert [attempt.outcome.kind for (attempt,) in found] == ["truncated"] * 3
+    for task in left:
+        assert task.cancelled() or isinstance(task.exception(), EpisodeLost)
+
+
 async def test_an_agent_that_ignores_its_end_does_not_keep_its_env() -> None:
     """It can't step it any more; the next attempt has it."""
     go_on, refused = asyncio.Event(), asyncio.Event()

@@ -106,6 +106,8 @@ class Try:
                 playing.cancel()
                 await surely({playing}, _PATIENCE_SECONDS)
                 self._abandon(playing)
+                if not ended.is_failure:  # Its time was over, but its env was lost before that.
+                    ended = view.fault or ended
             elif not ended.is_failure:
                 result = playing.result()
             await self._leave()

@@ -85,9 +85,10 @@ class EnvEpisode:
         self._group, self._agents, self.env = group, agents, env
         self._start = EpisodeStart(seed, options)
         self.lost: Outcome | None = None
-        # Steps, and the reset, that were cancelled after they had been sent.
-        self._given_up: list[AgentStep] = []
-        self._has_given_up_call = False
+        # Steps, the reset, and calls that were not answered, also of an agent that awaits them no
+        # more: it was cancelled, or has left them to a task of its own.
+        self._open_steps: list[AgentStep] = []
+        self._open_calls = set[object]()
 
     async def __aenter__(self) -> Self:
         try:
@@ -100,8 +101,11 @@ class EnvEpisode:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        if self._has_given_up_call or any(step.is_outstanding for step in self._given_up):
-            self._has_given_up_call = False
+        for step in self._open_steps:
+            if not step.is_outstanding:
+                step.reply.cancel()  # It will not be sent.
+        if self._open_calls or any(step.is_outstanding for step in self._open_steps):
+            self._open_calls.clear()
             abort: Any = self._group.abort([self.env.env_id])
             aborting = asyncio.ensure_future(abort)
             # However often this is cancelled, it continues, and the env is idle in the end.
@@ -111,15 +115,15 @@ class EnvEpisode:
 
     async def _asked(self, what: PolicyResponse | EpisodeStart) -> StepEnd:
         step, reply = self._agents.ask(self.env.env_id, what)
+        self._open_steps.append(step)
         try:
             return await reply
         except EpisodeLost as aborted:
             self._lose(aborted.outcome)
             raise
-        except BaseException:
-            if step.is_outstanding:
-                self._given_up.append(step)
-            raise
+        finally:
+            if not step.is_outstanding:
+                self._open_steps.remove(step)
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
@@ -151,14 +155,15 @@ class EnvEpisode:
                 another episode.
         """
         if self.lost is None:
+            self._open_calls.add(call := object())
             try:
                 value = await self.env.call(name, *args, **kwargs)
-            except EpisodeLost as aborted:
-                self._lose(aborted.outcome)
+            except Exception as error:
+                self._open_calls.discard(call)
+                if isinstance(error, EpisodeLost):  # It was aborted.
+                    self._lose(error.outcome)
                 raise
-            except asyncio.CancelledError:
-                self._has_given_up_call = True
-                raise
+            self._open_calls.discard(call)
             if (lost := self._agents.loss(self.env.env_id)) is None:
                 return value
             self._lose(lost)
