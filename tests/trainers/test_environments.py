@@ -20,6 +20,8 @@ class Counter:
 
     def reset(self, row: Any = None, **more: Any) -> Any:
         self.row, self.total = row, 0.0
+        if row == "die":
+            self.die()
         if isinstance(row, int):
             if row < 0:
                 raise ValueError("as asked")
@@ -153,6 +155,16 @@ def test_a_reset_that_fails_is_a_failure() -> None:
         assert one.get_reward() is None
         assert environments.metrics()["envs/outcomes_not_started"] == 2
         assert one.reset(row=1) == "begins with 1"
+
+
+def test_a_reset_that_costs_the_last_idle_env_is_a_failure() -> None:
+    """Its retry would wait for an env of this batch, which ends after this reset."""
+    with Environments(Counter, num_envs=2, max_restarts=0, on_worker_death="raise") as environments:
+        other, one = environments(), environments()
+        other.reset(row=1)
+        assert one.reset(row="die") is None
+        assert one.failure.kind in ("env_died", "not_started")
+        assert other.add(1) == "1"
 
 
 def test_a_batch_is_reset_at_the_same_time(tmp_path: Path) -> None:

@@ -49,21 +49,32 @@ class Lending:
         return self._idle.qsize()
 
     async def begin(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        seed: int | None = None,
+        options: dict[str, Any] | None = None,
+        *,
+        waits: bool = True,
     ) -> AttemptInPlay | Outcome:
         """Wait for an idle env and reset it; return the outcome of the last try if all failed.
+
+        Args:
+            seed: of the reset.
+            options: of the reset.
+            waits: False for a caller who returns no env meanwhile: it isn't tried again if none is
+                idle, because the env that has failed is gone.
 
         Raises:
             RLightningError: no env of the group is left.
         """
         failures: list[Outcome] = []
+        spec = EpisodeSpec("", seed, None)  # Before an env is taken, as a seed may be refused.
         while True:
             env_id = await self._idle.get()
             if not env_id:
                 self._idle.put_nowait("")
                 raise RLightningError("no env of this group is left that could play")
             playing = self._group.episode(env_id, seed, options)
-            episode = AttemptInPlay(playing, EpisodeSpec("", seed, None), 0)
+            episode = AttemptInPlay(playing, spec, 0)
             self._lent.add(episode)
             try:
                 with contextlib.suppress(EnvFault):
@@ -74,7 +85,8 @@ class Lending:
             if episode.fault is None:
                 return episode
             await self.end(episode)
-            if not tries_again(self._rules, episode.fault, failures):
+            is_vain = not (waits or self.idle)
+            if is_vain or not tries_again(self._rules, episode.fault, failures):
                 return episode.fault
             failures.append(episode.fault)
 
@@ -83,11 +95,15 @@ class Lending:
         if episode in self._lent:
             self._lent.remove(episode)
             episode.end("is over")
-            await episode.leave()
-            if episode.env_id in self._players.refresh():
-                self._idle.put_nowait(episode.env_id)
-            elif not self._lent and not self.idle:
-                self._idle.put_nowait("")  # Whoever waits is to know that none will come.
+            # However often this is cancelled, the env comes back.
+            await asyncio.shield(asyncio.ensure_future(self._take_back(episode)))
+
+    async def _take_back(self, episode: AttemptInPlay) -> None:
+        await episode.leave()
+        if episode.env_id in self._players.refresh():
+            self._idle.put_nowait(episode.env_id)
+        elif not self._lent and not self.idle:
+            self._idle.put_nowait("")  # Whoever waits is to know that none will come.
 
     async def end_all(self) -> None:
         """Take all envs back."""
@@ -159,4 +175,4 @@ class LendingThread:
     async def _begin(self, options: dict[str, Any]) -> AttemptInPlay | Outcome:
         if not self._lending.idle:
             raise RLightningError(f"none of {len(self._group)} envs is idle; raise num_envs")
-        return await self._lending.begin(options=options)
+        return await self._lending.begin(options=options, waits=False)
