@@ -105,6 +105,21 @@ def test_a_batch_is_called_in_two_halves_as_gymnasiums() -> None:
             use()
 
 
+@pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
+def test_a_mask_that_changes_before_the_resets_are_awaited(fields: dict[str, Any]) -> None:
+    """As an array of ends that a program writes to: the first half of the call has a copy."""
+    env = make_vec(PENDULUM, 2, autoreset_mode=AutoresetMode.DISABLED, **fields)
+    before, _ = env.reset(seed=0)
+    mask = np.array([True, False])
+    env.reset_async(seed=7, options={"reset_mask": mask})
+    mask[:] = False, True
+    after, _ = env.reset_wait()
+    assert (after != before).any(axis=1).tolist() == [True, False]
+    with pytest.raises(ValueError, match="at least one True"):
+        env.reset_async(options={"reset_mask": np.zeros(2, np.bool_)})
+    env.close()
+
+
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5"])
 @pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])

@@ -78,12 +78,14 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
             ClosedEnvironmentError: the vector env is closed.
         """
         check_free(self, self._pending, "reset_async")
-        return self._reset_now(seed, options)
+        return self._resetting(seed, options)()
 
-    def _reset_now(self, seed: Any, options: dict[str, Any] | None) -> Any:
+    def _resetting(self, seed: Any, options: dict[str, Any] | None) -> Callable[[], Any]:
+        """Check the arguments of a reset, and return what does it; they may change meanwhile."""
         if options is not None and "reset_mask" in options:
-            checked_mask(options["reset_mask"], self.num_envs)
-        return super().reset(seed=seeds_of_envs(seed, self.num_envs), options=options)
+            mask = checked_mask(options["reset_mask"], self.num_envs)
+            options = {**options, "reset_mask": mask}
+        return partial(super().reset, seed=seeds_of_envs(seed, self.num_envs), options=options)
 
     def step(
         self, actions: NDArray[Any]
@@ -102,7 +104,8 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         options: dict[str, Any] | None = None,
     ) -> None:
         """Note a reset; `reset_wait` resets."""
-        self._note("reset", partial(self._reset_now, seed, options))
+        check_free(self, self._pending, "reset_async")
+        self._note("reset", self._resetting(seed, options))
 
     def reset_wait(self, timeout: float | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
         """Reset as `reset_async` was told; `timeout` is ignored."""

@@ -51,7 +51,7 @@ def seeds_of_envs(seed: int | Sequence[int | None] | None, num_envs: int) -> lis
 
 
 def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
-    """Return ``options["reset_mask"]``, a bool array ``[num_envs]``.
+    """Return a copy of ``options["reset_mask"]``, a bool array ``[num_envs]``.
 
     Raises:
         TypeError: it is no array of bools.
@@ -70,4 +70,4 @@ def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
         raise ValueError(
             f"{what} contain a boolean array with at least one True value, got reset_mask={array}"
         )
-    return array
+    return array.copy()
