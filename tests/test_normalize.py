@@ -172,6 +172,18 @@ def test_it_continues_where_it_was_saved(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one_reward, other_reward)
 
 
+def test_a_state_that_lacks_a_part_changes_nothing() -> None:
+    normalizer, index = Normalizer(), np.arange(2)
+    normalizer.update_observations(index, np.ones((2, 3)))
+    normalizer.update_rewards(index, np.ones(2), np.ones(2, np.bool_))
+    before = normalizer.state_dict()
+    state = {name: value + 1 for name, value in before.items() if name != "return.count"}
+    with pytest.raises(KeyError, match="count"):
+        normalizer.load_state_dict(state)
+    for name, value in normalizer.state_dict().items():
+        np.testing.assert_array_equal(value, before[name])
+
+
 def test_values_equal_those_of_gymnasiums_wrappers() -> None:
     """Bit for bit; its wrapper starts the return again with the terminating reward."""
 

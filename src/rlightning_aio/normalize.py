@@ -217,16 +217,17 @@ class Normalizer:
         """Continue from what `state_dict` returned: arrays, or CPU tensors.
 
         Raises:
-            KeyError: `state` lacks a part.
+            KeyError: `state` lacks a part; nothing was changed.
         """
-        self._sums, self._starts = _copied(state["sums"]), _copied(state["starts"])
-        self._statistics = {}
+        sums, starts = _copied(state["sums"]), _copied(state["starts"])
+        found: dict[str, _Statistics] = {}
         for path in (name.removesuffix(".mean") for name in state if name.endswith(".mean")):
             first = 1.0 if path == _RETURN else _FIRST_VARIANCE
             mean = np.asarray(state[f"{path}.mean"])
-            statistics = self._of(path, mean.shape[1:], first)
+            found[path] = _Statistics(mean.shape[1:], first)
             for name in _SAVED:
-                setattr(statistics, name, _copied(state[f"{path}.{name}"]))
+                setattr(found[path], name, _copied(state[f"{path}.{name}"]))
+        self._sums, self._starts, self._statistics = sums, starts, found
 
     # -- parts --------------------------------------------------------------------
 

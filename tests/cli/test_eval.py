@@ -314,6 +314,7 @@ def test_wrong_options_of_a_queue_are_refused(tmp_path: Path) -> None:
         (("--tasks", "a"), "add --seeds 0:50"),
         (("--seeds", "3:1"), "should look like 0:50 or 1,2,5"),
         (("--seeds", "a"), "should look like 0:50 or 1,2,5"),
+        (("--seeds", 2**62), "should look like 0:50 or 1,2,5"),
         (("--seeds", "0:2", "--episodes", 3), "--episodes is for a number of episodes"),
         (("--seeds", "0:2", "--video-failed"), "add --video FOLDER"),
         (("--video-failed",), "choose episodes of a queue"),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from rlightning_aio._core.group.episodes.seeds import checked_seed
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import EpisodeSpec
 
@@ -156,10 +157,11 @@ def _place(spec: EpisodeSpec) -> Any:
 def _seeds(text: str) -> list[int]:
     first, colon, end = text.partition(":")
     try:
-        seeds = list(range(int(first or 0), int(end))) if colon else list(map(int, text.split(",")))
+        given = range(int(first or 0), int(end)) if colon else map(int, text.split(","))
+        seeds = [*map(checked_seed, given)]
     except ValueError:
         seeds = []
-    if not seeds or min(seeds) < 0:
+    if not seeds:
         raise ConfigError(f"--seeds {text!r}: should look like 0:50 or 1,2,5")
     return seeds
 
