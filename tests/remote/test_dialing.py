@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
-from typing import TYPE_CHECKING
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import zmq
 from kit.counting import CountingEnv
+from patience import HANG
 
+from rlightning_aio import sync
+from rlightning_aio.errors import NothingPending
 from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote import client as client_module
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -62,3 +68,26 @@ def test_between_two_attempts_a_client_takes_no_time_of_a_core() -> None:
         with pytest.raises(TimeoutError):
             client.connect(timeout=1.0)
         assert time.thread_time() - began < 0.5
+
+
+def test_a_client_whose_run_has_ended_dials_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its next call waits for no end of the connection that it has left."""
+    monkeypatch.setattr(client_module, "_ATTEMPT_SECONDS", 10 * HANG)
+    entry: dict[str, Any] = {"name": "robots", "backend": "env_server"}
+    with sync.build_env_group(entry) as group, ThreadPoolExecutor(1) as pool:
+        env = CountingEnv()
+        client = RemoteEnvClient(env, group["robots-0"].address, name="arm")
+
+        def run_twice() -> None:
+            with client:
+                for _ in range(2):
+                    env.finished = False
+                    client.connect(HANG)
+                    env.finished = True
+                    client.run()
+
+        running = pool.submit(run_twice)
+        while not running.done():
+            with contextlib.suppress(TimeoutError, NothingPending):
+                group.collect_async(deadline=0.01)
+        running.result()

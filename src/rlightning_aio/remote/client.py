@@ -199,7 +199,6 @@ class RemoteEnvClient:
             return
         self._closed = True
         self._leave("the client was closed")
-        self._hang_up()
         self._context.destroy(linger=0)
         self._env.close()
 
@@ -323,6 +322,7 @@ class RemoteEnvClient:
     def _leave(self, reason: str) -> None:
         self._session.leave(reason)
         self._flush()
+        self._hang_up()
 
     # -- env ------------------------------------------------------------------------
 
