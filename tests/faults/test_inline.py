@@ -58,37 +58,45 @@ def test_interrupt_in_an_inline_step_comes_out_and_ends_its_request() -> None:
 
 
 class Struck:
-    """Is interrupted in a step, or hangs there; the second one is interrupted in its reset."""
+    """Is interrupted in a step, or hangs there; the second one, in its making or its reset.
+
+    Attributes:
+        where: it is interrupted.
+    """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
     action_space = gym.spaces.Discrete(2)
     built: ClassVar[int] = 0
+    where: ClassVar[str]
 
     def __init__(self) -> None:
         Struck.built += 1
+        if Struck.built > 1 and self.where == "making":
+            raise KeyboardInterrupt
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         del seed, options
-        if Struck.built > 1:
+        if Struck.built > 1 and self.where == "reset":
             raise KeyboardInterrupt
         return np.zeros(1), {}
 
     async def step(self, action: Any) -> Any:
-        if not action:
+        del action
+        if self.where == "step":
             raise KeyboardInterrupt
         await asyncio.Event().wait()
 
 
-@pytest.mark.parametrize("hangs", [False, True], ids=["in a step", "in the reset after a hang"])
-def test_an_interrupt_on_the_trainers_event_loop_reaches_the_program(*, hangs: bool) -> None:
+@pytest.mark.parametrize("where", ["step", "reset", "making"])
+def test_an_interrupt_on_the_trainers_event_loop_reaches_the_program(where: str) -> None:
     """It may be the user's Ctrl-C, whatever an awaitable env executes then."""
-    Struck.built = 0
+    Struck.built, Struck.where = 0, where
 
     async def use() -> None:
         fields = {"name": "s", "task": Struck, "placement": "loop", "step_timeout": 0.1}
         async with rl.build_env_group(fields) as group:
             batch, _ = await group.reset()
-            await group.step(batch.respond(action=np.array([int(hangs)])))
+            await group.step(batch.respond(action=np.zeros(1, int)))
 
     with pytest.raises(KeyboardInterrupt):
         asyncio.run(use())

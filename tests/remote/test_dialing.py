@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 import zmq
@@ -75,8 +75,8 @@ def test_a_client_whose_run_has_ended_dials_anew(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(client_module, "_ATTEMPT_SECONDS", 10 * HANG)
     entry: dict[str, Any] = {"name": "robots", "backend": "env_server"}
     with sync.build_env_group(entry) as group, ThreadPoolExecutor(1) as pool:
-        env = CountingEnv()
-        client = RemoteEnvClient(env, group["robots-0"].address, name="arm")
+        env, server = CountingEnv(), cast("Any", group["robots-0"])
+        client = RemoteEnvClient(env, server.address, name="arm")
 
         def run_twice() -> None:
             with client:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
-__all__ = ["CANCEL_SECONDS", "AwaitedEnv", "Then", "end_all"]
+__all__ = ["CANCEL_SECONDS", "AwaitedEnv", "Then", "end_all", "reraise"]
 
 CANCEL_SECONDS: Final = 0.4
 """How long a task may go on after it was cancelled."""
@@ -140,7 +140,7 @@ class AwaitedEnv:
             error = raised
         # In the trainer it may be the user's Ctrl-C; a worker gets none.
         if self.runner.inline and isinstance(error, KeyboardInterrupt):
-            self._loop.call_soon(_reraise, error)
+            self._loop.call_soon(reraise, error)
         self._request = self.answering = None
         if not self.is_leaving:
             then(self, entry, outcome, error)
@@ -206,7 +206,8 @@ class AwaitedEnv:
                 future.cancel()
 
 
-def _reraise(error: BaseException) -> NoReturn:
+def reraise(error: BaseException) -> NoReturn:
+    """Raise an interrupt of an env, called by the event loop: it is meant for the program."""
     raise error
 
 

@@ -17,7 +17,12 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.hosts.awaiting.awaited_env import CANCEL_SECONDS, AwaitedEnv, end_all
+from rlightning_aio._core.hosts.awaiting.awaited_env import (
+    CANCEL_SECONDS,
+    AwaitedEnv,
+    end_all,
+    reraise,
+)
 from rlightning_aio._core.hosts.awaiting.event_loop import (
     TimeLimit,
     awaited_calls,
@@ -449,6 +454,10 @@ class AwaitedEnvs:
             if record.leaving is not None:
                 await asyncio.wait({record.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
             error, env = await self._build(record), record.env
+            if self._inline and isinstance(error, KeyboardInterrupt):
+                self._loop.call_soon(reraise, error)
+                self._finish(record, Raised(self._host_id, entry, ErrorText.of(error)))
+                return
             if env is None:
                 kind, message = WorkerDied, f"env {record.name!r} could not be rebuilt: {error!r}"
                 continue
