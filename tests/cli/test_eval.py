@@ -307,6 +307,19 @@ def test_a_queue_is_drawn_and_filmed(tmp_path: Path) -> None:
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_film_that_cannot_be_kept_ends_it_with_one_message(tmp_path: Path) -> None:
+    """The episodes until then are printed."""
+    config = write_config(tmp_path, SWITCHING)
+    films = tmp_path / "films"
+    (films / "many-b-seed-1.mp4").mkdir(parents=True)
+    asked = ("--tasks", "a,b", "--seeds", 1, "--video", films, "--json")
+    done = run("eval", config, *asked)
+    assert done.returncode == 2
+    assert f"error: --video {films}: can't be written: it is no regular file" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert [one["task"] for one in json.loads(done.stdout)["attempts"]] == ["a"]
+
+
 def test_wrong_options_of_a_queue_are_refused(tmp_path: Path) -> None:
     """The message names the option and the fix."""
     config = write_config(tmp_path, SWITCHING)

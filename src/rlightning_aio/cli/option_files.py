@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING
 
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.files import check_writable
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ def naming_option(option: str, path: Path) -> Generator[None]:
     """Turn an `OSError` of writing `path` into a `ConfigError` that names `option`."""
     try:
         yield
+    except RLightningError:
+        raise  # Some are an `OSError`, too.
     except OSError as error:
         raise ConfigError(f"{option} {path}: can't be written: {error.strerror}") from error
 

@@ -17,7 +17,7 @@ from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.bench.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.live_line import LiveLine, time_left
-from rlightning_aio.cli.option_files import check_option_file
+from rlightning_aio.cli.option_files import check_option_file, naming_option
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.playing.films import (
     Films,
@@ -314,7 +314,9 @@ async def _evaluate(
         except ValueError as error:
             raise ConfigError(str(error)) from None
         watch.ready(group)
-        await evaluated
+        folder = order.queue_films.get("video")
+        with naming_option("--video", folder) if folder else contextlib.nullcontext():
+            await evaluated
 
 
 def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
