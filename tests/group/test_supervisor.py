@@ -393,6 +393,24 @@ def test_an_aborted_request_that_exceeds_its_limit_is_no_hang(
     assert loss.death.cause == "was killed because a step was aborted"
 
 
+@pytest.mark.parametrize("second", [0, 1])
+def test_each_aborted_request_has_its_time_to_end(fleet: Callable[..., Fleet], second: int) -> None:
+    """Whatever was aborted just before, of the same env or of another of its worker."""
+    ours = fleet((2,))
+    ours.ask(0)
+    ours.begin(ours.core.abort(ours.now, None))
+    ours.finish(0)
+    ours.now += 0.15
+    ours.ask(second)
+    ours.begin(ours.core.abort(ours.now, None))
+    ours.now += 0.1
+    ours.check()
+    assert ours.log == []
+    ours.now += 0.15
+    ours.check()
+    assert ours.log == ["kill 0", "start 0", "attach 0"]
+
+
 def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]) -> None:
     """So may a call, and a reset if only steps have a limit."""
     free, limited = fleet(), fleet(step_timeout=5.0)

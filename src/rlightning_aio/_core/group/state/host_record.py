@@ -142,7 +142,7 @@ class HostRecord:
         suspects: without one, the slots of those that owed a reply while none was executed.
         dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
         is_hung: its worker hung and is being killed.
-        abort_by: when its worker is killed, unless its aborted requests have ended before;
+        abort_by: by slot, when its worker is killed unless an aborted request has ended before;
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
@@ -176,7 +176,7 @@ class HostRecord:
     dying: bool = False
     die_by: float | None = None
     is_hung: bool = False
-    abort_by: float | None = None
+    abort_by: dict[int, float] = field(default_factory=dict[int, float])
     aborted_slot: int | None = None
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0

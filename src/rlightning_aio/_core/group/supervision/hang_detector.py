@@ -59,13 +59,14 @@ class HangDetector:
         no_longer_held: list[tuple[int, int]] = []
         found: list[int] = sorted({*hosts.tolist()})
         for host_id in found:
-            record, own = self._records[host_id], entries[hosts == host_id]
+            record, is_own = self._records[host_id], hosts == host_id
+            own = entries[is_own]
             if record.is_down:
                 no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
                 continue
             record.host.abort(own)
-            if record.killable is not None and record.abort_by is None:
-                record.abort_by = now + _ABORT_SECONDS
+            if record.killable is not None:
+                record.abort_by |= dict.fromkeys(slots[is_own].tolist(), now + _ABORT_SECONDS)
                 self.any_ending = True
         return no_longer_held
 
@@ -76,7 +77,7 @@ class HangDetector:
             times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
         if self.any_ending:
             times += [r.die_by or self._now for r in self._records if r.dying]
-            times += [r.abort_by for r in self._records]
+            times += [by for r in self._records for by in r.abort_by.values()]
         return times
 
     def check(self, now: float) -> None:
@@ -88,21 +89,21 @@ class HangDetector:
                     self._check_hung(record)
         if self.any_ending:
             for record in self._records:
-                if record.abort_by is not None:
-                    self._check_aborted(record, record.abort_by)
+                if record.abort_by:
+                    self._check_aborted(record)
             self._check_dying()
-            self.any_ending = any(r.dying or r.abort_by is not None for r in self._records)
+            self.any_ending = any(r.dying or r.abort_by for r in self._records)
 
-    def _check_aborted(self, record: HostRecord, by: float) -> None:
+    def _check_aborted(self, record: HostRecord) -> None:
         """Kill a worker whose aborted requests go on."""
-        aborted = [slot for slot in self._requests.aborted.faults if slot in record.slots]
-        if not aborted or record.dying:
-            record.abort_by = None
-        elif self._now >= by and not read_news(record):
-            self._kill_aborted(record, aborted[0])
+        outstanding = {} if record.dying else self._requests.aborted.faults
+        record.abort_by = {k: by for k, by in record.abort_by.items() if k in outstanding}
+        slot = min(record.abort_by, key=record.abort_by.__getitem__, default=None)
+        if slot is not None and self._now >= record.abort_by[slot] and not read_news(record):
+            self._kill_aborted(record, slot)
 
     def _kill_aborted(self, record: HostRecord, slot: int) -> None:
-        record.abort_by, record.aborted_slot = None, slot
+        record.abort_by, record.aborted_slot = {}, slot
         self.kill(record, dump=False)
 
     def kill(self, record: HostRecord, *, dump: bool) -> None:

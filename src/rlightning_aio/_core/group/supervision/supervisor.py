@@ -351,7 +351,7 @@ class Supervisor:
         is started here.
         """
         record, death = self.records[exited.host_id], exited.death
-        record.dying, record.die_by, record.abort_by = False, None, None
+        record.dying, record.die_by, record.abort_by = False, None, {}
         if not self._lifetime.open:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
