@@ -24,7 +24,7 @@ from vector.toys import Toy, assert_alike
 from rlightning_aio import sync
 from rlightning_aio.batch.infos import infos_of_each
 from rlightning_aio.envs.mujoco import tasks as mujoco_tasks
-from rlightning_aio.errors import ConfigError, SnapshotError, StartFailed
+from rlightning_aio.errors import ConfigError, EnvRaised, SnapshotError, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
 from rlightning_aio.vector.making import steps_together
 from rlightning_aio.vector.mujoco import MujocoVectorEnv
@@ -103,6 +103,24 @@ def test_a_batch_is_called_in_two_halves_as_gymnasiums() -> None:
     for use in (lambda: env.step(actions), env.save_state, lambda: env.render_one(0)):
         with pytest.raises(ClosedEnvironmentError, match="this MujocoVectorEnv is closed"):
             use()
+
+
+@pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
+def test_simulations_that_were_never_reset_make_no_step(fields: dict[str, Any]) -> None:
+    """Those that a mask has left out of the first reset are reset by the next one."""
+    env = make_vec(PENDULUM, 2, **fields)
+    actions = np.zeros((2, 1), np.float32)
+    env.reset(seed=3, options={"reset_mask": np.array([True, False])})
+    with pytest.raises((ResetNeeded, EnvRaised), match=r"before calling env.reset\(\)"):
+        env.step(actions)
+    env.close()
+    ours, theirs = make_vec(PENDULUM, 2, **fields), make_vec(PENDULUM, 2)
+    theirs.reset(seed=3)
+    for mask in ([True, False], [False, True]):
+        ours.reset(seed=3, options={"reset_mask": np.array(mask)})
+    assert_alike(ours.step(actions), theirs.step(actions))
+    ours.close()
+    theirs.close()
 
 
 @pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])

@@ -139,7 +139,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._take_back(k)
         # The observations that were returned last; never written to.
         self._last = np.zeros((num_envs, *self.env.observation_space.shape))
+        # None until each simulation was reset once.
         self._ended: NDArray[np.bool_] | None = None
+        self._unused = np.ones(num_envs, np.bool_)
         self._nobody = np.zeros(num_envs, np.bool_)
         self._is_whole = True  # No step or reset was interrupted.
 
@@ -204,8 +206,11 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._is_whole = False
         ids, observations = np.flatnonzero(mask), self._last.copy()
         begun = self._begin(ids, observations, [seeds[k] for k in ids.tolist()], options)
-        ended = (self._nobody if self._ended is None else self._ended) & ~mask
-        self._ended, self._is_whole = ended if ended.any() else self._nobody, True
+        self._unused &= ~mask
+        if self._ended is not None or not self._unused.any():
+            ended = (self._nobody if self._ended is None else self._ended) & ~mask
+            self._ended = ended if ended.any() else self._nobody
+        self._is_whole = True
         self._keep(observations)
         return observations, self._infos(partial(of_resets, begun, self.num_envs, self._add_info))
 
@@ -329,7 +334,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             actions: ``[num_envs, *action]``.
 
         Raises:
-            ResetNeeded: there was no reset yet.
+            ResetNeeded: a simulation was not reset yet, or a call was interrupted.
             ValueError: the actions have the wrong shape.
         """
         ended, actions = self._ended, np.asarray(actions)
