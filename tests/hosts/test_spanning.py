@@ -16,7 +16,7 @@ from rlightning_aio.errors import EnvRaised, EpisodeLost
 if TYPE_CHECKING:
     from pathlib import Path
 
-SOON = 0.3
+SOON = 1.0
 
 
 @pytest.fixture(params=["loop", "process"])

@@ -214,6 +214,9 @@ class Training(InContext):
                 continue  # The collector does it.
             try:
                 self.group.reset_async(env_ids=[one.env_id])
+            except KeyboardInterrupt:  # Of before: nothing was sent.
+                self.group.reset_async(env_ids=[one.env_id])
+                raise
             except WorkerDied as died:
                 self.lose(died)
 
