@@ -264,10 +264,13 @@ def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
 
 
 def test_a_file_names_the_episodes(tmp_path: Path) -> None:
-    """Without a task it is the entry's; with several entries each names its own."""
+    """Without a task it is the entry's; with several entries each names its own. JSON may hold
+    what Unicode calls the end of a line.
+    """
     config = write_config(tmp_path, JUDGED, STUB)
     file = tmp_path / "episodes.jsonl"
-    file.write_text('{"entry": "judged", "seed": 2}\n\n{"entry": "stub", "seed": 1}\n')
+    odd = '{"entry": "stub", "seed": 1, "options": {"note": "a\u2028b"}}'
+    file.write_text(f'{{"entry": "judged", "seed": 2}}\n\n{odd}\n', encoding="utf-8")
     document = invoke_json("eval", config, "--episodes-file", file)
     played = {(one["entry"], one["task"], one["seed"]) for one in document["attempts"]}
     assert played == {("judged", JUDGED["task"], 2), ("stub", "any", 1)}

@@ -178,7 +178,7 @@ def _with_tasks(specs: list[EpisodeSpec], configs: Sequence[EnvConfig]) -> list[
 
 def _in_file(path: Path) -> list[EpisodeSpec]:
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8").split("\n")  # JSON may hold other ends of lines.
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"--episodes-file {path}: can't be read: {error}") from None
     specs: list[EpisodeSpec] = []
