@@ -107,12 +107,18 @@ def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
     """The client answers and leaves after the server has found no message, and before it looks at
     its connections.
     """
-    gate = threading.Event()
-    env = CountingEnv(on_step=lambda: gate.wait(HANG) or None)
+    begun, gate = threading.Event(), threading.Event()
+
+    def on_step() -> None:
+        begun.set()
+        gate.wait(HANG)
+
+    env = CountingEnv(on_step=on_step)
     with sync.build_env_group(ENTRY) as group:
         friend = ClientThread(group["robots-0"].address, "arm", env)
         batch, _ = group.reset()
         group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+        assert begun.wait(HANG)
         server: Any = group["robots-0"]._server
         connections = server._listener.connections
         update = connections.update
