@@ -119,7 +119,8 @@ class Players:
         if not self.gone:
             return True
         left = {entry for env_id, entry in self.entry_of.items() if env_id not in self.gone}
-        return left.issuperset(entries)
+        lost = {self.entry_of[env_id] for env_id in self.gone} - left
+        return lost.isdisjoint(entries)  # Of a server's entry, no client may be known yet.
 
 
 def _can_play(player: _Player, task: str) -> bool:
