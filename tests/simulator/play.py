@@ -1018,7 +1018,8 @@ class Play(Session):
                     env.put_back(saved)
                     env.request, env.limbo = Request("show"), False
                 else:
-                    env.torn = [state.copy() for state in (*before, *saved)]
+                    # Built anew after a death: what it has saved is not used.
+                    env.torn = [*map(State.copy, (*before, *saved)), env.fresh()]
             raise
         for env, _, _ in pairs:
             env.state.refuses = False
@@ -1052,7 +1053,7 @@ class Play(Session):
                 env.saves = [*(env.saves if env.may_be_lost else ()), *map(State.copy, before)]
                 env.since_save = 0
             if env.may_be_lost or env.env_id in note:
-                env.torn = [state.copy() for state in (*before, *saved)]
+                env.torn = [*map(State.copy, (*before, *saved)), env.fresh()]
 
     def targets(self, rng: Random, envs: list[Env]) -> list[Env]:
         """Where the states of these envs may go: there, or to others of the same entries."""
