@@ -1,0 +1,96 @@
+"""How large is the project? Lines by package, modules, tests, words, pages, options and fields.
+
+    python benchmarks/size.py
+
+Lines are those of `wc -l`, of Python and of C. The *engine* is what runs environments; everything
+else of `src` stands around it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from rlightning_aio.cli.app import app
+from rlightning_aio.config import EnvConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+ROOT = Path(__file__).resolve().parent.parent
+SRC = ROOT / "src" / "rlightning_aio"
+SMALL = [
+    "__init__", "__main__", "calling", "errors", "files", "json_text", "loop_thread", "outcomes",
+    "sealing", "sharing", "spaces", "sync", "trees", "types",
+]  # fmt: skip
+"""Modules beside the packages of the engine that belong to it."""
+ENGINE = {"_core", "protocol", "batch", "config", "registry", "remote", *SMALL}
+
+
+def code(folder: str) -> list[Path]:
+    """Return the files of Python and C below a folder of the checkout."""
+    return [path for path in (ROOT / folder).rglob("*") if path.suffix in (".py", ".c")]
+
+
+def lines(paths: Iterable[Path]) -> int:
+    return sum(path.read_bytes().count(b"\n") for path in paths)
+
+
+def words(pages: Iterable[Path]) -> int:
+    return sum(len(page.read_text().split()) for page in pages)
+
+
+def package_of(path: Path) -> str:
+    """Return the row of a module: its package, two deeper in `_core`; small modules share one."""
+    parts = path.relative_to(SRC).with_suffix("").parts
+    if parts[0] == "_core":
+        return "/".join(parts[:3] if len(parts) > 3 else parts[:-1])
+    return "small modules" if parts[0] in SMALL else parts[0]
+
+
+def options() -> list[str]:
+    """Return the options of the program and of all commands, without `--help`."""
+    group: Any = typer.main.get_command(app)
+    return [
+        parameter.opts[-1]
+        for command in (group, *group.commands.values())
+        for parameter in command.params
+        if parameter.param_type_name == "option"
+        and parameter.name not in ("help", "install_completion", "show_completion")
+    ]
+
+
+def main() -> None:
+    modules = code("src")
+    packages: Counter[str] = Counter()
+    for path in modules:
+        packages[package_of(path)] += lines([path])
+    sums = Counter({"engine": 0, "around the engine": 0})
+    for name, count in sorted(packages.items()):
+        engine = name == "small modules" or name.partition("/")[0] in ENGINE
+        sums["engine" if engine else "around the engine"] += count
+        print(f"{count:7,}  {'' if engine else '  '}{name}")
+    pages = list((ROOT / "docs").glob("*.md"))
+    texts = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING")]
+    found = {
+        **sums,
+        "src": sums.total(),
+        "modules of src": len(modules),
+        "tests": lines(code("tests")),
+        "benchmarks": lines(code("benchmarks")),
+        "words of README, ARCHITECTURE, CONTRIBUTING, docs/*.md": words([*texts, *pages]),
+        "pages in docs/": len(pages),
+        "options of all commands": len(options()),
+        "different ones": len(set(options())),
+        "fields of an entry": len(EnvConfig.model_fields),
+    }
+    print()
+    for name, count in found.items():
+        print(f"{count:7,}  {name}")
+
+
+if __name__ == "__main__":
+    main()
