@@ -9,7 +9,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.config import EnvConfig
 from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
@@ -33,23 +32,6 @@ def test_no_worker_has_much_more_than_its_share(total: int, workers: int) -> Non
 def test_one_batch_for_each_worker_if_possible(total: int, workers: int, count: int) -> None:
     """Otherwise more; a prime number makes batches of one."""
     assert num_batches(total, workers) == count
-
-
-def test_an_entry_is_divided_over_the_cores_on_request() -> None:
-    """Simulators that are parallel themselves, and this process, have one env."""
-    entry = {"name": "a", "backend": "mujoco", "task": "Hopper-v5", "num_workers": "auto"}
-    total = 8 * num_cores()
-
-    def laid_out(**fields: object) -> tuple[int, int]:
-        config = EnvConfig.model_validate({**entry, "num_envs": total, **fields})
-        return config.num_workers, config.num_envs
-
-    assert laid_out() == (num_cores(), 8)
-    assert laid_out(placement="inline") == laid_out(backend="envpool") == (1, total)
-    assert laid_out(num_envs=1) == (1, 1)
-    for fields in ({"backend": "pettingzoo"}, {"backend": "callable"}):
-        with pytest.raises(ValueError, match="and these envs have none; give a number"):
-            laid_out(**fields)
 
 
 @pytest.mark.parametrize(

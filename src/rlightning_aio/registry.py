@@ -11,7 +11,6 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast
@@ -182,21 +181,9 @@ def _is_simulators(task: Any) -> bool:
 
 
 def _computes(maker: Any) -> bool:
-    """Return True if a callable says that its envs compute, or names a simulator's task."""
-    said: Any = getattr(maker, "computes", None)
-    if said is not None:
-        return bool(said)
+    """Return True if a callable says that its envs compute."""
     maker = getattr(maker, "__wrapped__", maker)  # Of `VectorEnv`.
-    named: list[Any] = []
-    while isinstance(maker, partial):
-        named += [*maker.args, *maker.keywords.values()]
-        maker = cast("Any", maker).func
-    code: Any = getattr(maker, "__code__", None)
-    if code is not None:
-        with suppress(ValueError):  # A cell may be empty.
-            named += [cell.cell_contents for cell in maker.__closure__ or ()]
-        named += [*code.co_consts, *(maker.__defaults__ or ())]
-    return any(map(_is_simulators, named))
+    return bool(getattr(maker, "computes", False))
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,8 +385,7 @@ class Registry:
         """Return True if envs of `task`, of backend `name`, are known to be CPU-bound.
 
         Own ones aren't known: tasks whose code is neither Gymnasium's nor that of another backend
-        here, and callables that name no such task (in a constant, an argument or a closure) and
-        have no attribute ``computes`` that says so.
+        here, and callables that have no attribute ``computes`` that says so.
         """
         if not self.is_cpu_bound(name):
             return False

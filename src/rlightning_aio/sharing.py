@@ -9,12 +9,10 @@ from typing import Any, Final
 
 from rlightning_aio.errors import ConfigError
 
-__all__ = ["check_threads", "envs_per_worker", "num_batches", "num_cores"]
+__all__ = ["check_threads", "num_batches", "num_cores"]
 
 _AS_GOOD: Final = 1.15
 """A worker may have this many times its share if that makes batches fewer and larger."""
-
-_WORKERS_PER_CORE: Final = 8
 
 _CGROUPS: Final = Path("/sys/fs/cgroup")
 
@@ -46,11 +44,6 @@ def _time_limit(cgroups: Path) -> float | None:
     except (OSError, ValueError):  # Without a limit: no file, or "max".
         return None
     return limit if limit > 0 else None
-
-
-def envs_per_worker(num_envs: int, num_cores: int) -> int:
-    """The fewest envs in each worker, for envs that wait: one, up to eight workers to a core."""
-    return max(1, -(-num_envs // (_WORKERS_PER_CORE * num_cores)))
 
 
 def check_threads(name: str, number: Any) -> None:

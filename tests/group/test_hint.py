@@ -214,15 +214,6 @@ def test_envs_with_a_worker_each_and_short_steps_get_one_warning(
     assert "set envs_per_process: 3 (in VectorEnv, max_concurrency=2)" in text
 
 
-def test_many_envs_that_wait_need_not_have_a_worker_each(caplog: pytest.LogCaptureFixture) -> None:
-    """Thirty-two on two cores: sixteen workers are eight for each core."""
-    machine = Machine(per_worker=16)
-    machine.look()
-    machine.step_all(8, 10 * MS, ran=MS)
-    machine.look()
-    assert "envs_per_process: 2" in warned(caplog)[0]
-
-
 OTHERS: dict[str, dict[str, Any]] = {
     "they compute": {"ran": 9 * MS},
     "they compute on a busy machine": {"ran": MS, "queued": 9 * MS},

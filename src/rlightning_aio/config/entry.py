@@ -18,7 +18,6 @@ from pydantic import (
 
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
 from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, is_mujocos, name_of, placement_of
-from rlightning_aio.sharing import num_batches, num_cores
 
 __all__ = [
     "MADE_BY_GYMNASIUM",
@@ -68,9 +67,7 @@ class EnvConfig(_Fields):
     it with ``env_kwargs``, and it returns a `gymnasium.Env`, a `gymnasium.vector.VectorEnv`, a
     `BaseEnv` or an object whose ``reset`` and ``step`` are ``async def``."""
     num_workers: int = Field(default=1, ge=1)
-    """Number of envs; by default that of the callables. With ``auto``, `num_envs` is the total
-    number of sub-environments; they are spread over the cores, and both fields then hold the
-    result."""
+    """Number of envs; by default that of the callables."""
     num_envs: int = Field(default=1, ge=1)
     """Number of vectorised sub-environments in each env, where the backend supports them."""
     max_episode_steps: int | None = Field(default=None, ge=1)
@@ -78,8 +75,7 @@ class EnvConfig(_Fields):
     num_cpus: float = Field(default=1, ge=0)
     """CPUs of each worker; 0 reserves none (``placement: ray`` only)."""
     num_gpus: float = Field(default=0.0, ge=0)
-    """GPUs of each worker, of those that Ray manages or this process sees; a whole number, or a
-    fraction of one GPU."""
+    """GPUs of each actor, whole ones or a fraction of one (``placement: ray`` only)."""
     env_kwargs: dict[str, Any] = Field(default_factory=dict)
     """Passed to the backend."""
     placement: str = "process"
@@ -134,7 +130,7 @@ class EnvConfig(_Fields):
         for name in given:
             if name not in cls.model_fields:
                 raise ValueError(f"{name}: {unknown_field(name, cls.model_fields)}")
-        return _spread_over_cores(completed(given))
+        return completed(given)
 
     @field_validator("backend")
     @classmethod
@@ -142,16 +138,6 @@ class EnvConfig(_Fields):
         if not backend:
             raise ValueError("is required where no task is given")
         return backend
-
-    @field_validator("num_workers", mode="before")
-    @classmethod
-    def _refuse_auto(cls, num_workers: Any) -> Any:
-        if num_workers == "auto":
-            raise ValueError(
-                "'auto' spreads the sub-environments of num_envs over the cores, and these envs "
-                "have none; give a number"
-            )
-        return num_workers
 
     @field_validator("task", mode="before")
     @classmethod
@@ -246,19 +232,6 @@ def _name_of(task: Any, backend: object) -> str:
     makers = cast("Sequence[Any]", task if isinstance(task, list | tuple) else [task])
     names = {name_of(maker).rpartition(".")[2] for maker in makers}
     return "env" if len(names) != 1 or "<lambda>" in names else names.pop()
-
-
-def _spread_over_cores(fields: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return `fields` with ``num_workers: auto`` replaced by numbers, where the backend can."""
-    total, name = fields.get("num_envs", 1), str(fields.get("backend"))
-    backend = ENVS.described(name)
-    several = name != CALLABLE and (backend is None or backend.vectorized)
-    if fields.get("num_workers") != "auto" or not several or type(total) is not int or total < 1:
-        return fields
-    # Other backends compute many sub-environments at once by themselves.
-    spread = fields.get("placement") != "inline" and ENVS.is_cpu_bound(name)
-    count = num_batches(total, num_cores()) if spread else 1
-    return {**fields, "num_workers": count, "num_envs": total // count}
 
 
 def moved(config: EnvConfig, placement: str) -> EnvConfig:

@@ -1,4 +1,4 @@
-"""`start_orders`: which host runs which envs, and with which cores, devices and variables."""
+"""`start_orders`: which host runs which envs, and with which cores and variables."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ import itertools
 from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
 from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, placement_for
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of
 from rlightning_aio.registry import ENVS
-from rlightning_aio.sharing import envs_per_worker
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -77,20 +75,14 @@ def _order_of_members(config: EnvConfig) -> StartOrder:
 def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
     """The environment variables of each worker, given its entry.
 
-    The entry's own variables override those that assign devices. ``{process_index}`` in a value is
-    replaced by the number of the worker within its entry.
+    ``{process_index}`` in a value is replaced by the number of the worker within its entry.
     """
-    devices = iter(dealt_out([config for config in workers if _has_worker_here(config)]))
     count = Counter[str]()
     found: list[dict[str, str]] = []
     for config in workers:
         index = str(count[config.name])
         count[config.name] += 1
-        own = {k: v.replace("{process_index}", index) for k, v in config.env_vars.items()}
-        if config.placement == "inline":
-            check_own_devices(config)
-        dealt = next(devices) if _has_worker_here(config) else {}
-        found.append({**dealt, **own})
+        found.append({k: v.replace("{process_index}", index) for k, v in config.env_vars.items()})
     return found
 
 
@@ -106,13 +98,11 @@ def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
 
     With ``envs_per_process: auto``, entries of CPU-bound simulators share the cores in proportion
     to their envs. Entries on other machines don't, as the cores there are unknown here. Envs that
-    only wait are all in one worker, which keeps an event loop for them. Others may wait or compute:
-    own envs have a worker each, as far as `envs_per_worker` allows it for all of them.
+    only wait are all in one worker, which keeps an event loop for them. Others have a worker each,
+    as it is not known whether they may share a process.
     """
     nums: list[int] = []
     sharing: list[int] = []
-    own = sum(config.num_workers for config in configs if _is_own(config))
-    together = envs_per_worker(own, num_cores)
     for k, config in enumerate(configs):
         if not placement_for(config).spreads:
             nums.append(1)
@@ -120,9 +110,7 @@ def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             nums.append(-(-config.num_workers // config.envs_per_process))
         elif ENVS.is_awaitable(config.backend):
             nums.append(1)
-        elif _is_own(config):
-            nums.append(-(-config.num_workers // together))
-        elif ENVS.is_cpu_bound(config.backend) and placement_for(config).local:
+        elif _shares_cores(config):
             nums.append(1)
             sharing.append(k)
         else:
@@ -136,19 +124,15 @@ def nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     return nums
 
 
-def _is_own(config: EnvConfig) -> bool:
-    """True for envs of the user, of which nobody knows whether they compute or wait.
-
-    Those of a class with coroutines wait on the event loop of a worker, so they may share it.
-    """
+def _shares_cores(config: EnvConfig) -> bool:
+    """True for envs that are known to compute, or that wait on the event loop of a worker."""
     if not ENVS.is_cpu_bound(config.backend) or not placement_for(config).local:
         return False
     task: Any = config.task
     if isinstance(task, tuple):
         task = cast("tuple[Any, ...]", task)[0]
-    return not (
-        ENVS.computes(config.backend, config.task)
-        or inspect.iscoroutinefunction(getattr(task, "step", None))
+    return ENVS.computes(config.backend, config.task) or inspect.iscoroutinefunction(
+        getattr(task, "step", None)
     )
 
 

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from rlightning_aio._core.group.supervision.fault_messages import warn_where
-from rlightning_aio.sharing import envs_per_worker
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -145,15 +144,13 @@ class Hints:
         if not spent.is_enough:
             return
         self._since[name] = now
-        config = records[0].config
         together = max(len(record.slots) for record in records)
-        best = envs_per_worker(config.num_workers, self._num_cores)
-        if waits(spent) and best < together:
+        if waits(spent):
             self._since[name] = None
             warn_where(
                 records[0],
                 records[0].slots.start,
-                _advice(name, together, best, spent),
+                _advice(name, together, spent),
                 "; a step stands in {}",
                 f"a worker of entry {name!r}",
                 after=spent.step_seconds / 2,  # In a step, probably.
@@ -220,15 +217,14 @@ def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
     return bool((begun[order][1:] < done[order][:-1]).any())
 
 
-def _advice(name: str, together: int, best: int, spent: Spent) -> str:
+def _advice(name: str, together: int, spent: Spent) -> str:
     share = spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
-    factor = min(together / best, 1 / max(share, 1e-9))
+    factor = min(together, 1 / max(share, 1e-9))
     return (
         f"entry {name!r}: {together} envs share each worker, where only one is stepped at a time, "
         f"and their steps wait (one takes {1e3 * spent.step_seconds:.3g} ms, and keeps a "
         f"core busy for {100 * share:.0f} % of that); to have them wait at the same time, up to "
-        f"{factor:.1f} times as fast, set envs_per_process: {best} (in VectorEnv, "
-        f"envs_per_process={best})"
+        f"{factor:.1f} times as fast, set envs_per_process: 1 (in VectorEnv, envs_per_process=1)"
     )
 
 
