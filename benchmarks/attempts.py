@@ -48,7 +48,6 @@ from waiting import IDLE, MEAN, Waits
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
 from rlightning_aio.attempts.rules import seed_of
-from rlightning_aio.plugins.openenv.server import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
@@ -315,16 +314,7 @@ async def until_free_everywhere(*, ray: bool) -> dict[str, dict[str, float]]:
     }
     if ray:
         places["ray"] = {**worker, "placement": "ray", "num_cpus": 0, "start_timeout": 300.0}
-    found = {name: await until_free(fields) for name, fields in places.items()}
-    for session in ("own", "keep"):
-        async with (
-            rl.build_env_group(name="tool", num_workers=1, **worker) as served,
-            OpenEnvServer(served, "127.0.0.1", 0) as server,
-        ):
-            kwargs = {"action_field": "action", "session": session}
-            far = {"backend": "openenv", "task": server.url, "env_kwargs": kwargs}
-            found[f"openenv, session: {session}"] = await until_free({**far, "placement": "loop"})
-    return found
+    return {name: await until_free(fields) for name, fields in places.items()}
 
 
 class Waiting(Waits):

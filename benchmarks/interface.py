@@ -31,7 +31,7 @@ MODULES: Final = {
     "attempts": "attempts", "trl": "trainers", "tinker": "trainers",
     "policies": "evaluation", "plugins.policy_servers": "evaluation",
     "plugins.lerobot": "evaluation", "plugins.export": "evaluation",
-    "metrics": "metrics", "remote": "remote", "plugins.openenv.server": "remote",
+    "metrics": "metrics", "remote": "remote",
     "errors": "errors", "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
     "registry": "envs", "legacy": "legacy",
 }  # fmt: skip

@@ -30,7 +30,6 @@ SCRIPTS = (
     "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
     "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "pool",
     "tracing", "filming", "thread_share", "loop_pause", "headline", "exchange", "awaitable",
-    "openenv_sessions",
 )  # fmt: skip
 # Run only if they are named.
 LONG = ("training",)

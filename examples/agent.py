@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 SEEDS, GROUP_SIZE = 4, 8
 TOKENS = ("prompt_tokens", "completion_tokens", "token_ids", "logprobs")
-FIELDS = {f"{name}_field": name for name in ("observation", "action", "truncated")}  # If served.
 
 
 async def converse(model: Any, episode: AttemptEpisode) -> None:
@@ -75,17 +74,14 @@ async def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("rollouts.jsonl"))
     parser.add_argument("--patience", type=float, default=600.0, help="seconds for a server away")
     parser.add_argument("--retries", type=int, default=2, help="of an attempt that failed")
-    parser.add_argument("--openenv", metavar="URL", help="OpenEnv server of the environment")
     args = parser.parse_args()
     key = os.environ.get("OPENAI_API_KEY", "none")
     client = AsyncOpenAI(base_url=args.base_url, api_key=key, max_retries=0)
     model = Model(client, args.patience, args.stream, model=args.model, extra_body=args.body)
     tasks = [EpisodeSpec("", seed, {"task": task}) for task in TASKS for seed in range(SEEDS)]
-    shop: dict[str, Any] = {"backend": "shop", "task": "-", "placement": "loop"}
-    if args.openenv:
-        shop |= {"backend": "openenv", "task": args.openenv, "env_kwargs": FIELDS}
     lines: list[dict[str, Any]] = []
-    shop |= {"name": "shop", "num_workers": len(tasks) * GROUP_SIZE, "step_timeout": 60}
+    shop: dict[str, Any] = {"name": "shop", "backend": "shop", "task": "-", "placement": "loop"}
+    shop |= {"num_workers": len(tasks) * GROUP_SIZE, "step_timeout": 60}
     async with client, rl.build_env_group(shop) as group:
         rules, agent = Rules(retries=args.retries), partial(converse, model)
         async for attempts in play(group, tasks, agent, GROUP_SIZE, rules):

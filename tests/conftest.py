@@ -125,7 +125,7 @@ def _repeats(item: pytest.Item) -> bool:
         if hasattr(place, "inline"):
             return place.synchronous != place.inline or on_uvloop == place.inline
         on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
-        return on_asyncio and place not in (None, "loop", "openenv")
+        return on_asyncio and place not in (None, "loop")
     synchronous = any(getattr(value, "synchronous", False) for value in params.values())
     return synchronous and on_uvloop
 

@@ -248,7 +248,6 @@ def test_plug_ins_use_only_names_of_the_reference() -> None:
                     used |= {f"{module}.{name.name}" for name in node.names}
     assert used - described == set()
     for name in (
-        "openenv.server.OpenEnvServer",
         "policy_servers.OpenPiPolicy",
         "lerobot",
         "export",

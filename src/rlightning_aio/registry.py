@@ -312,11 +312,11 @@ def load(target: str) -> Any:
     return getattr(importlib.import_module(module_name), name)
 
 
-def plugins(kind: Literal["backends", "policies", "servers"]) -> EntryPoints:
+def plugins(kind: Literal["backends", "policies"]) -> EntryPoints:
     """Return the entry points of a kind.
 
     Each names, for ``backends``, a `Backend`; for ``policies``, a class of policies that takes the
-    ``ws://`` address of a server; for ``servers``, a class like `OpenEnvServer`.
+    ``ws://`` address of a server.
     """
     from importlib.metadata import entry_points  # noqa: PLC0415  # See `Backend`.
 

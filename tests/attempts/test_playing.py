@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from attempts.room import CountedRoom
-from attempts.rooms import PLACES, openenv, rooms, serving
+from attempts.rooms import PLACES, rooms
 from kit.counting import ClientThread, CountingEnv
 from patience import HANG
 
@@ -372,8 +372,6 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
 
 
 async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
-    if place.get("backend") == "openenv":
-        pytest.skip("a session has none")
 
     async def agent(episode: AttemptEpisode) -> int:
         return await episode.call("tool", 21)
@@ -383,35 +381,6 @@ async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
     assert attempt.result == 42
     assert attempt.outcome.kind == "truncated"
     assert "stopped" in attempt.outcome.cause
-
-
-async def test_attempts_of_a_server_that_is_lost_are_played_at_another() -> None:
-    """Those that it has lost say so, and are tried again."""
-    flying, go_on = 0, asyncio.Event()
-
-    async def agent(episode: AttemptEpisode) -> None:
-        nonlocal flying
-        await episode.step(1)
-        flying += 1
-        if flying == 4:
-            await first.__aexit__(None, None, None)
-            go_on.set()
-        await go_on.wait()
-        await earner(episode)
-
-    async with rooms(PLACES["loop"]) as here, rooms(PLACES["loop"]) as there:
-        first, second = serving(here), serving(there)
-        await first.__aenter__()
-        async with second:
-            place = openenv(first.url, urls=[second.url])
-            async with rooms(place, placement="loop") as group:
-                found = await played(group, tasks(4), agent, 2)
-    attempts = [attempt for attempts in found for attempt in attempts]
-    assert [attempt.reward for attempt in attempts] == [
-        1 + 4.0 * attempts.spec.seed for attempts in found for _ in range(2)
-    ]
-    failures = Counter((o.kind, o.blame) for attempt in attempts for o in attempt.failures)
-    assert failures == {("env_away", "infrastructure"): 2}
 
 
 @pytest.mark.parametrize("name", ["loop", "awaitable in workers", "workers"])
@@ -440,22 +409,8 @@ async def test_an_env_that_never_answers_is_free_for_the_next_attempt(
     """Nothing but the attempt has a time limit."""
     if place.get("placement") == "inline":
         pytest.skip("a step that hangs here is the end of the test")
-    if deed == "call" and place.get("backend") == "openenv":
-        pytest.skip("a session has none")
     async with rooms(place, num_workers=1) as group:
         await cut_off_and_play_on(group, deed)
-
-
-@pytest.mark.parametrize("session", ["own", "keep"])
-@pytest.mark.parametrize("deed", ["reset", "step"])
-async def test_the_only_env_of_a_server_is_free_for_the_next_attempt(
-    deed: str, session: str
-) -> None:
-    """The server ends what a client has given up, also of a session that outlives its socket."""
-    async with rooms(PLACES["workers"], num_workers=1) as served, serving(served) as server:
-        place = openenv(server.url, session=session)
-        async with rooms(place, num_workers=1, placement="loop") as group:
-            await cut_off_and_play_on(group, deed)
 
 
 async def cut_off_and_play_on(group: rl.EnvGroup, deed: str) -> None:

@@ -258,7 +258,6 @@ def test_a_rollout_without_a_step_is_code_1(tmp_path: Path) -> None:
         ("eval", "--episodes", "1"),
         ("bench", "--rounds", "1", "--seconds", "0.01"),
         ("check",),
-        ("serve", "--port", "0"),
     ],
 )
 def test_a_full_stdout_is_one_line_and_code_2(tmp_path: Path, words: tuple[str, ...]) -> None:

@@ -1,4 +1,4 @@
-"""The `openenv` backend and `serve` with OpenEnv itself, which has its own Python."""
+"""The `openenv` backend with OpenEnv itself, which has its own Python."""
 
 from __future__ import annotations
 
@@ -15,10 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import pytest
-from cli.command import start, write_config
-from cli.test_interrupt import interrupt
 from envs.openenv_actions import STEPS, action_of, seed_of
 from patience import HANG
 
@@ -189,23 +186,3 @@ def wait_for(url: str) -> None:
             time.sleep(0.05)
         else:
             return
-
-
-def test_the_clients_of_openenv_use_our_server(tmp_path: Path) -> None:
-    """One kind after the other, so the sessions of each are free again for the next."""
-    pole = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 4}
-    with start("serve", write_config(tmp_path, pole), "--port", 0) as server:
-        assert server.stdout is not None
-        url = server.stdout.readline().split()[-1]
-        client = [PYTHON, str(HERE / "openenv_client.py"), url, "4"]
-        text = subprocess.run(client, stdout=subprocess.PIPE, check=True, env=AS_USUAL).stdout
-        interrupt(server)
-    found = json.loads(text)
-    assert found["generic"] == found["sync"] == found["mcp"]
-    env = gym.make("CartPole-v1")
-    for seed, (first, *rows) in enumerate(found["mcp"]):
-        assert first == [env.reset(seed=seed)[0].tolist(), 0.0, False]
-        for number, (observation, reward, done) in enumerate(rows, 1):
-            found, gained, terminated, truncated, _ = env.step(number % 2)
-            assert (observation, reward) == (found.tolist(), gained)
-            assert done == (terminated or truncated)

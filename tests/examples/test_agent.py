@@ -24,7 +24,6 @@ from run_python import output_of
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, Rules, play
-from rlightning_aio.plugins.openenv.server import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
@@ -181,51 +180,6 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
     }
     blames = {rollout["error"]: rollout["outcome"]["blame"] for rollout in rollouts}
     assert set(blames.values()) == {"caller", "either", "policy"}
-
-
-def test_a_lost_server_of_environments_is_no_reward(tmp_path: Path) -> None:
-    """Every rollout fails: it has neither a reward nor an advantage, and is counted."""
-    out = tmp_path / "rollouts.jsonl"
-    shops = {"name": "shop", "backend": "shop", "task": "-", "num_workers": 64}
-
-    async def played() -> str:
-        async with (
-            ChatServer(gate=65) as chat,
-            rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
-        ):
-            async with OpenEnvServer(group, "127.0.0.1", 0) as server:
-                printing = asyncio.create_task(
-                    run_agent(chat.url, "--openenv", server.url, "--out", out, "--retries", "0")
-                )
-                while chat.most < 64 and not printing.done():  # noqa: ASYNC110
-                    await asyncio.sleep(0.01)
-            chat.may_answer.set()
-            return await printing
-
-    printed = asyncio.run(played(), debug=False)
-    assert printed.startswith("64 episodes, 0 right, 64 failed: http://127.0.0.1:")
-    for line in map(json.loads, out.read_text().splitlines()):
-        assert "was lost" in line["error"]
-        assert (line["reward"], line["advantage"]) == (None, None)
-
-
-def test_environments_of_a_server_are_played_as_those_here(tmp_path: Path) -> None:
-    """Their messages and actions are fields."""
-    out = tmp_path / "rollouts.jsonl"
-    shops = {"name": "shop", "backend": "shop", "task": "-", "num_workers": 64}
-
-    async def played() -> str:
-        async with (
-            ChatServer(gate=64) as chat,
-            rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
-            OpenEnvServer(group, "127.0.0.1", 0) as server,
-        ):
-            options = ["--openenv", server.url, "--patience", "1", "--retries", "0", "--out", out]
-            return await run_agent(chat.url, *options)
-
-    assert asyncio.run(played(), debug=False).startswith("64 episodes, 32 right, 16 failed: ")
-    for line in map(json.loads, out.read_text().splitlines()):
-        check_messages(line)
 
 
 @pytest.mark.parametrize("outage", ["429", "503", "cut off"])

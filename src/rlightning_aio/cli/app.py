@@ -15,7 +15,6 @@ from rlightning_aio.cli.check import check
 from rlightning_aio.cli.playing.evaluating import evaluation
 from rlightning_aio.cli.playing.rollout import rollout
 from rlightning_aio.cli.remote import client, keygen
-from rlightning_aio.cli.serving import serve
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.cli.trace import trace
 from rlightning_aio.protocol import kernel
@@ -70,7 +69,7 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, check, trace, backends, serve, client, keygen):
+for command in (rollout, bench, check, trace, backends, client, keygen):
     app.command()(guarded(command))
 # Named after what Python has a function of that name for.
 app.command("eval")(guarded(evaluation))
