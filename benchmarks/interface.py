@@ -28,10 +28,10 @@ from rlightning_aio.config import EnvConfig
 MODULES: Final = {
     "": "the package", "sync": "blocking", "vector": "vector", "sb3": "vector",
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
-    "attempts": "attempts", "trl": "trainers", "tinker": "trainers",
+    "attempts": "attempts",
     "policies": "evaluation", "plugins.policy_servers": "evaluation",
     "plugins.lerobot": "evaluation", "plugins.export": "evaluation",
-    "metrics": "metrics", "remote": "remote",
+    "remote": "remote",
     "errors": "errors", "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
     "registry": "envs", "legacy": "legacy",
 }  # fmt: skip

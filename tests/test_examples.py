@@ -30,7 +30,7 @@ ELSEWHERE = {
     "scaling": "on_ray/test_pages.py",
     "stable_baselines3": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
-    "trainers": "trainers/test_page.py",
+    "trainers": "vector/test_pages.py",
 }
 
 

@@ -23,6 +23,8 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("migrating#RL Zoo", ["rl_zoo3"]),
         ("migrating#skrl", ["skrl"]),
         ("migrating#Tianshou", ["tianshou"]),
+        ("trainers", ["skyrl_gym"]),
+        ("metrics", ["wandb", "prometheus_client", "opentelemetry.sdk", "tensorboardX"]),
     ],
 )
 def test_programs_run(
