@@ -183,9 +183,9 @@ $(VENV)/installed-ray: tools := test
 $(VENV)/installed-ray: extras := [ray]
 $(VENV)/installed-release: tools := test release
 $(SIMULATORS)/installed: tools := test examples notebook
-$(SIMULATORS)/installed: extras := [ale,envpool,maniskill,pettingzoo,piper,sb3,torchrl,websockets]
+$(SIMULATORS)/installed: extras := [ale,maniskill,pettingzoo,piper,sb3,torchrl,websockets]
 # Libraries whose pages it runs, too.
-$(SIMULATORS)/installed: pages := skrl tianshou skyrl-gym wandb
+$(SIMULATORS)/installed: pages := envpool skrl tianshou skyrl-gym wandb
 # What an installation is made from.
 SOURCES := pyproject.toml setup.py constraints.txt $(wildcard requirements/*.txt src/rlightning_aio/*/*.c src/rlightning_aio/*/*/*.c)
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)

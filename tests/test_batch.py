@@ -461,24 +461,6 @@ def test_columns_of_flags_belong_to_the_reader() -> None:
         assert not getattr(batch, name).any()
 
 
-def test_results_of_some_sub_environments_have_their_indices() -> None:
-    """Each result has some of them; their numbers are in the infos."""
-    names = replace(NAMES, turns=np.array([True] * 5), index_offset=np.arange(5) * 4)
-    batch = results(
-        columns(
-            [1, 0],
-            np.zeros((2, 2, 1)),
-            names=names,
-            reward=np.zeros((2, 2)),
-            flags=flags((2, 2)),
-            out_of_band={
-                k: {"info": {"env_id": np.array(ids)}} for k, ids in enumerate(([3, 1], [0, 2]))
-            },
-        )
-    )
-    assert batch.index.tolist() == [[7, 5], [0, 2]]
-
-
 def test_rows_of_different_shapes_have_no_common_column() -> None:
     """The error says what to do."""
     batch = results(
@@ -838,8 +820,7 @@ def test_infos_in_rows_become_the_same_columns_as_single_infos(
             marks[row] = InfoWriter(memoryview(rows[row]), announced.announce).write(info)
             schemas.append(known)
     slots = list(range(len(infos)))
-    names = replace(NAMES, turns=np.zeros(len(infos), np.bool_))
-    part = columns(slots, None, info=rows, info_marks=marks, schemas=schemas, names=names)
+    part = columns(slots, None, info=rows, info_marks=marks, schemas=schemas)
     assert repr(reported_info_list(results(part))) == repr(infos)
     found, expected = results(part).infos, vector_infos(infos)
     assert found.keys() == expected.keys()
@@ -987,7 +968,6 @@ def test_infos_of_sub_environments_have_their_own_masks(
         info=rows,
         info_marks=marks,
         schemas=[known] * len(slots),
-        names=replace(NAMES, turns=np.zeros(len(slots), np.bool_)),
         out_of_band={k: {"info": of_envs[k]} for k in slots if marks[k] == PICKLED},
     )
     found, expected = results(part).infos, vector_infos([info for own in infos for info in own])

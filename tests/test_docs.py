@@ -10,7 +10,6 @@ import re
 import shlex
 from pathlib import Path
 
-import pytest
 from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
@@ -53,10 +52,3 @@ def test_the_programs_for_rlightning_run(tmp_path: Path) -> None:
         *shlex.split(command)[1:], folder=tmp_path, asyncio_debug=False
     )
     assert "(16, 17)" in run_programs(programs, tmp_path)
-
-
-@pytest.mark.simulators
-def test_the_programs_for_envpool_run(tmp_path: Path) -> None:
-    """Each runs unchanged."""
-    pytest.importorskip("envpool")
-    run_programs(blocks("python", "envpool.md"), tmp_path)

@@ -23,7 +23,6 @@ LOOPS = ("async_loop", "sync_loop")
 # Run by other tests: they need other packages, or are not complete programs.
 ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
-    "envpool": "test_docs.py",
     "lerobot": "vector/test_pages.py",
     "metrics": "test_metrics.py",
     "rlightning": "test_docs.py",

@@ -132,8 +132,6 @@ BACKENDS: dict[str, Backend] = {
         Backend("pettingzoo", f"{_SIMULATORS}.pettingzoo:PettingZooEnv", "pettingzoo",
                 install=_of_extra("pettingzoo"), cpu_bound=True,
                 preload=(f"{_SIMULATORS}.pettingzoo",)),
-        Backend("envpool", f"{_SIMULATORS}.envpool:EnvPoolEnv", "envpool",
-                install=_of_extra("envpool"), vectorized=True, preload=(f"{_SIMULATORS}.envpool",)),
         Backend("maniskill", f"{_SIMULATORS}.maniskill:ManiskillEnv", "mani_skill",
                 install=_of_extra("maniskill"), vectorized=True,
                 preload=(f"{_SIMULATORS}.maniskill",)),

@@ -18,7 +18,6 @@ pytestmark = [
     ("name", "entry", "simulator"),
     [
         ("ale", "pong", "ale_py"),
-        ("envpool", "cheetahs", "envpool"),
         ("maniskill", "pick_cube", "mani_skill"),
         ("pettingzoo", "spread", "mpe2"),
     ],

@@ -225,17 +225,14 @@ def atari(**kwargs: Any) -> gym.Env[Any, Any]:
 @pytest.mark.parametrize(
     ("fields", "part"),
     [
-        ({"backend": "envpool", "task": "CartPole-v1", "num_envs": 2}, "in a library that"),
         ({"backend": "ale", "task": "ALE/Pong-v5", "num_envs": 2}, "env.env"),
         ({"backend": "maniskill", "task": "PushCube-v1"}, "BackendInfo"),
     ],
-    ids=["envpool", "ale", "maniskill"],
+    ids=["ale", "maniskill"],
 )
 def test_an_env_that_cannot_be_saved_raises(fields: dict[str, Any], part: str) -> None:
     """The message names the part."""
-    pytest.importorskip(
-        {"ale": "ale_py", "maniskill": "mani_skill"}.get(fields["backend"], "envpool")
-    )
+    pytest.importorskip({"ale": "ale_py", "maniskill": "mani_skill"}[fields["backend"]])
     made = Made(0, **fields)
     with pytest.raises(NotImplementedError, match=part):
         made.env.save_state()

@@ -38,8 +38,8 @@ class Stream:
     over: bool = False
     reset: bool = False
 
-    def begin(self, *, begun: bool = True) -> None:
-        self.total, self.length, self.over, self.reset = 0.0, 0, not begun, False
+    def begin(self) -> None:
+        self.total, self.length, self.over, self.reset = 0.0, 0, False, False
 
     def step(self, reward: float, *, ended: bool) -> None:
         self.reset = False
@@ -70,21 +70,20 @@ class Both:
         values = [getattr(self.streams[p], name) for p in np.ndindex(self.streams.shape)]
         return np.array(values).reshape(self.streams.shape)
 
-    def step(self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Any = ...) -> None:
-        streams = self.streams[which] if self.streams.shape else self.streams
+    def step(self, reward: NDArray[np.float64], ended: NDArray[np.bool_]) -> None:
         for place in np.ndindex(reward.shape):
-            streams[place].step(float(reward[place]), ended=bool(ended[place]))
-        found = self.sums.step(reward, ended if ended.any() else None, which)
-        expected = self.column("reset")[which]
+            self.streams[place].step(float(reward[place]), ended=bool(ended[place]))
+        found = self.sums.step(reward, ended if ended.any() else None)
+        expected = self.column("reset")
         assert (found is None) == (not expected.any())
         if found is not None:
             assert found.tolist() == expected.tolist()
         self.check()
 
-    def begin(self, begun: Any = ...) -> None:
+    def begin(self) -> None:
         for place in np.ndindex(self.streams.shape):
-            self.streams[place].begin(begun=begun is ... or place[0] in begun)
-        self.sums.begin(begun)
+            self.streams[place].begin()
+        self.sums.begin()
         self.check()
 
     def check(self) -> None:
@@ -119,27 +118,6 @@ def test_sums_equal_those_of_separate_streams(
 
 
 @pytest.mark.parametrize("mode", MODES)
-@given(data=st.data())
-def test_partial_results_update_only_their_own_sums(mode: Autoreset, data: st.DataObject) -> None:
-    """The indices decide, not the order in the result.
-
-    A partial reset covers some sub-environments; the next result of any other one is its start.
-    """
-    both = Both((4,), mode)
-
-    def some() -> Any:
-        chosen = data.draw(st.permutations(range(4)))[: data.draw(st.integers(1, 4))]
-        return np.array(chosen, np.int32)
-
-    for _ in range(data.draw(st.integers(0, 20))):
-        if data.draw(st.integers(0, 5)) == 0:
-            both.begin(some())
-        else:
-            which = some()
-            both.step(*drawn_step(data, (len(which),)), which)
-
-
-@pytest.mark.parametrize("mode", MODES)
 def test_a_reset_drops_the_current_episodes(mode: Autoreset) -> None:
     """No earlier step counts afterwards."""
     both = Both((2,), mode)
@@ -148,14 +126,3 @@ def test_a_reset_drops_the_current_episodes(mode: Autoreset) -> None:
     both.step(np.array([1.0, 2.0]), np.array([True, True]))
     returns, lengths, _ = both.row
     assert (returns.tolist(), lengths.tolist()) == ([1.0, 2.0], [1, 1])
-
-
-def test_an_episode_may_begin_with_a_later_result() -> None:
-    """The first result of a sub-environment after a partial reset is its start, not a step."""
-    both = Both((3,), "next_step")
-    both.begin(begun=np.array([2]))
-    which = np.array([0, 2])
-    both.step(np.array([0.0, 4.0]), np.array([False, False]), which)
-    both.step(np.array([1.0, 1.0]), np.array([True, True]), which)
-    returns, lengths, _ = both.row
-    assert (returns[which].tolist(), lengths[which].tolist()) == ([1.0, 5.0], [1, 2])

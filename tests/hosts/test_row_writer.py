@@ -301,21 +301,6 @@ def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
     assert slab.is_reset[0].tolist() == [[False, False, True]] * 2
 
 
-def test_a_partial_result_has_the_sums_of_its_own_sub_environments() -> None:
-    """They are in the order of the result."""
-    writer, slab = writer_of("next_step", (2,), partial_of=4)
-    no = np.zeros(2, bool)
-    begin(writer, {"env_id": np.array([3, 1])})
-    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
-    step(writer, np.ones(2), no, no, {"env_id": np.array([1, 2])})
-    # The first result of sub-environment 2 is its first observation.
-    assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
-    step(writer, np.array([5.0, 6.0]), np.array([True, False]), no, {"env_id": np.array([2, 1])})
-    assert flags_and_sums(slab) == [[False, False], [True, False], [5, 7], [1, 2]]
-    step(writer, np.ones(2), no, no, {"env_id": np.array([3, 2])})
-    assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
-
-
 # -- what has no place in the row
 
 

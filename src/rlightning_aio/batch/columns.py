@@ -132,16 +132,12 @@ class ResultColumns(msgspec.Struct):
     @property
     def index(self) -> NDArray[np.int64]:
         """``[n]`` or ``[n, num_envs]``, position in the group, counting sub-environments."""
-        names, shape = self.names, self.is_reset.shape
-        first: NDArray[np.int64] = names.index_offset[self.slots]
+        shape = self.is_reset.shape
+        first: NDArray[np.int64] = self.names.index_offset[self.slots]
         if len(shape) == 1:
             return first
         num_envs: int = shape[1]
-        places = np.add.outer(first, np.arange(num_envs))
-        if np.count_nonzero(names.turns):
-            for row in np.flatnonzero(names.turns[self.slots]).tolist():
-                places[row] = first[row] + self.info_of(row)["env_id"]
-        return places
+        return np.add.outer(first, np.arange(num_envs))
 
     @property
     def ready_ns(self) -> NDArray[np.int64]:

@@ -27,7 +27,6 @@ class EnvNames:
         shared_ids: ids in batches: a client has the id of its env_server.
         entries: number of the config entry of each slot; entry_names: names of the entries.
         index_offset: position in the group of the first sub-environment of each slot.
-        turns: True if each result of a slot comes from some of its sub-environments.
     """
 
     env_ids: Sequence[str]
@@ -35,7 +34,6 @@ class EnvNames:
     entries: NDArray[np.intp]
     entry_names: Sequence[str]
     index_offset: NDArray[np.int64]
-    turns: NDArray[np.bool_]
 
     def ids(self, slots: NDArray[np.intp]) -> list[str]:
         """Ids of `slots`, in order."""
@@ -60,7 +58,6 @@ class EnvNames:
             shared_ids=self.batch_ids(slots),
             entries=self.entries[slots],
             index_offset=self.index_offset[slots],
-            turns=self.turns[slots],
         )
 
     def renamed(self, slot: int, env_id: str, index_offset: int) -> EnvNames:

@@ -37,10 +37,6 @@ def _of_pettingzoo() -> Iterable[str]:
     return importlib.import_module("pettingzoo").parallel_registry
 
 
-def _of_envpool() -> Iterable[str]:
-    return importlib.import_module("envpool").list_all_envs()
-
-
 def _of_maniskill() -> Iterable[str]:
     importlib.import_module("mani_skill.envs")
     return importlib.import_module("mani_skill.utils.registration").REGISTERED_ENVS
@@ -55,7 +51,6 @@ _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "mujoco": _of_mujoco,
     "ale": _of_ale,
     "pettingzoo": _of_pettingzoo,
-    "envpool": _of_envpool,
     "maniskill": _of_maniskill,
     "metaworld": _of_metaworld,
 }

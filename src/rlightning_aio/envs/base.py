@@ -80,8 +80,7 @@ class BaseEnv(abc.ABC):
         transforms_actions: set it on a subclass whose `step` takes actions that don't have to
             fit the action space (chunks, logits, dicts).
         agents: agent names of a multi-agent env, in order; empty otherwise.
-        num_envs: sub-environments in each result. If it is below the config's, each result comes
-            from some of them, which ``info["env_id"]`` lists.
+        num_envs: sub-environments in each result.
         autoreset: what sub-environments do after the end of their episode; see `EnvMeta`.
         switches_task: `reset` accepts the name of any task of the same spaces as
             ``options["task"]``, and switches to it until the next such reset.

@@ -57,7 +57,7 @@ _STATE: Final = ("_num_steps", "_last", "_ended")
 
 
 def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
-    """Return True if a step of so many simulations seems to be too short to switch threads for."""
+    """Return True if a step of this many simulations seems too short to switch threads for."""
     inner: Any = env.unwrapped
     data = mujoco.MjData(inner.model)
     mujoco.mj_step(inner.model, data, inner.frame_skip)  # The first one is slower.

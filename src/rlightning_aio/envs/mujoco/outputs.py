@@ -254,7 +254,7 @@ class AdvancePlan(ctypes.Structure):
 
 
 def _most_references(arrays: tuple[NDArray[Any], ...]) -> int:
-    """Return how many somebody has to one of the arrays; views and tensors have some, too."""
+    """Return the most references to one of the arrays, those of views and tensors included."""
     return max(map(sys.getrefcount, arrays))
 
 
@@ -325,10 +325,10 @@ class Outputs:
             self._plan.frame = ctypes.addressof(self._at)
 
     def renew(self) -> None:
-        """Leave the frame to whoever has it, and write to another one.
+        """Write to another frame, as a caller may have this one.
 
         Making arrays, and asking for their addresses, takes longer than a step's own Python, so
-        those that nobody has any more are used again. New columns are zeros: infos are computed
+        those without further references are used again. New columns are zeros: infos are computed
         of all simulations, also of those that are reset instead of a step and leave theirs as is.
         """
         known = self._known

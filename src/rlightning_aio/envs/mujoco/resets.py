@@ -78,7 +78,7 @@ def noise_of(env: Any, kind: str, generators: NDArray[np.uintp]) -> Noise | None
 
 
 def generator_of(generator: np.random.Generator) -> int:
-    """Address of the C functions of a generator, which is to be kept meanwhile."""
+    """Address of the C functions of a generator, which must be kept meanwhile."""
     return generator.bit_generator.ctypes.bit_generator.value
 
 

@@ -135,7 +135,7 @@ class PettingZooEnv(BaseEnv):
         for agent in set(live) - set(there):
             # An agent that left has ended, even if the simulator forgot to say so.
             self._terminated[agent] |= not self._truncated[agent]
-        if not there:  # Nobody is waiting for those that are expected.
+        if not there:  # No agent waits for those that are expected.
             self._terminated |= dict.fromkeys(self._expected, True)
         self._steps += 1
         if self._steps >= (self.config.max_episode_steps or math.inf):

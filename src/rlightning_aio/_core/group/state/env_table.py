@@ -78,7 +78,6 @@ class EnvTable:
             np.array([number[config.name] for config in self.configs], np.intp),
             entry_names,
             index_offset=np.zeros(size, np.int64),
-            turns=np.zeros(size, np.bool_),
         )
         self.all = np.arange(len(env_ids))
         self.step_limits = np.array(
@@ -113,10 +112,7 @@ class EnvTable:
             self.out_of_band_actions[slot] = env.transforms_actions or not fits_row
             self.reads_extras[slot] = env.reads_extras
             self._note_meta(slot, env.meta)
-            # Each sub-environment has a seed, though a result may hold only some of them.
-            in_all = self.configs[slot].num_envs
-            self.names.turns[slot] = in_all > env.meta.num_envs
-            self.num_sub_envs[slot] = max(env.meta.num_envs, in_all)
+            self.num_sub_envs[slot] = env.meta.num_envs
         local = self.num_sub_envs[self.all]
         self.num_seeds = self._next_index = int(local.sum())
         self.seed_offset[self.all] = np.cumsum(local) - local

@@ -152,11 +152,6 @@ def _check_renders(env: BaseEnv, sub_env: int) -> None:
             f"env {env.env_id!r} has no sub-environment {sub_env} that could be "
             f"filmed: it has {env.num_envs}, from 0"
         )
-    if env.config.num_envs > env.num_envs:
-        raise ValueError(
-            f"env {env.env_id!r} can't be filmed: it gives results of some sub-environments at a "
-            "time"
-        )
 
 
 def _fps(env: BaseEnv) -> float:

@@ -50,14 +50,8 @@ class Checkpoints:
         """Return a checkpoint.
 
         Raises:
-            NotImplementedError: the env returns results of some sub-environments at a time.
             TypeError: its state can't be pickled.
         """
-        if self._writer.partial_results:
-            raise NotImplementedError(
-                f"env {self._env.env_id!r} returns results of some sub-environments at a time; "
-                "there is no moment at which all of them are idle"
-            )
         shown_result = self._restored
         if shown_result is None and self.has_result:
             shown_result = self._writer.shown_result()

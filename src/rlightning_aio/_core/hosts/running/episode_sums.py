@@ -8,18 +8,16 @@ and the next reset.
 
 from __future__ import annotations
 
-from types import EllipsisType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from rlightning_aio.types import Autoreset
 
 __all__ = ["EpisodeSums"]
-
-Which = EllipsisType | NDArray[np.integer[Any]]
 
 
 class EpisodeSums:
@@ -47,66 +45,57 @@ class EpisodeSums:
         self._autoreset = autoreset
         self._any_over = False
 
-    def begin(self, begun: Which = ...) -> None:
-        """Begin new episodes; those that `begun` leaves out begin with their next result."""
+    def begin(self) -> None:
+        """Begin new episodes."""
         self.returns[...] = 0.0
         self.lengths[...] = 0
-        self.over[...] = is_partial = begun is not ...
-        if is_partial:
-            self.over[begun] = False
-        self._any_over = is_partial and bool(self.over.any())
+        self.over[...] = self._any_over = False
 
     def row_changed(self) -> None:
         """Read what others wrote into the row."""
         self._any_over = bool(self.over.any())
 
     def step(
-        self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None, which: Which = ...
+        self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_] | None:
-        """Count one step of all sub-environments, or of those that `which` names.
+        """Count one step of all sub-environments.
 
         Args:
             reward: of each.
             ended: whether each was terminated or truncated in it; None if none was.
-            which: distinct indices.
 
         Returns:
             A mask of those that reset themselves in this step; None if none did.
         """
         if ended is None and not self._any_over:
-            if which is ...:
-                np.add(self.returns, reward, out=self.returns)
-                np.add(self.lengths, 1, out=self.lengths)
-            else:
-                self.returns[which] += reward
-                self.lengths[which] += 1
+            np.add(self.returns, reward, out=self.returns)
+            np.add(self.lengths, 1, out=self.lengths)
             return None
-        return self._step_around_ends(reward, ended, which)
+        return self._step_around_ends(reward, ended)
 
     def _step_around_ends(
-        self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None, which: Which
+        self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None
     ) -> NDArray[np.bool_] | None:
-        over = self.over[which].copy()
-        chosen = over if which is ... else which[over]
+        over = self.over.copy()
         same_step, next_step = self._autoreset == "same_step", self._autoreset == "next_step"
         some = self._any_over and np.count_nonzero(over) > 0
         if same_step and some:
             # These already began their next episode.
-            self.returns[chosen] = self.lengths[chosen] = 0
+            self.returns[over] = self.lengths[over] = 0
         # An agent that waits for others keeps its return, so that they can be added up.
         waits = some and self._autoreset == "disabled"
-        self.returns[which] += np.where(over, 0.0, reward) if waits else reward
-        self.lengths[which] += 1
+        self.returns[...] += np.where(over, 0.0, reward) if waits else reward
+        self.lengths[...] += 1
         if some and not same_step:
-            self.lengths[chosen] = 0
+            self.lengths[over] = 0
         if some and next_step:
-            self.returns[chosen] = 0.0
+            self.returns[over] = 0.0
         if ended is None:
             now = np.zeros_like(over) if same_step or next_step else over
         elif same_step:
             now = ended
         else:
             now = ended & ~over if next_step else over | ended
-        self.over[which] = now
+        self.over[...] = now
         self._any_over = np.count_nonzero(self.over) > 0
         return over if next_step and some else None

@@ -26,7 +26,7 @@ from rlightning_aio.trees import as_numpy, copied, holds_tensor
 from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -72,14 +72,12 @@ class RowWriter:
         env_id: named in errors.
         autoreset: when sub-environments reset themselves; see `EnvMeta`.
         announce: sends a new schema of infos to the trainer, and returns its number.
-        partial_of: the number of sub-environments, if a result is of some of them only; else 0.
         stays_here: data out of band stays in this process: it must be copied, and tensors, which
             become NumPy arrays elsewhere, are handed over as they are.
 
     Attributes:
         whole: the last result if it was handed over whole, because it holds tensors that stay in
             this process; otherwise None.
-        partial_results: a result is of some of the sub-environments only.
         is_bypassed: the function of `short_stepper` writes into the row, too.
     """
 
@@ -91,7 +89,6 @@ class RowWriter:
         env_id: str,
         autoreset: Autoreset,
         announce: Callable[[InfoSchema], int],
-        partial_of: int = 0,
         stays_here: bool = False,
     ) -> None:
         self._slab = slab
@@ -111,8 +108,12 @@ class RowWriter:
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
         self._terminated, self._truncated = slab.terminated[row, ...], slab.truncated[row, ...]
         self._is_reset = slab.is_reset[row, ...]
-        self.partial_results = partial_of > 0
-        self._sums = _sums(slab, row, autoreset, partial_of)
+        self._sums = EpisodeSums(
+            slab.episode_return[row, ...],
+            slab.episode_length[row, ...],
+            slab.over[row, ...],
+            autoreset,
+        )
 
     def convert_by(self, fit: Fit) -> None:
         """Convert observations by `fit` from now on; call `short_stepper` again."""
@@ -146,8 +147,7 @@ class RowWriter:
         self._write_times(busy_ns)
         if self.is_bypassed:
             self._sums.row_changed()
-        _, reward, terminated, truncated, info = result
-        self._write_ends(reward, terminated, truncated, info)
+        self._write_ends(*result[1:4])
         return self._write_data(result, extra, whole, is_fresh=True)
 
     def write_reset(
@@ -169,13 +169,7 @@ class RowWriter:
         self._write_no_transition()
         if is_loss:
             self._truncated[...] = True
-        if self.partial_results:
-            # The first observations of the others will come as results of steps.
-            begun = np.asarray(result[-1]["env_id"])
-            self._sums.begin(begun)
-            self._show_sums(begun)
-        else:
-            self._sums.begin()
+        self._sums.begin()
         return self._write_data(result, extra, whole, is_fresh=False)
 
     def write_shown(self, shown_result: ShownResult) -> OutOfBand | None:
@@ -217,8 +211,7 @@ class RowWriter:
         """
         slab, row, write_observation = self._slab, self._row, self._write_observation
         resets_itself = self._autoreset == "same_step"
-        is_single = not slab.layout.head and not self.partial_results
-        if not is_single or write_observation is None or self.whole is not None:
+        if slab.layout.head or write_observation is None or self.whole is not None:
             return None
         if self._autoreset != "disabled" and not resets_itself:
             return None
@@ -257,9 +250,7 @@ class RowWriter:
         self._flags[...] = False
         self._is_reset[...] = True
 
-    def _write_ends(
-        self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]
-    ) -> None:
+    def _write_ends(self, reward: Any, terminated: Any, truncated: Any) -> None:
         """Write reward and ends, and add the step to the sums."""
         reward = self._checked("reward", reward)
         terminated = self._checked("terminated", terminated)
@@ -271,23 +262,12 @@ class RowWriter:
         if terminated is not False or truncated is not False:
             ended = self._terminated | self._truncated
             ended = ended if np.count_nonzero(ended) else None
-        if self.partial_results:
-            which = np.asarray(info["env_id"])
-            reset = self._sums.step(self._reward, ended, which)
-            self._show_sums(which)
-        else:
-            reset = self._sums.step(self._reward, ended)
+        reset = self._sums.step(self._reward, ended)
         self._is_reset[...] = False if reset is None else self._of_all_agents(reset)
 
     def _of_all_agents(self, reset: Any) -> Any:
         """Combine the agents: a sub-environment resets itself for all of them."""
         return reset.all(axis=0) if self._slab.layout.agents else reset
-
-    def _show_sums(self, which: Any) -> None:
-        slab, row, sums = self._slab, self._row, self._sums
-        slab.episode_return[row] = sums.returns[which]
-        slab.episode_length[row] = sums.lengths[which]
-        slab.over[row] = sums.over[which]
 
     def _checked(self, what: str, value: Any) -> Any:
         layout = self._slab.layout
@@ -361,22 +341,6 @@ class RowWriter:
         copies = self._stays_here and not is_fresh
         self._last_out_of_band = copied(out_of_band) if copies else out_of_band
         return self._last_out_of_band
-
-
-def _sums(slab: Slab, row: int, autoreset: Autoreset, partial_of: int) -> EpisodeSums:
-    if partial_of:
-        return EpisodeSums(
-            np.zeros(partial_of),
-            np.zeros(partial_of, np.int64),
-            np.zeros(partial_of, np.bool_),
-            autoreset,
-        )
-    return EpisodeSums(
-        slab.episode_return[row, ...],
-        slab.episode_length[row, ...],
-        slab.over[row, ...],
-        autoreset,
-    )
 
 
 def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:

@@ -182,7 +182,6 @@ class EnvRunner:
         send_checkpoint: Send | None = None,
     ) -> None:
         """Write all results into `row` of `slab` from now on."""
-        num_envs = self.env.config.num_envs
         self._slab, self._row, self._announce = slab, row, announce
         self._attach_again = partial(self.attach, slab, row, announce, send_checkpoint)
         self._writer = RowWriter(
@@ -191,7 +190,6 @@ class EnvRunner:
             env_id=self.env.env_id,
             autoreset=self.meta.autoreset,
             announce=announce,
-            partial_of=num_envs if num_envs > self.meta.num_envs else 0,
             stays_here=self.inline,
         )
         if self._casts is not None:
