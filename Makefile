@@ -98,7 +98,7 @@ test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators 
 	$(SIMULATORS)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py tests/envs/test_maniskill.py
 
 test-lerobot: export HF_HUB_OFFLINE := 1
-test-lerobot: $(LEROBOT)/installed ## the tests of LeRobot and Minari (6 GB of packages, Python 3.12)
+test-lerobot: $(LEROBOT)/installed ## the tests of LeRobot (6 GB of packages, Python 3.12)
 	$(LEROBOT)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py tests/vector/test_lerobot.py tests/test_export.py
 
 # Their versions are to be those of constraints.txt; a project without a folder in PEERS is not run.
@@ -214,7 +214,7 @@ $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 
 $(LEROBOT)/bin/python: PYTHON := $(PYTHON_OF_LEROBOT)
 $(LEROBOT)/installed: pyproject.toml integrations/lerobot/pyproject.toml | $(LEROBOT)/bin/python
-	$(PIP_INSTALL) --editable . 'lerobot[pusht,diffusion]==0.6.1' 'minari[hdf5]==0.5.4' \
+	$(PIP_INSTALL) --editable . 'lerobot[pusht,diffusion]==0.6.1' \
 	    hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist
 	$(PIP_INSTALL) --no-deps ./integrations/lerobot
 	@touch $@

@@ -118,16 +118,6 @@ def entry_of(args: Args | CartPole) -> dict[str, Any]:
     return entry
 
 
-def waiting(rollout: Rollout) -> dict[str, float]:
-    """Average numbers of environments that stepped, waited for the policy, or for the learner."""
-    seconds = rollout.seconds
-    return {
-        "stepping": seconds["env_busy"] / seconds["elapsed"],
-        "waiting_for_policy": seconds["waited_for_policy"] / seconds["elapsed"],
-        "waiting_for_learner": seconds["waited_for_learner"] / seconds["elapsed"],
-    }
-
-
 async def train(args: Args | CartPole) -> Run:
     torch.manual_seed(args.seed)
     run = Run(args.total_steps, args.folder, args.resume)
@@ -149,7 +139,7 @@ async def train(args: Args | CartPole) -> Run:
                     figures = learner.learn(learner.columns(rollout), rate)
                     player.take(learner.agent)
                 collector.policy_version += 1
-                figures |= waiting(rollout) | {"lag": rollout.lag.mean()}
+                figures["lag"] = rollout.lag.mean()
                 returns = rollout.episodes["total_reward"].tolist()
                 run.record(len(rollout), returns, **figures)
                 if len(run.rows) % args.save_every == 0:

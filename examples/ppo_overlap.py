@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 import ppo_async
 import torch
-from ppo_async import Learner, entry_of, waiting
+from ppo_async import Learner, entry_of
 from training_run import Run, arguments
 
 import rlightning_aio as rl
@@ -141,7 +141,7 @@ async def train(args: Args | CartPole) -> Run:
                             figures = await apart.learn(columns, rate)
                         player.take(learner.agent)
                         collector.policy_version += 1
-                    figures |= waiting(rollout) | {"lag": lag.clip(max=MOST_LAG).mean()}
+                    figures["lag"] = lag.clip(max=MOST_LAG).mean()
                     returns = rollout.episodes["total_reward"].tolist()
                     run.record(len(rollout), returns, **figures)
                     rollout = collecting.result()

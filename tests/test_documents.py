@@ -27,7 +27,6 @@ INTERNAL |= {
     "loop_thread",
     "outcomes",
     "plugins",
-    "sealing",
     "trees",
     "types",
     "video",

@@ -1,4 +1,4 @@
-"""Episodes of rollouts, and what Minari and LeRobot read of the datasets they are saved as."""
+"""Episodes of rollouts, and what LeRobot reads of the dataset they are saved as."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kit.scripted import Counts
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
 from rlightning_aio.collecting.episodes import whole_episodes
-from rlightning_aio.plugins.export import save_lerobot, save_minari
+from rlightning_aio.plugins.export import save_lerobot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -113,25 +113,6 @@ def test_an_episode_with_its_begin_in_a_rollout_that_was_not_added_is_left_out()
         rollouts = (collector.collect() for _ in range(2))
         (episode,) = whole_episodes(rollouts)
         assert episode.observation["agent_pos"][0].tolist() == [2.0, 0.0]
-
-
-@pytest.mark.simulators
-@pytest.mark.filterwarnings("ignore::UserWarning:minari")  # Of what it doesn't know of the env.
-def test_minari_reads_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the observations, actions, rewards and ends that were played."""
-    minari = pytest.importorskip("minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    rollouts = list(rollouts_of(12, 1))
-    spaces = Counting.observation_space, Counting.action_space
-    save_minari(rollouts, "counting/half-v0", *spaces, jpeg_encoding=False)
-    dataset = minari.load_dataset("counting/half-v0")
-    assert dataset.total_episodes == 4
-    for episode, read in zip(whole_episodes(rollouts), dataset.iterate_episodes(), strict=True):
-        for name, of in episode.observation.items():
-            np.testing.assert_array_equal(read.observations[name], of)
-        np.testing.assert_array_equal(read.actions, episode.action)
-        np.testing.assert_array_equal(read.rewards, episode.reward)
-        np.testing.assert_array_equal(read.terminations, episode.terminated)
 
 
 @pytest.fixture(scope="module")

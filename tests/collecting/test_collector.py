@@ -173,7 +173,7 @@ def collector_of_infos(value: Any, infos: Any) -> Any:
 @pytest.mark.parametrize("value", [True, np.False_, 0.5, np.float32(0.5), np.array(1)])
 def test_an_info_becomes_a_column_that_is_nan_where_it_is_missing(value: Any) -> None:
     group, collector = collector_of_infos(value, ["success", "absent"])
-    with group, group.auto_reset(), pytest.warns(match="'absent'"):
+    with group, group.auto_reset():
         rollout = collector.collect()
     assert rollout.done.any()
     np.testing.assert_array_equal(rollout.success, np.where(rollout.done, float(value), np.nan))
@@ -188,36 +188,6 @@ def test_an_info_that_is_not_a_number_raises(value: Any) -> None:
         for _ in range(2):
             with pytest.raises(ValueError, match=r"info 'success' .* one number"):
                 collector.collect()
-
-
-def test_an_info_that_no_env_reports_is_warned_of_once() -> None:
-    """At the end of the first rollout with an episode that has ended, with the names there are."""
-    group, collector = collector_of_infos(True, ["sucess", "success"])
-    with group, group.auto_reset():
-        with pytest.raises(UserWarning, match=r"no info has had 'sucess'.*mean 'success'"):
-            collector.collect()  # Warnings are errors here; they lose nothing.
-        rollouts = [collector.collect() for _ in range(2)]
-    lengths = [rollout.episodes["length"].sum() for rollout in rollouts]
-    assert rollouts[0].first[0]
-    assert sum(lengths) <= 120
-    assert rollouts[0].success[rollouts[0].done].all()
-
-
-def test_infos_that_come_later_or_from_some_entries_only_are_not_warned_of() -> None:
-    """Nothing is known before an episode has ended."""
-    entries = [
-        {"name": name, "task": maker, "placement": "inline"}
-        for name, maker in (
-            ("judged", lambda: Judged(1.0)),
-            ("plain", lambda: gym.make("CartPole-v1")),
-        )
-    ]
-    with sync.build_env_group(entries) as group, group.auto_reset():
-        policies = {"judged": zeros, "plain": zeros}
-        collector = Collector(group, policies, num_transitions=6, infos=["success"], seed=0)
-        while not (rollout := collector.collect())["judged"].done.any():
-            pass
-    assert rollout["judged"].success[rollout["judged"].done].all()
 
 
 def test_infos_with_the_name_of_a_rollouts_column_raise() -> None:
@@ -485,24 +455,6 @@ def test_ctrl_c_after_a_step_was_sent_loses_nothing(sent: int) -> None:
     np.testing.assert_array_equal(found.observation, expected.observation)
 
 
-@pytest.mark.parametrize("name", ["enter", "leave"])
-def test_ctrl_c_around_a_rollout_leaves_the_collector_usable(
-    monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    """It may be raised wherever the collector looks at the clock."""
-    with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=6)
-
-        def interrupt() -> None:
-            raise KeyboardInterrupt
-
-        with monkeypatch.context() as patch:
-            patch.setattr(collector._clock, name, interrupt)
-            with pytest.raises(KeyboardInterrupt):
-                collector.collect()
-        assert len(collector.collect()) == 6
-
-
 def test_a_policy_must_give_the_same_columns_each_time() -> None:
     """With the same shape and kind of number: 0.5 is not an integer."""
     for more in (
@@ -565,21 +517,6 @@ def test_lag_is_counted_in_versions() -> None:
         rollout = collector.collect()
         assert sorted(rollout.policy_version.tolist()) == [0, 2, 2]
         assert sorted(rollout.lag.tolist()) == [0, 0, 2]
-
-
-def test_a_rollout_reports_its_times() -> None:
-    """At any time each of two envs is in one state; late times count for a later rollout."""
-    with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=20, min_results=2, seed=0)
-        seconds = [collector.collect().seconds for _ in range(3)]
-    for own in seconds:
-        assert 0 < own["policy"] <= own["collecting"] <= own["elapsed"]
-        assert own["env_busy"] > 0
-        assert own["waited_for_policy"] > 0
-        assert own["waited_for_learner"] >= 0
-    elapsed = sum(own["elapsed"] for own in seconds)
-    in_states = ("env_busy", "waited_for_policy", "waited_for_learner")
-    assert sum(own[name] for own in seconds for name in in_states) <= 2 * elapsed
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from faults.striking import hear_of_interrupt, struck
 
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
-from rlightning_aio.collecting.record import RecordedGroup
 from rlightning_aio.errors import NothingPending
 
 if TYPE_CHECKING:
@@ -39,18 +38,17 @@ def group() -> Iterator[sync.EnvGroup]:
 
 
 @pytest.mark.parametrize("call", ["first", "third"])
-@pytest.mark.parametrize("kind", ["first ready", "blocks", "recorded"])
+@pytest.mark.parametrize("kind", ["first ready", "blocks"])
 def test_a_collect_goes_on_wherever_it_was_interrupted(
     group: sync.EnvGroup, kind: str, call: str
 ) -> None:
     """The interrupted call raises KeyboardInterrupt, or returns a rollout; then the next does."""
     options = {"num_transitions": 8, "wait_all": True} if kind == "blocks" else {}
-    used: Any = RecordedGroup(group) if kind == "recorded" else group
     for line in range(1, NUM_LINES, STRIDE):
         found: list[Rollout] = []
         with group.auto_reset(math.inf):
             collector: Any = Collector(
-                used, PER_ENTRY, seed=SEED, **{"num_transitions": 3, **options}
+                group, PER_ENTRY, seed=SEED, **{"num_transitions": 3, **options}
             )
             for _ in range(2 if call == "third" else 0):
                 found += parts_of(collector.collect())

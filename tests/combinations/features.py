@@ -16,7 +16,6 @@ from combinations.played import Transition, as_tuple
 from timelines import Seen
 
 from rlightning_aio.collecting import Collector, Rollout
-from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.evaluation import evaluate
 
@@ -94,7 +93,7 @@ def copied(rollout: Rollout) -> Rollout:
     """One whose arrays nobody else writes to."""
     columns = {name: rollout[name].copy() for name in rollout}
     ends = Ends(rollout.ends, rollout.end_observation.copy())
-    return Rollout(columns, ends, rollout.episodes, rollout.seconds)
+    return Rollout(columns, ends, rollout.episodes)
 
 
 def stored(use: Use, found: list[Rollout]) -> list[list[Transition]]:
@@ -138,22 +137,6 @@ def blocks(use: Use, folder: Path) -> None:
     lists = stored(use, found)
     assert {len(own) for own in lists} == {15}
     assert_as_played(use, lists)
-
-
-def replay(use: Use, folder: Path) -> None:
-    """A run in a recorded order is that run to the bit, and true to the envs."""
-    del folder
-    rules: dict[str, Any] = {"num_transitions": 11, "min_results": use.options.results[0]}
-    recorded = RecordedGroup(use.group)
-    before = rollouts(use, recorded, **rules)
-    use.drain()
-    again = rollouts(use, ReplayedGroup(use.group, recorded.record), **rules)
-    for one, other in zip(before, again, strict=True):
-        for name in one:
-            np.testing.assert_array_equal(one[name], other[name])
-        np.testing.assert_array_equal(one.ends, other.ends)
-        np.testing.assert_array_equal(one.end_observation, other.end_observation)
-    assert_as_played(use, stored(use, again))
 
 
 def resumption(use: Use) -> None:
@@ -267,7 +250,6 @@ FEATURES = (
     first_come,
     chains,
     blocks,
-    replay,
     evaluation,
     timeline,
     snapshots,

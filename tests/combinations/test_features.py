@@ -60,18 +60,6 @@ _INLINE = {**FACTORS, "placement": ["inline"], "snapshot_every": [None]}
 _OPTIONS = st.builds(Options, **{name: st.sampled_from(values) for name, values in _INLINE.items()})
 
 
-def test_a_new_collector_begins_anew_after_a_restore_for_an_earlier_one(tmp_path: Path) -> None:
-    """It goes on only from what was restored since it was made."""
-    by_name = {feature.__name__: feature for feature in FEATURES}
-    kind, task = FACTORS["kind"][0], FACTORS["task"][0]
-    options = Options(kind, "inline", False, task, math.inf, None, (2, None), False)
-    with Use(options) as use:
-        for number, name in enumerate(("chains", "snapshots", "replay")):
-            (folder := tmp_path / str(number)).mkdir()
-            by_name[name](use, folder)
-            use.drain()
-
-
 @given(_OPTIONS.filter(lambda options: options.fits), st.data())
 def test_any_options(tmp_path_factory: pytest.TempPathFactory, options: Any, data: Any) -> None:
     """One feature after another with the same envs, in any order."""

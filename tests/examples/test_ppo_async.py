@@ -1,4 +1,4 @@
-"""The asynchronous examples: a run is repeated by its record, and learning beside it stays near."""
+"""The asynchronous examples: learning beside the collection stays near."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
-
-from rlightning_aio.collecting import Collector
-from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -39,31 +36,6 @@ def tracker_of_multiprocessing() -> None:
 def ppo_async(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(EXAMPLES)
     return importlib.import_module("ppo_async")
-
-
-def test_a_run_is_repeated_by_its_record(
-    ppo_async: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Weights, normaliser and returns are the same to the bit, whoever is ready first."""
-    recorded: list[Any] = []
-
-    def weights(group_in_front: Any, folder: str) -> dict[str, Any]:
-        def collector(group: Any, policy: Any, **options: Any) -> Any:
-            recorded.append(group_in_front(group))
-            return Collector(recorded[-1], policy, **options)
-
-        monkeypatch.setattr(ppo_async, "Collector", collector)
-        args = ppo_async.CartPole(folder=str(tmp_path / folder), normalize=True, **SHORT)
-        asyncio.run(ppo_async.train(args))
-        return torch.load(tmp_path / folder / "checkpoint.pt", weights_only=True)
-
-    once = weights(RecordedGroup, "recorded")
-    again = weights(lambda group: ReplayedGroup(group, recorded[0].record), "replayed")
-    for part in ("agent", "normalizer"):
-        for name, value in once[part].items():
-            assert torch.equal(again[part][name], value), name
-    returns = [[row["return"] for row in saved["run"]["rows"]] for saved in (once, again)]
-    np.testing.assert_array_equal(*returns)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Programs of `Collector`, in recorded and replayed order, and of `evaluate`."""
+"""Programs of `Collector`, and of `evaluate`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from simulator.session import Session, action_of, stacked
 from simulator.trails import Trail, Transition
 
 from rlightning_aio.collecting import Collector
-from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import (
     EnvAway,
     EnvFault,
@@ -120,20 +119,15 @@ class Training(InContext):
         super().begin()
         self.raised = dict.fromkeys(self.by_id, 0)
         self.kept: list[tuple[Any, Any]] = []
-        self.disturbed = False
         self.raised_deaths: set[int] = set()
         rng = Random(self.program.seed)
         self.options = self._options(rng)
-        self.recorded = RecordedGroup(self.group)
-        self._begin_with(self.group if self.clients else self.recorded)
-
-    def _begin_with(self, group: Any) -> None:
         self.trails: dict[tuple[int, int], Trail] = {}
         local = [env for env in self.envs if env.client is None]
         self.env_of = {env.first + k: env for env in local for k in range(len(env.codes))}
         single = len(self.program.plans) == 1
         policy: Any = self.policy if single else {p.name: self.policy for p in self.program.plans}
-        self.collector: Any = Collector(group, policy, **self.options)
+        self.collector: Any = Collector(self.group, policy, **self.options)
 
     def _options(self, rng: Random) -> dict[str, Any]:
         width = sum(len(env.codes) for env in self.envs)
@@ -167,8 +161,6 @@ class Training(InContext):
     # -- operations
 
     plain = False
-    replays = False
-    """Nothing was cut off when it was recorded, and envs may be slower now."""
 
     async def op_rollout(self, rng: Random) -> bool:
         """Collect a rollout, or be disturbed meanwhile."""
@@ -176,7 +168,7 @@ class Training(InContext):
         cancels = self.is_async and "cancel" in self.features and rng.random() < 0.4
         seconds = 10 ** rng.uniform(-6, -1) if cancels and not self.plain else None
         try:
-            if seconds is None or self.replays:
+            if seconds is None:
                 found = await self.done(self.collector.collect())
             else:
                 async with asyncio.timeout(seconds):
@@ -192,11 +184,7 @@ class Training(InContext):
         else:
             self.take(found)
             return True
-        self.disturbed = True
         return False
-
-    def note_interrupt(self) -> None:
-        self.disturbed = True
 
     def restore_order(self, fault: EnvFault) -> None:
         """Reset the env that raised, as the error says; those of a worker that is gone are lost."""
@@ -248,31 +236,7 @@ class Training(InContext):
                 break
         else:
             raise Violation("no rollout is collected any more")
-        if not (self.disturbed or self.clients or any(env.deaths for env in self.envs)):
-            # An env may press Ctrl-C in a step that the recorded run didn't wait for.
-            await self.interruptible(self.replay())
         await super().finish()
-
-    async def replay(self) -> None:
-        """Do the same with other envs in the recorded order: the rollouts are the same."""
-        rollouts = [copies for _, copies in self.kept]
-        record = pickle.loads(pickle.dumps(self.recorded.record))
-        self.context.__exit__(None, None, None)
-        await self.close()
-        self.build()
-        await self.start()
-        self.enter()
-        self.kept, self.plain, self.replays = [], False, True
-        self._begin_with(ReplayedGroup(self.group, record))
-        for op in self.program.ops:
-            if op.name == "rollout":
-                await self.op_rollout(Random(op.seed))
-            self.collector.policy_version += op.name == "learn"
-        self.plain = True
-        await self.op_rollout(Random(1))
-        require(not self.disturbed, "the replay was disturbed")
-        require(same([copies for _, copies in self.kept], rollouts), "the replay differs")
-        self.counts["replays"] += 1
 
     # -- rollouts
 

@@ -33,9 +33,6 @@ EXCEPTIONS: Final[dict[tuple[str, str], str]] = {
     ("rlightning_aio.vector.env.VectorEnv", "arguments of a constructor"): (
         "It takes those of Gymnasium's AsyncVectorEnv, so that programs change only an import."
     ),
-    ("rlightning_aio.collecting.collector.Collector", "arguments of a constructor"): (
-        "Two of nine record an order and replay it, in place of three classes around the group."
-    ),
 }
 """By qualified name and limit: why it is exceeded. An exception that is not needed is refused."""
 

@@ -2,7 +2,7 @@
 
 `Collector` steps a group with a policy and returns `Rollout`s: transitions as columns, ordered by
 env, with the observations needed to bootstrap at each end, and advantages over them. `collector`
-calls the policy, `kind` and `staging` fill the columns, `record` writes and follows an order.
+calls the policy, `kind` and `staging` fill the columns.
 Rule: it uses only the public `EnvGroup` and NumPy; torch shares the arrays.
 """
 

@@ -7,10 +7,7 @@ next `collect` continues there; `Newest` says which of them are old by then.
 
 from __future__ import annotations
 
-import time
-import warnings
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
@@ -20,17 +17,13 @@ from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio._core.group.engine.newest import newest_of
-from rlightning_aio.collecting.clock import Clock
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
-from rlightning_aio.collecting.record import Record, RecordedGroup, RecordFile, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
 from rlightning_aio.policies.random_actions import RandomPolicy
-from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable, Coroutine, Sequence
 
     import gymnasium as gym
@@ -94,23 +87,16 @@ class Collector(Generic[G, R]):
             of the envs.
         wait_all: collect blocks ``[T, N]``.
         infos: names of numbers in infos, such as ``("success",)``. Each becomes a float64 column
-            of the rollout, NaN where the info of a transition has no such number. A name that no
-            info has had when the first episode ends is warned of.
+            of the rollout, NaN where the info of a transition has no such number.
         seed: of the first reset; see `EnvGroup.reset`.
-        record: file for the order in which results arrive, a few bytes for each; written with each
-            rollout, and when `collect` raises. An existing file is replaced.
-        replay: such a file, of a run with the same program, seeds and settings: results are taken
-            in its order, so every transition is the same, bit for bit.
 
     Attributes:
         policy_version: set it to the version of the policy. Each transition records the version
             that chose its action.
 
     Raises:
-        ValueError: a number is below 1, both `min_results` and `wait_all` or `record` and `replay`
-            are given, a name of `infos` is that of a column of every rollout, or the file to replay
-            is none or is damaged.
-        OSError: the file to record can't be written, or the file to replay can't be read.
+        ValueError: a number is below 1, both `min_results` and `wait_all` are given, or a name of
+            `infos` is that of a column of every rollout.
     """
 
     @overload
@@ -124,8 +110,6 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
-        record: str | os.PathLike[str] | None = None,
-        replay: str | os.PathLike[str] | None = None,
     ) -> None: ...
 
     @overload
@@ -139,8 +123,6 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
-        record: str | os.PathLike[str] | None = None,
-        replay: str | os.PathLike[str] | None = None,
     ) -> None: ...
 
     def __init__(
@@ -153,8 +135,6 @@ class Collector(Generic[G, R]):
         wait_all: bool = False,
         infos: Sequence[str] = (),
         seed: Any = None,
-        record: str | os.PathLike[str] | None = None,
-        replay: str | os.PathLike[str] | None = None,
     ) -> None:
         for name, number in (("num_transitions", num_transitions), ("min_results", min_results)):
             if number is not None and number < 1:
@@ -166,9 +146,8 @@ class Collector(Generic[G, R]):
         for name in (OWN_NAMES | {"action"}).intersection(infos):
             raise ValueError(f"infos: a rollout already has {name!r}; rename the env's info")
         self.policy_version = 0
-        self._group, self._order = _in_order(group, record, replay)
+        self._group = group
         self._infos = infos
-        self._are_infos_known = not infos
         self._policy: Any = policy
         self._policies: Mapping[str, Callable[[BatchedData], Any] | None] | None = (
             policy if isinstance(policy, Mapping) else None
@@ -178,7 +157,6 @@ class Collector(Generic[G, R]):
         self._block = wait_all
         self._num_steps = 0
         self._seed = seed
-        self._clock = Clock()
         self._kinds: dict[str, EnvKind] = {}
         self._started = self._start_cut_off = self._start_raised = False
         self._start_fault: EnvFault | None = None
@@ -214,15 +192,9 @@ class Collector(Generic[G, R]):
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
                 takes part again in the next call, and one whose worker is not replaced doesn't.
             RLightningError: a robot's or a client's env has raised and was not reset since.
-            RLightningError: the results are not those of `replay`, or it has ended.
-            OSError: the order can't be written to `record`; the next call tries again.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """
-        group = self._group
-        wrapped: Any = group
-        if isinstance(group, RecordedGroup | ReplayedGroup):
-            wrapped = cast("RecordedGroup[Any] | ReplayedGroup[Any]", group).group
-        return run_as_one_call(self._collect(), wrapped)
+        return run_as_one_call(self._collect(), self._group)
 
     # -- the loop -----------------------------------------------------------------
 
@@ -234,7 +206,6 @@ class Collector(Generic[G, R]):
         with ensure_auto_reset(self._group):
             self._collecting = True
             try:
-                self._clock.enter()
                 if not self._started:
                     yield from self._start()
                 is_resumed = False
@@ -244,7 +215,6 @@ class Collector(Generic[G, R]):
                         self._received = None
                     if not self._store():
                         yield BREAK  # After this, it would wait for the learner's next collect.
-                        self._write_order()
                         return self._full()
                     if not is_resumed:
                         self._resume()
@@ -254,17 +224,8 @@ class Collector(Generic[G, R]):
                     while self._unanswered:
                         yield from self._answer(self._unanswered[0])
                     yield from self._wait()
-            except BaseException:
-                with suppress(OSError):
-                    self._write_order()
-                raise
             finally:
                 self._collecting = False
-                self._clock.leave()
-
-    def _write_order(self) -> None:
-        if self._order is not None:
-            self._order.write()
 
     def _wait(self) -> Procedure[None]:
         """Wait for the next results."""
@@ -283,7 +244,7 @@ class Collector(Generic[G, R]):
     def _start(self) -> Procedure[None]:
         """Reset all envs, and wait for all of them, unless the program has done so."""
         try:
-            if self._order is None and not (self._start_cut_off or self._start_raised):
+            if not (self._start_cut_off or self._start_raised):
                 self._received = self._newest.take_all_returned()
             if self._received is None:
                 self._received, _ = yield partial(self._group.reset, seed=self._seed)
@@ -499,10 +460,8 @@ class Collector(Generic[G, R]):
     def _answer(self, part: Part) -> Procedure[None]:
         """Call the policy for `part`, and send its actions."""
         version = self.policy_version
-        began = time.monotonic_ns()
         with self._group.span("policy"):
             answer = yield Interruptible(partial(part.kind.policy, part.batch))
-        self._clock.note_policy(time.monotonic_ns() - began)
         responses, columns = part.kind.columns_of(part, answer)
         # Copy before sending: the columns may be views of rows that envs will overwrite.
         part.kind.staging.begin(part.results.index, columns, version)
@@ -522,7 +481,6 @@ class Collector(Generic[G, R]):
                 raise
             return
         part.kind.staging.note_sent()
-        self._clock.note_answered(part.batch)
         del self._unanswered[0]
 
     def _was_raised_before(self, error: WorkerDied) -> bool:
@@ -541,30 +499,12 @@ class Collector(Generic[G, R]):
         self._unanswered[:1] = [] if left is None else [left]
         self._expecting = bool(self._group.pending)
 
-    def _warn_of_unknown_infos(self) -> None:
-        """Warn once of names in `infos` that no env has reported up to the end of an episode."""
-        stagings = [kind.staging for kind in self._kinds.values()]
-        if not self._are_infos_known and any(staging.episodes for staging in stagings):
-            self._are_infos_known = True
-            found = set[str]().union(*(staging.info_names for staging in stagings))
-            for name in set(self._infos) - found:
-                known = ", ".join(map(repr, sorted(found))) or "nothing"
-                warnings.warn(
-                    f"no info has had {name!r}, one of Collector(infos=…), up to the end of the "
-                    "first episode, so its column holds NaN; "
-                    + (did_you_mean(name, found) or f"infos had {known}"),
-                    stacklevel=2,
-                )
-
     def _full(self) -> R:
-        self._warn_of_unknown_infos()
-        seconds = self._clock.seconds()
         waiting = {id(part.kind): part.results for part in self._unanswered}
         found = {
             name: kind.rollout(
                 waiting.get(id(kind)) if kind.held is None else kind.held.results,
                 self.policy_version,
-                seconds,
             )
             for name, kind in self._kinds.items()
         }
@@ -583,17 +523,3 @@ def _newest_parts(parts: list[Part], newest: Newest) -> list[Part]:
 
 def _is_server(meta: EnvMeta) -> bool:
     return meta.observation_space is None
-
-
-def _in_order(
-    group: Any, record: str | os.PathLike[str] | None, replay: str | os.PathLike[str] | None
-) -> tuple[Any, RecordFile | None]:
-    """Return `group`, or one around it that records or replays the order of its results."""
-    if record is not None and replay is not None:
-        raise ValueError("record and replay exclude each other: give one of them")
-    if replay is not None:
-        return ReplayedGroup(group, Record.load(replay)), None
-    if record is None:
-        return group, None
-    recorded = RecordedGroup(group)
-    return recorded, RecordFile(recorded.record, record)

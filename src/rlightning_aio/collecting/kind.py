@@ -192,7 +192,7 @@ class EnvKind:
     def _space(self) -> gym.Space[Any] | None:
         return self._action_space
 
-    def rollout(self, held: ResultRows | None, version: int, seconds: dict[str, float]) -> Rollout:
+    def rollout(self, held: ResultRows | None, version: int) -> Rollout:
         """Return the completed transitions as columns.
 
         `held` has the results without an answer; `version` is that of the newest policy.
@@ -213,8 +213,7 @@ class EnvKind:
         columns["lag"] = version - columns["policy_version"]
         episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
-        found = Ends(ends, end_observation)
-        return Rollout(columns, found, episodes, seconds)
+        return Rollout(columns, Ends(ends, end_observation), episodes)
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)
@@ -237,7 +236,7 @@ class EnvKind:
 
 OWN_NAMES: Final = frozenset(
     {"done", "end_observation", "ends", "episodes", "first", "index", "lag", "num_chains"}
-    | {"observation", "policy_version", "reward", "seconds", "shape", "terminated"}
+    | {"observation", "policy_version", "reward", "shape", "terminated"}
     | {"truncated", "advantages", "at_ends", "keys", "next_observation", "vtrace"}
 )
 """Names that neither a policy nor an info may give to a column of a rollout."""

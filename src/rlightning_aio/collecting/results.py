@@ -84,14 +84,6 @@ class ResultRows:
             found[over] = _numbers(name, cast("dict[str, Any]", final), self.head)[over]
         return found.reshape(-1)
 
-    def info_names(self) -> set[str]:
-        """Names that the info of any row has."""
-        columns = self.batch.infos
-        parts = [columns]
-        if isinstance(final := columns.get("final_info"), dict):
-            parts.append(cast("dict[str, Any]", final))
-        return {name for part in parts for name in part if f"_{name}" in part}
-
     def episodes(self, rows: NDArray[np.intp]) -> list[Ended]:
         """Episodes that ended in `rows`."""
         count = self.num_sub_envs

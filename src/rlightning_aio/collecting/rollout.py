@@ -61,13 +61,6 @@ class Rollout:
             earlier. ``index`` is that of the env in the group, ``total_reward`` the undiscounted
             return since the reset, summed over agents, ``length`` the steps since the reset, and
             ``info`` a list: the info of the last step, without that of the next episode.
-        seconds: times by name. ``elapsed``: since the previous rollout was complete, or since the
-            first call of `collect`. ``collecting``: inside `Collector.collect`; a learner that runs
-            in between waits that long. ``policy``: in calls of the policy. ``env_busy``: in steps
-            and resets, summed over envs. ``waited_for_policy``: between the result of an env and
-            its next request, summed over envs, minus ``waited_for_learner``: envs wait for the
-            policy, or for results of other envs to fill a batch. ``waited_for_learner``: likewise,
-            while no call of `collect` was in progress.
     """
 
     observation: Tree
@@ -81,19 +74,12 @@ class Rollout:
     index: NDArray[np.int64]
     first: NDArray[np.bool_]
 
-    def __init__(
-        self,
-        columns: dict[str, Tree],
-        ends: Ends,
-        episodes: dict[str, Any],
-        seconds: dict[str, float],
-    ) -> None:
+    def __init__(self, columns: dict[str, Tree], ends: Ends, episodes: dict[str, Any]) -> None:
         self._columns = columns
         index: Any = columns["index"]
         self.shape: tuple[int, ...] = index.shape
         self.ends, self._end_observation = ends
         self.episodes = episodes
-        self.seconds = seconds
         self._segments: Segments | None = None
 
     @property

@@ -58,14 +58,12 @@ class Staging:
         complete: number of complete transitions.
         made: number of complete transitions by env.
         episodes: those that ended with these transitions.
-        info_names: names that the infos of transitions had, until all of `infos` were among them.
     """
 
     def __init__(self, quota: int, infos: Sequence[str]) -> None:
         self._quota = quota
         self._infos = infos
         self.episodes: list[Ended] = []
-        self.info_names: set[str] = set()
         self.columns: dict[str, Tree] = {}
         self.complete = 0
         self.end_observation: Tree = None
@@ -233,8 +231,6 @@ class Staging:
                 scattered(self.columns[name], places, mapped(lambda leaf: leaf[rows], values))
         for name in self._infos:
             scattered(self.columns[name], places, results.info(name)[rows])
-        if not self.info_names.issuperset(self._infos):
-            self.info_names |= results.info_names()
         self._is_complete[places] = True
         self._last[index] = places
         self._place[index] = _NO_PLACE

@@ -1,4 +1,4 @@
-"""Episodes of rollouts as datasets of Minari and of LeRobot.
+"""Episodes of rollouts as datasets of LeRobot.
 
 Rule: a dataset holds whole episodes only (`whole_episodes`).
 """
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rlightning_aio.collecting import Rollout
     from rlightning_aio.collecting.episodes import WholeEpisode
 
-__all__ = ["save_lerobot", "save_minari"]
+__all__ = ["save_lerobot"]
 
 _LEROBOT_NAMES = {
     "agent_pos": "observation.state",
@@ -29,54 +29,6 @@ _LEROBOT_NAMES = {
     "pixels": "observation.image",
 }
 _CAMERAS = "observation.images"
-
-
-# -- Minari -------------------------------------------------------------------------------
-
-
-def save_minari(
-    rollouts: Iterable[Rollout],
-    dataset_id: str,
-    observation_space: Any,
-    action_space: Any,
-    **fields: Any,
-) -> Any:
-    """Save whole episodes of rollouts as a dataset of Minari (``pip install 'minari[hdf5]'``).
-
-    Args:
-        rollouts: successive ones of one `Collector`; of a list, copies (`copy.deepcopy`), because
-            the collector overwrites a rollout in its second call of `collect` after it.
-        dataset_id: such as ``cartpole/random-v0``. The folder is Minari's own
-            (``MINARI_DATASETS_PATH``).
-        observation_space: such as ``group.get_observation_spaces()[0]``.
-        action_space: likewise.
-        fields: further arguments of `minari.create_dataset_from_buffers`, such as ``env``.
-
-    Returns:
-        The dataset.
-
-    Raises:
-        ValueError: the envs have several agents.
-    """
-    buffer_of = import_module("minari.data_collector").EpisodeBuffer
-    buffers = [
-        buffer_of(
-            id=number,
-            observations=episode.observation,
-            actions=episode.action,
-            rewards=episode.reward,
-            terminations=episode.terminated,
-            truncations=episode.truncated,
-        )
-        for number, episode in enumerate(whole_episodes(rollouts))
-    ]
-    return import_module("minari").create_dataset_from_buffers(
-        dataset_id, buffers, observation_space=observation_space, action_space=action_space,
-        **fields,
-    )  # fmt: skip
-
-
-# -- LeRobot ------------------------------------------------------------------------------
 
 
 def save_lerobot(
@@ -89,7 +41,9 @@ def save_lerobot(
     ``observation.images.<camera>``; others are ``observation.<name>``. Floats become float32.
 
     Args:
-        rollouts: as for `save_minari`, with one whole episode at least.
+        rollouts: successive ones of one `Collector`, with one whole episode at least; of a list,
+            copies (`copy.deepcopy`), because the collector overwrites a rollout in its second call
+            of `collect` after it.
         repo_id: name of the dataset.
         root: a folder that doesn't exist yet.
         fps: steps per second.

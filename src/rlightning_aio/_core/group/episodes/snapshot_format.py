@@ -7,6 +7,7 @@ Left out: a signature. A person who can write the file can make a worker execute
 
 from __future__ import annotations
 
+import hashlib
 import re
 from typing import TYPE_CHECKING, Final
 
@@ -15,7 +16,6 @@ import msgspec
 from rlightning_aio.config import makers_of
 from rlightning_aio.errors import SnapshotError
 from rlightning_aio.registry import name_of
-from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 __all__ = ["EnvSnapshot", "check_same", "identity_of", "pack", "unpack"]
 
 _BEGINNING: Final = b"rlightning-aio snapshot 1\n"
+_DIGEST: Final = hashlib.sha256
+_START: Final = len(_BEGINNING) + _DIGEST().digest_size
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 _VERSION: Final = "version of "
 
@@ -84,7 +86,8 @@ def check_same(snapshot: EnvSnapshot, identity: Mapping[str, str], described: st
 
 def pack(snapshots: Sequence[EnvSnapshot]) -> bytes:
     """The bytes that `EnvGroup.snapshot` returns."""
-    return seal(_BEGINNING, msgspec.msgpack.encode(snapshots))
+    content = msgspec.msgpack.encode(snapshots)
+    return b"".join((_BEGINNING, _DIGEST(content).digest(), content))
 
 
 def unpack(data: bytes) -> list[EnvSnapshot]:
@@ -97,10 +100,13 @@ def unpack(data: bytes) -> list[EnvSnapshot]:
         raise SnapshotError(
             f"a snapshot is the bytes that snapshot() returned, not a {type(data).__name__}"
         )
-    try:
-        content = unseal(_BEGINNING, bytes(data))
-    except ValueError as error:
+    data, why = bytes(data), ""
+    if not data.startswith(_BEGINNING):
+        why = "doesn't start like one of this version of rlightning_aio"
+    elif _DIGEST(data[_START:]).digest() != data[len(_BEGINNING) : _START]:
+        why = "was changed or truncated since it was made: its checksum doesn't match"
+    if why:
         raise SnapshotError(
-            f"the snapshot {error}; read the file again, in binary; nothing was changed"
-        ) from None
-    return msgspec.msgpack.decode(content, type=list[EnvSnapshot])
+            f"the snapshot {why}; read the file again, in binary; nothing was changed"
+        )
+    return msgspec.msgpack.decode(data[_START:], type=list[EnvSnapshot])
