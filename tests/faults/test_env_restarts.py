@@ -330,7 +330,7 @@ def test_a_robot_is_never_moved_by_an_exception(build: Start) -> None:
 
 @on_one_driver
 def test_the_log_has_the_traceback(start: Start, caplog: pytest.LogCaptureFixture) -> None:
-    """The first three in five minutes."""
+    """Of the first three."""
     group, tokens = start(entry(2, on_env_error="restart")), Tokens()
     for _ in range(5):
         group.step(tokens.steps(group.group.env_ids, {"faulty-1": "raise"}))
@@ -341,4 +341,4 @@ def test_the_log_has_the_traceback(start: Start, caplog: pytest.LogCaptureFixtur
         assert "env 'faulty-1' (entry 'faulty'" in text
         assert "raised in step: ValueError: as asked for; restart 1 of 3 in a row" in text
         assert "faulty.py" in text
-    assert "further restarts in entry 'faulty' are counted, in one line a minute\n" in texts[-1]
+    assert "restart 3 of entry 'faulty', of which every 100th is logged\n" in texts[-1]

@@ -726,26 +726,3 @@ def test_closing_does_not_wait_for_a_restart(fleet: Callable[..., Fleet]) -> Non
     with pytest.raises(GroupClosed):
         ours.check()
     assert "start 0" not in ours.log
-
-
-def test_a_worker_that_crashes_again_and_again_does_not_fill_the_log(
-    fleet: Callable[..., Fleet], caplog: pytest.LogCaptureFixture
-) -> None:
-    """Thirty deaths in five minutes: three lines, then one a minute, whose counts add up."""
-    ours = fleet((1,), max_restarts=99)
-    for _ in range(30):
-        (entry,) = ours.ask(0)
-        assert is_replaced(ours.die(0, entry))
-        while ours.supervisor.next_check() is not None:
-            ours.wait()
-        ours.reply(0)
-        ours.now += 10 - ours.now % 10
-        ours.check()
-    lines = [record.getMessage() for record in caplog.records]
-    assert [" in a row" in line for line in lines] == [True] * 3 + [False] * (len(lines) - 3)
-    counted = [int(line.split()[2]) for line in lines[3:]]
-    assert 4 <= len(counted) <= 5
-    ours.supervisor.crash_log.flush(ours.now, everything=True)
-    counted += [int(record.getMessage().split()[2]) for record in caplog.records[len(lines) :]]
-    assert sum(counted) == 27
-    assert all("while executing fake-0" in line for line in lines[3:])

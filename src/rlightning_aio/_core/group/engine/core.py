@@ -96,7 +96,6 @@ class Core:
 
     def close(self, now: float) -> Procedure[None]:
         """Close the hosts."""
-        self.supervisor.crash_log.flush(now, everything=True)
         return self.supervisor.shutdown.close(now)
 
     def describe_workers(self, now_ns: int) -> list[dict[str, Any]]:

@@ -23,7 +23,6 @@ from rlightning_aio._core.group.engine.actions import (
     write_column,
 )
 from rlightning_aio._core.group.engine.newest import Newest
-from rlightning_aio._core.group.engine.results import FirstObservations
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
@@ -109,7 +108,6 @@ class Steps:
         self._waiting = waiting
         self._intake = waiting.intake
         self._stats = tables.stats
-        self._first_observations = FirstObservations(tables.envs)
         self.newest = Newest(tables, supervisor.members)
         self.collecting = False
         # The host of the only env, which steps in the calls of a synchronous group.
@@ -419,8 +417,6 @@ class Steps:
             batch = batch_of_results(
                 parts, self._tables, slots, self._envs.names, results.sources(slots)
             )
-            if self._first_observations.left:
-                self._first_observations.check(parts)
             self._driver.check_interrupt()
             self._stats.account(parts, synchronous=synchronous, since=since, needed=needed)
             continuity.returned(slots, flagged, judged)

@@ -52,15 +52,13 @@ class EnvErrors:
         policy, name = record.error_policy, record.config.name
         count = record.deaths[slot] = record.deaths.get(slot, 0) + 1
         self._on_count()
-        now = tables.clock()
-        is_borne, then = policy.count(count, now, pauses=False)
+        is_borne, then = policy.count(count, tables.clock(), pauses=False)
         if not is_borne:
             fault.add_note(then)
             return False
         record.restarts += 1
         doing = Operation(tables.requests.numbering.op(slot)).name.lower()
         message = f"{tables.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
-        cause = f"raised {error.type_name}"
-        self._crash_log.note(name, message, cause, fault.env_id, now, error.traceback)
+        self._crash_log.note(name, message, error.traceback)
         tables.observed.note_fate("raised", record.host.host_id, slot, error.summary)
         return True

@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections import Counter, deque
-from dataclasses import dataclass, field
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
@@ -40,11 +38,7 @@ __all__ = [
 ]
 
 _LINES: Final = 3
-_QUIET_SECONDS: Final = 300.0
-"""Time without so many restarts, after which each has a line of its own again."""
-_SECONDS: Final = 60.0
-"""Between lines about restarts that are counted."""
-_MOST_NAMED: Final = 3
+_EVERY: Final = 100
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -222,100 +216,22 @@ def _why(envs: EnvTable, requests: Requests, record: HostRecord, cause: str) -> 
     return Loss(cause, kind, "env", at_fault, suspects)
 
 
-@dataclass
-class _Deaths:
-    """The restarts of one entry.
-
-    Attributes:
-        recent: times of the last three.
-        causes, at_fault: those that were counted since the time `since`, by cause and env.
-    """
-
-    recent: deque[float] = field(default_factory=lambda: deque[float](maxlen=_LINES))
-    since: float = math.inf
-    causes: Counter[str] = field(default_factory=Counter[str])
-    at_fault: Counter[str] = field(default_factory=Counter[str])
-
-
 class CrashLog:
-    """Restarts in the log, each in a line of its own at first, then counted.
+    """Restarts in the log: of each entry the first three, then every hundredth.
 
-    Of each entry, the first three restarts within five minutes have a line each, and further ones
-    one line a minute together. Callers pass the time in (monotonic seconds). A death or exception
-    that is not followed by one is no part of it, as it is raised.
-
-    Attributes:
-        due: when `flush` has something to log.
+    A death or exception that no restart follows is left out, because it is raised.
     """
 
     def __init__(self) -> None:
-        self.due = math.inf
-        self._entries: dict[str, _Deaths] = {}
+        self._counts = Counter[str]()
 
-    def note(
-        self,
-        entry: str,
-        message: str,
-        cause: str,
-        at_fault: str | None,
-        now: float,
-        traceback: str = "",
-    ) -> None:
-        """Log a restart, or count it.
-
-        Args:
-            entry: of the worker or env.
-            message: all about the cause, for a line of its own.
-            cause: in a clause, for a count.
-            at_fault: the id of the env that was being executed, if it is known.
-            now: the time.
-            traceback: follows the message.
-        """
-        deaths = self._entries.setdefault(entry, _Deaths())
-        recent = deaths.recent
-        if len(recent) < _LINES or now - recent[0] >= _QUIET_SECONDS:
-            recent.append(now)
-            then = ""
-            if len(recent) == _LINES and now - recent[0] < _QUIET_SECONDS:
-                then = f"; further restarts in entry {entry!r} are counted, in one line a minute"
-            _log.warning("%s%s%s", message, then, f"\n{traceback.rstrip()}" if traceback else "")
+    def note(self, entry: str, message: str, traceback: str = "") -> None:
+        """Log a restart of an env or worker of `entry`, or only count it."""
+        self._counts[entry] += 1
+        count = self._counts[entry]
+        if count > _LINES and count % _EVERY:
             return
-        recent.append(now)
-        if not deaths.causes:
-            deaths.since = now
-            self.due = min(self.due, now + _SECONDS)
-        deaths.causes[cause.partition(" (")[0]] += 1
-        if at_fault is not None:
-            deaths.at_fault[at_fault] += 1
-        if now >= self.due:
-            self.flush(now)
-
-    def flush(self, now: float, *, everything: bool = False) -> None:
-        """Log counts that are a minute old, or `everything`, as the group is about to close."""
-        self.due = math.inf
-        for entry, deaths in self._entries.items():
-            if not deaths.causes:
-                continue
-            if not everything and now < deaths.since + _SECONDS:
-                self.due = min(self.due, deaths.since + _SECONDS)
-                continue
-            count = deaths.causes.total()
-            whose = f"; while executing {_counted(deaths.at_fault)}" if deaths.at_fault else ""
-            _log.warning(
-                "entry %r: %d further restart%s within %.0f s: %s%s",
-                entry,
-                count,
-                "s" if count > 1 else "",
-                max(now - deaths.since, 1.0),
-                _counted(deaths.causes),
-                whose,
-            )
-            deaths.causes.clear()
-            deaths.at_fault.clear()
-
-
-def _counted(counts: Counter[str]) -> str:
-    most = counts.most_common(_MOST_NAMED)
-    named = ", ".join(f"{what} ({count})" for what, count in most)
-    rest = counts.total() - sum(count for _, count in most)
-    return f"{named}, others ({rest})" if rest else named
+        then = ""
+        if count >= _LINES:
+            then = f"; restart {count} of entry {entry!r}, of which every {_EVERY}th is logged"
+        _log.warning("%s%s%s", message, then, f"\n{traceback.rstrip()}" if traceback else "")

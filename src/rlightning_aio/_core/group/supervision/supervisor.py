@@ -338,8 +338,6 @@ class Supervisor:
             self.detector.check(now)
         if now >= self.overdue.due:
             self.overdue.look(now)
-        if now >= self.crash_log.due:
-            self.crash_log.flush(now)
 
     # -- deaths -------------------------------------------------------------------
 
@@ -447,9 +445,7 @@ class Supervisor:
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:
-            self.crash_log.note(
-                record.config.name, loss.message, death.cause, loss.why.at_fault, self._clock()
-            )
+            self.crash_log.note(record.config.name, loss.message)
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return loss
 
