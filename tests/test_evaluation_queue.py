@@ -5,14 +5,16 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import subprocess
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
+import imageio_ffmpeg
 import numpy as np
 import pytest
-from kit.scripted import DIE, GO, HANG, RAISE, Scripted
+from kit.scripted import DIE, GO, HANG, RAISE, Awaitable, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -398,26 +400,108 @@ def test_a_subject_is_compared_as_it_is_read(tmp_path: Path) -> None:
 # -- films --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("failed_only", [False, True])
-def test_chosen_or_failed_episodes_are_filmed(tmp_path: Path, failed_only: bool) -> None:
-    """Their films are named after them, and nothing else is left."""
-    kind = "failed" if failed_only else True
-    films = {"video": tmp_path, "video_if": lambda spec: spec.task == "2" and kind}
-    assert rows(evaluated(group_of(), **films)) == ROWS
-    seeds = (1, 3) if failed_only else range(4)
+def films(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir())
+
+
+def frames(path: Path) -> list[int]:
+    """Return the brightness of each frame."""
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    form = ("-vf", "scale=1:1:flags=area", "-pix_fmt", "gray", "-f", "rawvideo", "-")
+    done = subprocess.run([program, "-i", str(path), *form], capture_output=True, check=True)
+    return [*done.stdout]
+
+
+class Brighter(Tasks):
+    """Its frames say how many steps were made, in a size that most players don't support."""
+
+    metadata: ClassVar[Any] = {"render_fps": 5}
+
+    def render(self) -> Any:
+        return np.full((15, 17, 3), 20 * self.steps, np.uint8)
+
+
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_the_first_episode_of_each_task_is_filmed(tmp_path: Path, placement: str) -> None:
+    """From its reset to its end, whatever other envs do, in any placement."""
+    queue = [EpisodeSpec(task, seed) for task in ("1", "2") for seed in (2, 3)]
+    found = evaluated(group_of(task=Brighter, placement=placement), queue, video=tmp_path)
+    assert len(found.played) == 4
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == [f"env-2-seed-{seed}.mp4" for seed in seeds]
+    assert names == ["env-1-seed-2.mp4", "env-2-seed-2.mp4"]
+    for name in names:
+        seen = frames(tmp_path / name)
+        assert [round(value / 20) for value in seen] == [0, 1, 2, 3]
+
+
+async def test_films_of_a_number_of_episodes_name_their_env(tmp_path: Path) -> None:
+    """Here with `await`, of awaitable envs."""
+    entry = {"name": "env", "task": lambda: Awaitable(lambda: Tasks(False)), "placement": "loop"}
+    async with rl.build_env_group({**entry, "num_workers": 2}) as group:
+        with group.auto_reset(100):
+            await evaluate(group, nothing, 2, seed=4, video=tmp_path)
+    (path,) = films(tmp_path)
+    assert path.name.endswith("seed-4-env-0-episode-0.mp4")
+    assert len(frames(path)) == 6
+
+
+class Stumbling(Brighter):
+    """Its second step does `fault` if `before` is not there, and makes it."""
+
+    def __init__(self, fault: int, before: Path) -> None:
+        super().__init__()
+        self._fault, self._before = fault, before
+
+    def does(self, action: Any) -> float:
+        if self.steps == 2 and not self._before.exists():
+            self._before.touch()
+            Scripted.does(self, self._fault)
+        return super().does(action)
+
+
+@pytest.mark.parametrize("fault", [RAISE, DIE])
+def test_a_lost_episode_leaves_no_film_and_is_filmed_again(tmp_path: Path, fault: int) -> None:
+    """A film shows one try, from its reset on."""
+    films, make = tmp_path / "films", partial(Stumbling, fault, tmp_path / "before")
+    group = group_of(1, placement="process", task=make)
+    found = evaluated(group, [EpisodeSpec("1", 3)], video=films)
+    assert found.failures.total() == 1
+    (path,) = films.iterdir()
+    assert [round(value / 20) for value in frames(path)] == [0, 1, 2, 3, 4]
+
+
+def test_an_evaluation_that_ends_early_leaves_no_part_of_a_film(tmp_path: Path) -> None:
+    """Here the policy raises."""
+
+    def broken(batch: rl.BatchedData) -> Any:
+        if not batch.is_reset.any():
+            raise ArithmeticError
+        return nothing(batch)
+
+    with pytest.raises(ArithmeticError):
+        evaluated(group_of(), [EpisodeSpec("1", 3)], policy=broken, video=tmp_path)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_envs_that_render_no_frames_are_refused_before_anything_is_played(tmp_path: Path) -> None:
+    """The error names the env and what to do."""
+
+    class Blind(Tasks):
+        render_mode = None
+
+    def played(attempt: Attempt) -> None:
+        raise AssertionError
+
+    with pytest.raises(ValueError, match="env-0 can't be filmed: its render_mode is None; make it"):
+        evaluated(group_of(task=Blind), video=tmp_path, on_episode=played)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: Path) -> None:
-    """Nothing outside is deleted, before the film or after it."""
-    films, outside = tmp_path / "films", tmp_path / "mine-0.partial"
-    outside.mkdir()
-    (outside / "notes").touch()
-    evaluated(group_of(name="../mine"), QUEUE[:1], video=films)
-    assert (outside / "notes").exists()
-    assert [path.suffix for path in films.iterdir()] == [".mp4"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["films", "mine-0.partial"]
+    """Nothing is written outside of it."""
+    evaluated(group_of(name="../mine"), QUEUE[:1], video=tmp_path / "films")
+    assert [path.name for path in tmp_path.iterdir()] == ["films"]
+    assert [path.suffix for path in (tmp_path / "films").iterdir()] == [".mp4"]
 
 
 @pytest.mark.parametrize("limit", [1, 2, 9])
@@ -428,4 +512,4 @@ def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) 
     lengths = sorted(record.length or 0 for record in found.attempts)
     assert lengths == [min(k, limit) for k in (1, 2, 3, 4)]
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == [f"env-1-seed-{seed}.mp4" for seed in range(4)]
+    assert names == ["env-1-seed-0.mp4"]

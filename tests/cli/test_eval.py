@@ -86,7 +86,7 @@ def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
-    """The summary says that it is no fair sample, and the film is marked."""
+    """The summary says that it is no fair sample, and a film of them is there."""
     config = write_config(
         tmp_path, {"name": "slow", "task": "cli.judged_env:wait", "num_workers": 2}
     )
@@ -103,8 +103,9 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     assert document["interrupted"]
     assert [one["env_id"] for one in document["attempts"]] == ["slow-0"]
     assert len(file.read_text().splitlines()) == 2
-    names = {path.name for path in films.iterdir()}
-    assert names == {"slow-0-episode-0.mp4", "slow-0-episode-1.partial.mp4"}
+    assert [path.name for path in films.iterdir()] == [
+        "slow-cli.judged_env_wait-seed-0-slow-0-episode-0.mp4"
+    ]
 
 
 def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:
@@ -147,16 +148,15 @@ def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
 
 def test_eval_draws_films_and_traces(tmp_path: Path) -> None:
     """The timeline has each episode from its reset on."""
-    config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
+    config = write_config(tmp_path, {**JUDGED, "num_workers": 2})
     plot, films, trace = tmp_path / "plot.png", tmp_path / "films", tmp_path / "run.json"
-    filming = ("--video", films, "--video-env", "judged-1", "--video-every", 2)
     drawing = ("--plot", plot, "--trace", trace, "--json")
     # In a process of its own, because matplotlib keeps its fonts open.
-    done = run("eval", config, "--episodes", 3, "--seed", 0, *drawing, *filming)
+    done = run("eval", config, "--episodes", 3, "--seed", 0, *drawing, "--video", films)
     assert done.returncode == 0, done.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
-    names = sorted(path.name for path in films.iterdir())
-    assert names == ["judged-1-episode-0.mp4", "judged-1-episode-2.mp4"]
+    (film,) = films.iterdir()
+    assert film.name.endswith("-seed-0-judged-0-episode-0.mp4")
     seen = Seen(trace)
     played = Counter(one["env_id"] for one in json.loads(done.stdout)["attempts"])
     for env_id, count in played.items():
@@ -180,10 +180,6 @@ def test_wrong_options_are_refused_at_once(tmp_path: Path) -> None:
     config = write_config(tmp_path, POLE)
     assert "there is no such file" in refused(config, "--policy", "absent.zip")
     assert "--algo is for a model" in refused(config, "--algo", "PPO")
-    assert "add --video FOLDER" in refused(config, "--video-every", 2)
-    assert "did you mean 'pole-0'" in refused(
-        config, "--video", tmp_path / "films", "--video-env", "pole_0"
-    )
     assert "can't be written" in refused(config, "--resume", tmp_path / "absent" / "file")
     (tmp_path / "zip.zip").write_text("nothing")
     assert "name it with --algo" in refused(config, "--policy", tmp_path / "zip.zip")
@@ -298,15 +294,14 @@ def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
 
 
 def test_a_queue_is_drawn_and_filmed(tmp_path: Path) -> None:
-    """Of chosen episodes, those that fail."""
+    """The first episode of each task."""
     config = write_config(tmp_path, {**SWITCHING, "num_workers": 2})
     plot, films = tmp_path / "plot.png", tmp_path / "films"
-    chosen = ("--video-episode", "a:1", "--video-episode", "b:2", "--video-failed")
-    asked = ("--tasks", "a,b", "--seeds", "0:4", "--video", films, *chosen, "--plot", plot)
+    asked = ("--tasks", "a,b", "--seeds", "0:4", "--video", films, "--plot", plot)
     # In a process of its own, because matplotlib keeps its fonts open.
     done = run("eval", config, *asked)
     assert done.returncode == 0, done.stderr
-    assert [path.name for path in films.iterdir()] == ["many-a-seed-1.mp4"]
+    assert {path.name for path in films.iterdir()} == {"many-a-seed-0.mp4", "many-b-seed-0.mp4"}
     assert plot.read_bytes().startswith(b"\x89PNG")
 
 
@@ -332,9 +327,6 @@ def test_wrong_options_of_a_queue_are_refused(tmp_path: Path) -> None:
         (("--seeds", "a"), "should look like 0:50 or 1,2,5"),
         (("--seeds", 2**62), "should look like 0:50 or 1,2,5"),
         (("--seeds", "0:2", "--episodes", 3), "--episodes is for a number of episodes"),
-        (("--seeds", "0:2", "--video-failed"), "add --video FOLDER"),
-        (("--video-failed",), "choose episodes of a queue"),
-        (("--seeds", "0:2", "--video", tmp_path, "--video-episode", "x:1"), "not in the queue"),
         (("--seeds", "0:2", "--episodes-file", config), "leave --tasks and --seeds out"),
         (("--seeds", "1,1"), "the queue has"),
     ):

@@ -7,15 +7,15 @@ import resource
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from cli.command import CARTPOLE, invoke, run, write_config
+from cli.command import invoke, run, write_config
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 STUB = {"name": "stub", "backend": "stub", "task": "-", "placement": "inline"}
 OPTIONS = [
-    *(("rollout", "--trace"), ("rollout", "--plot"), ("rollout", "--video")),
-    *(("eval", "--trace"), ("eval", "--plot"), ("eval", "--resume"), ("eval", "--video")),
+    *(("rollout", "--trace"), ("rollout", "--plot")),
+    *(("eval", "--trace"), ("eval", "--plot"), ("eval", "--resume")),
     *(("bench", "--trace"), ("bench", "--plot"), ("bench", "--best")),
 ]
 
@@ -30,8 +30,8 @@ def refused(*words: Any) -> str:
 
 
 def asked(command: str, option: str, folder: Path) -> tuple[Any, Path]:
-    """The command's words, and the file that it would write; of --video the folder."""
-    config = write_config(folder, STUB if option != "--video" else {**CARTPOLE})
+    """The command's words, and the file that it would write."""
+    config = write_config(folder, STUB)
     path = folder / "file.png"
     return (command, config, option, path), path
 
@@ -45,7 +45,7 @@ def test_a_fifo_is_refused_and_left_alone(
     os.mkfifo(path)
     line = refused(*words)
     assert path.name in line
-    assert ("File exists" if option == "--video" else "it is no regular file") in line
+    assert "it is no regular file" in line
     assert path.is_fifo()
 
 

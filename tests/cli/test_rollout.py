@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
-import tomllib
 from typing import TYPE_CHECKING
 
 import pytest
 from cli import stub_policies
-from cli.command import CARTPOLE, TESTS, invoke, invoke_json, run, write_config
+from cli.command import CARTPOLE, invoke, invoke_json, run, write_config
 from cli.stub_envs import Stub
-from timelines import Seen
-
-from rlightning_aio import load_config
-from rlightning_aio._core.group.setup.start_orders import start_orders
-from rlightning_aio.cli.playing.films import films_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -190,73 +183,3 @@ def test_random_actions_fit_entries_with_different_spaces(tmp_path: Path) -> Non
     )
     document = invoke_json("rollout", config, "--steps", 300)
     assert all(entry["steps"] > 50 for entry in document["entries"])
-
-
-def test_rollout_films_the_first_env_of_each_entry(tmp_path: Path) -> None:
-    """Films of unfinished episodes are marked."""
-    judged = {"name": "judged", "task": "cli.judged_env:make", "num_workers": 2}
-    films = tmp_path / "films"
-    config = write_config(tmp_path, judged)
-    both = ("--min-results", 2)  # Otherwise the other env might take all the steps.
-    done = run("rollout", config, "--steps", 40, *both, "--video", films, "--video-every", 2)
-    assert done.returncode == 0, done.stderr
-    assert {path.name.partition("-episode-")[0] for path in films.iterdir()} == {"judged-0"}
-    assert (films / "judged-0-episode-2.mp4").exists()
-
-
-def test_a_filmed_env_has_its_own_worker(tmp_path: Path) -> None:
-    """So no other env waits for its frames, unless the entry says how many share one."""
-    config = load_config(write_config(tmp_path, {**CARTPOLE, "num_workers": 6}))
-    ready, films = films_of(config, tmp_path, ["pole-2"], None)
-    plan = films.plan(ready)
-    envs_of = [order.worker_indices for order in start_orders(plan, 2)]
-    assert envs_of == [(0, 1), (2,), (3, 4, 5)]
-    (three,) = [c.model_copy(update={"envs_per_process": 3}) for c in ready]
-    envs_of = [order.worker_indices for order in start_orders(films.plan([three]), 2)]
-    assert envs_of == [(0, 1, 2), (3, 4, 5)]
-
-
-def test_the_console_script_runs_cli_main() -> None:
-    """Its name is rlightning-aio."""
-    project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"rlightning-aio": "rlightning_aio.cli:main"}
-
-
-def test_python_m_runs_the_same_command() -> None:
-    """For example where the scripts of an environment are not on the path."""
-    done = run("--version", program=[sys.executable, "-m", "rlightning_aio"])
-    assert (done.returncode, done.stdout) == (0, invoke("--version").stdout)
-
-
-@pytest.mark.parametrize(
-    "command",
-    [[], *([name] for name in ("rollout", "bench", "check", "backends"))],
-)
-def test_help_has_examples(command: list[str]) -> None:
-    """Each help text has command lines."""
-    done = invoke(*command, "--help")
-    assert done.exit_code == 0
-    assert invoke(*command, "-h").stdout == done.stdout
-    assert f"rlightning-aio {' '.join(command)}".strip() in done.stdout
-
-
-def test_version_is_printed() -> None:
-    """--version prints it, and which implementation of the hot path is active."""
-    import rlightning_aio
-    from rlightning_aio.protocol import kernel
-
-    expected = f"{rlightning_aio.__version__} (hot path: {kernel.selected})\n"
-    assert invoke("--version").stdout == expected
-
-
-def test_trace_writes_a_timeline(tmp_path: Path) -> None:
-    """It includes the policy; an invalid path is refused before any env starts."""
-    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "placement": "inline"})
-    trace = tmp_path / "run.json"
-    document = invoke_json("rollout", config, "--steps", 50, "--trace", trace)
-    seen = Seen(trace)
-    assert len(seen.called("policy")) == len(seen.called("collect_async")) + 1
-    assert len(seen.called("step")) >= document["steps"]
-    done = invoke("rollout", config, "--trace", tmp_path / "missing" / "run.json")
-    assert done.exit_code == 2
-    assert "there is no folder" in done.stderr

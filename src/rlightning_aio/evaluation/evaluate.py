@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from operator import index
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, overload
 
@@ -11,8 +12,8 @@ from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation.episode_video import EpisodeVideo, Wanted
 from rlightning_aio.evaluation.evaluation import Evaluation
+from rlightning_aio.evaluation.films import Films
 from rlightning_aio.evaluation.playing import Options, PolicyPlay
 from rlightning_aio.policies.predicting import Model, PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
@@ -44,7 +45,6 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Evaluation: ...
 
@@ -60,7 +60,6 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Coroutine[Any, Any, Evaluation]: ...
 
@@ -75,7 +74,6 @@ def evaluate(
     retries: int = 2,
     results: ResultsFile | None = None,
     video: str | os.PathLike[str] | None = None,
-    video_if: Callable[[EpisodeSpec], Wanted] | None = None,
     on_episode: Callable[[Attempt], None] | None = None,
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
@@ -99,26 +97,28 @@ def evaluate(
             it has failed, and the others are played.
         results: the file to save episodes in; those that it has are not played again. One file for
             each `seed`, since episodes without a seed are only known by their number.
-        video: folder for films, ``<entry>-<task>-seed-<seed>.mp4``, created if missing; options of
-            an episode add a number to the name, an episode for one env its env and number.
-        video_if: returns True for an episode to film, or ``"failed"`` to keep its film only if its
-            success is False; None films all.
+        video: folder for films of the first episode of each task, which is asked for a frame by
+            `render` after each step: ``<entry>-<task>-seed-<seed>.mp4``. The folder is created if
+            missing; options of an episode add a number to the name, an episode for one env its env
+            and number.
         on_episode: called with each episode: first with those in the file, then as others end.
 
     Raises:
         EnvBusy: an env has a request in flight, or a result that was not collected.
         ValueError: a number is out of its range, the group has an env_server, an episode is in the
             queue twice, no entry of the group or more than one can play it, a queue has a `seed`,
-            or a queue or `video` is given for an env with sub-environments.
+            a queue or `video` is given for an env with sub-environments, or an env to be filmed
+            was not made with the ``render_mode`` ``rgb_array``.
         BadAction: the policy's actions don't fit; nothing was sent.
         WorkerDied, EnvHung: no env is left that could play an episode.
         ConfigError: `results` can't be written.
         OSError: nothing can be written into the folder `video`.
+        ImportError: `video` is given, and imageio-ffmpeg isn't installed.
     """
     is_number = isinstance(episodes, SupportsIndex)
     _check_numbers({"min_results": min_results, "episodes": episodes if is_number else None})
     _check(group, one_each=video is not None or not is_number)
-    films = None if video is None else EpisodeVideo(video, video_if)
+    films = None if video is None else Films(group, video)
     queue = AttemptQueue(group, Rules(retries=retries), results)
     options = Options(min_results or default_min_results(group), films, on_episode)
     play = PolicyPlay(group, _called(policy, group, seed), queue, Evaluation(), options)
@@ -156,7 +156,7 @@ def _each(group: Any, queue: AttemptQueue, episodes: int, seed: int | None) -> l
 
 
 def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
-    with ensure_auto_reset(group):
+    with ensure_auto_reset(group), closing(play):
         return (yield from play.to_the_end())
 
 

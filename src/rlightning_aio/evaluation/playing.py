@@ -19,7 +19,6 @@ from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.endless import EndlessEpisodes
-from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.outcomes import Outcome, own_end
 from rlightning_aio.policies.answers import answers_of
 
@@ -32,6 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting.procedure import Procedure
     from rlightning_aio.evaluation.evaluation import Evaluation
+    from rlightning_aio.evaluation.films import Films
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Options", "PolicyPlay"]
@@ -44,7 +44,7 @@ class Options:
     """The options of an evaluation; see `evaluate`."""
 
     min_results: int | None
-    video: EpisodeVideo | None
+    films: Films | None
     on_episode: Callable[[Attempt], None] | None
 
 
@@ -91,14 +91,16 @@ class PolicyPlay:
         """Episodes that the last results ended, to be noted."""
         self._endless = EndlessEpisodes()
         self._has_warned = False
-        self._filming = None if options.video is None else Filming(group, options.video)
+        self._films = options.films
 
     # -- the loop ---------------------------------------------------------------------
 
     def to_the_end(self) -> Procedure[Evaluation]:
         """Play all episodes."""
+        if self._films is not None:
+            yield from self._films.check()
         while True:
-            yield from self._begin_episodes()
+            self._begin_episodes()
             self._queue.check_players()
             if not self._pending:
                 return self._found
@@ -112,11 +114,16 @@ class PolicyPlay:
             else:
                 yield from self._continue(batch)
 
-    def _begin_episodes(self) -> Procedure[None]:
+    def close(self) -> None:
+        """Delete the films of episodes that have no end."""
+        if self._films is not None:
+            self._films.close()
+
+    def _begin_episodes(self) -> None:
         """Note ended episodes, and begin others in idle envs."""
         while True:
             while self._ended:
-                yield from self._keep(*self._ended.popleft())
+                self._keep(*self._ended.popleft())
             env_id = self._queue.next_env()
             if env_id is None:
                 return
@@ -124,29 +131,23 @@ class PolicyPlay:
             first = self._places[env_id].start
             self._jobs.update((first + job.sub_env, job) for job in jobs)
             try:
-                yield from self._begin(env_id, jobs[0])
+                self._begin(env_id, jobs[0])
             except WorkerDied as fault:
                 self._note_fault(fault)
 
-    def _begin(self, env_id: str, job: Job) -> Procedure[None]:
-        if self._filming is not None:
-            yield from self._filming.begin(env_id, job.spec)
+    def _begin(self, env_id: str, job: Job) -> None:
         seed, options = self._queue.begin(env_id, job)
         seeds = None if seed is None else {env_id: seed - job.sub_env}
         self._group.reset_async(seed=seeds, options=options, env_ids=[env_id])
         self._pending.add(env_id)
         self._begun.add(env_id)
+        if self._films is not None:
+            self._films.begin(env_id, job)
 
-    def _keep(self, job: Job, attempt: Attempt) -> Procedure[None]:
+    def _keep(self, job: Job, attempt: Attempt) -> None:
         """Note what came of an episode."""
-        if self._filming is not None and attempt.outcome.is_failure:
-            self._filming.drop(attempt.env_id)
-        elif self._filming is not None:
-            try:
-                yield from self._filming.end(attempt.env_id, attempt)
-            except WorkerDied as fault:
-                self._filming.drop(attempt.env_id)
-                self._note_fault(fault)
+        if self._films is not None and not attempt.outcome.is_failure:
+            self._films.keep(attempt)
         if not self._queue.end(job, attempt):
             return
         if attempt.outcome.is_failure and not self._has_warned:
@@ -174,10 +175,12 @@ class PolicyPlay:
         """Add results to their episodes, and begin others or step their envs."""
         env_ids = batch.env_ids()
         self._pending.difference_update(env_ids)
+        if self._films is not None:
+            yield from self._film(self._films, env_ids)
         for part in batch.by_entry().values() if self._separate else (batch,):
             self._record(part)
         self._begun.difference_update(env_ids)
-        yield from self._begin_episodes()
+        self._begin_episodes()
         rows = [
             row
             for row, env_id in enumerate(env_ids)
@@ -189,6 +192,13 @@ class PolicyPlay:
             space = self._metas[env_ids[rows[0]]].action_space
             for part in answers_of(stepped, answer, lambda: space):
                 self._step(part)
+
+    def _film(self, films: Films, env_ids: list[str]) -> Procedure[None]:
+        for env_id in env_ids:
+            try:
+                yield from films.see(env_id)
+            except EnvFault as fault:
+                self._note_fault(fault)
 
     def _plays(self, env_id: str) -> bool:
         return any(place in self._jobs for place in self._places[env_id])
@@ -248,7 +258,7 @@ class PolicyPlay:
 
     def _take_next(self, env_id: str, sub_env: int) -> None:
         """Give a sub-environment that resets itself its next episode."""
-        if self._filming is None and self._metas[env_id].autoreset != "disabled":
+        if self._films is None and self._metas[env_id].autoreset != "disabled":
             job = self._queue.take_next(env_id, sub_env)
             if job is not None:
                 self._jobs[self._places[env_id][sub_env]] = job
@@ -296,8 +306,8 @@ class PolicyPlay:
 
     def _lose(self, env_id: str, outcome: Outcome) -> None:
         """Note that an env has lost its episodes."""
-        if self._filming is not None:
-            self._filming.drop(env_id)
+        if self._films is not None:
+            self._films.drop(env_id)
         for sub_env in range(len(self._places[env_id])):
             self._end(env_id, sub_env, outcome)
         self._release(env_id)

@@ -12,30 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeAlia
 
 import typer
 
-from rlightning_aio._core.group.api.aio import EnvGroup
+import rlightning_aio
 from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.bench.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.live_line import LiveLine, time_left
-from rlightning_aio.cli.option_files import check_option_file, naming_option
+from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
-from rlightning_aio.cli.playing.films import (
-    Films,
-    Video,
-    VideoEnvs,
-    VideoEvery,
-    check_films,
-    films_of,
-    rendering,
-)
 from rlightning_aio.cli.playing.queue_options import (
     EpisodesFile,
     QueueOptions,
     Retries,
     Seeds,
     Tasks,
-    VideoEpisodes,
-    VideoFailed,
 )
 from rlightning_aio.cli.policies.collecting import playing
 from rlightning_aio.cli.policies.policies import load_policy, served_policy
@@ -51,8 +40,8 @@ from rlightning_aio.cli.terminal import (
     print_table,
     run_interruptible,
 )
-from rlightning_aio.config import load_config
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.config import MADE_BY_GYMNASIUM, load_config
+from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.evaluation import Evaluation, evaluate
 from rlightning_aio.evaluation.evaluation import parts_of
 from rlightning_aio.json_text import finite
@@ -63,6 +52,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
+    from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.attempts import Attempt
     from rlightning_aio.cli.policies.policies import Policy
     from rlightning_aio.config import EnvConfig
@@ -108,6 +98,14 @@ _Episodes: TypeAlias = Annotated[
 _Seed: TypeAlias = Annotated[
     int | None, typer.Option(min=0, help="Base seed; each episode has its own seed.")
 ]
+_Video: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--video",
+        metavar="FOLDER",
+        help="Film the first episode of each task to this folder (MP4; needs imageio-ffmpeg).",
+    ),
+]
 _Resume: TypeAlias = Annotated[
     Path | None,
     typer.Option(help="Save finished episodes to this file, and skip those already in it."),
@@ -135,14 +133,13 @@ class _Order:
 
     Attributes:
         episodes: a number for each env, or a queue.
-        films: of envs; queue_films: of episodes of the queue, as `evaluate` takes them.
+        video: the folder for films.
         by: what the table has a line for; title: of the table.
     """
 
     configs: Sequence[EnvConfig]
     episodes: int | Sequence[EpisodeSpec]
-    films: Films
-    queue_films: dict[str, Any]
+    video: Path | None
     whose: _Whose
     by: _By
     title: str
@@ -176,11 +173,7 @@ def evaluation(
     retries: Retries = 2,
     resume: _Resume = None,
     plot: PlotFile = None,
-    video: Video = None,
-    video_env: VideoEnvs = None,
-    video_every: VideoEvery = None,
-    video_failed: VideoFailed = False,
-    video_episode: VideoEpisodes = None,
+    video: _Video = None,
     trace: TraceFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -206,36 +199,42 @@ def evaluation(
     configs = load_config(config, overrides or ())
     _check_envs(config, configs)
     files = _Files(resume, plot, trace, as_json)
-    filming = (video, video_every, video_failed, video_episode)
-    queue = QueueOptions(episodes_file, tasks, seeds, *filming)
+    queue = QueueOptions(episodes_file, tasks, seeds)
     if queue.wanted:
-        _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
+        _refuse({"--episodes": episodes, "--seed": seed})
     facts = {"config": str(config), "policy": policy, "seed": seed}
     with contextlib.ExitStack() as stack:
         chosen, named = _policy(policy, algo, action_steps, stack)
         whose = _Whose(retries, chosen, named, facts)
         if queue.wanted:
-            order = _in_queue(configs, queue, whose)
+            order = _in_queue(configs, queue, video, whose)
         else:
-            configs, films = films_of(configs, video, video_env, video_every)
-            order = _of_each(configs, episodes or 10, films, whose)
+            order = _of_each(configs, episodes or 10, video, whose)
         _play(order, files, _resumed(order, resume, stack))
 
 
-def _in_queue(configs: Sequence[EnvConfig], queue: QueueOptions, whose: _Whose) -> _Order:
+def _in_queue(
+    configs: Sequence[EnvConfig], queue: QueueOptions, video: Path | None, whose: _Whose
+) -> _Order:
     specs = queue.specs(configs)
-    films = queue.films(specs)
-    if films:
-        check_films(configs, films["video"])
-        configs = [rendering(config) for config in configs]
     title = f"{whose.facts['policy']}: {counted(len(specs), 'episode')}"
-    return _Order(configs, specs, Films(), films, whose, "task", title)
+    return _Order(configs, specs, video, whose, "task", title)
 
 
-def _of_each(configs: Sequence[EnvConfig], episodes: int, films: Films, whose: _Whose) -> _Order:
+def _of_each(
+    configs: Sequence[EnvConfig], episodes: int, video: Path | None, whose: _Whose
+) -> _Order:
     whose.facts["episodes_each"] = episodes
     title = f"{whose.facts['policy']}: {counted(episodes, 'episode')} of each env"
-    return _Order(configs, episodes, films, {}, whose, "entry", title)
+    return _Order(configs, episodes, video, whose, "entry", title)
+
+
+def _rendering(config: EnvConfig) -> EnvConfig:
+    """Return `config` with simulators that can render frames."""
+    if config.backend not in MADE_BY_GYMNASIUM:
+        return config
+    kwargs = {"render_mode": "rgb_array", **config.env_kwargs}
+    return config.model_copy(update={"env_kwargs": kwargs})
 
 
 def _refuse(given: dict[str, Any]) -> None:
@@ -269,7 +268,8 @@ def _subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:
 
 def _play(order: _Order, files: _Files, results: ResultsFile | None) -> None:
     """Play the episodes, and report them."""
-    group = EnvGroup(order.films.plan(order.configs))
+    configs = order.configs if order.video is None else [*map(_rendering, order.configs)]
+    group = rlightning_aio.build_env_group(list(configs), mixed_actions=True)
     interrupted, stopped = True, False
     with _Watch(group, order) as watch:
         try:
@@ -299,7 +299,6 @@ async def _evaluate(
     base: int | None = order.whose.facts["seed"]
     seed = None if base is None else base + before
     async with playing(group, order.whose.policy, seed, trace, watch.line.show) as policy:
-        await order.films.begin(group)
         try:
             evaluated = evaluate(
                 group,
@@ -309,14 +308,18 @@ async def _evaluate(
                 retries=order.whose.retries,
                 results=results,
                 on_episode=watch.note,
-                **order.queue_films,
+                video=order.video,
             )
-        except ValueError as error:
-            raise ConfigError(str(error)) from None
-        watch.ready(group)
-        folder = order.queue_films.get("video")
-        with naming_option("--video", folder) if folder else contextlib.nullcontext():
+            watch.ready(group)
             await evaluated
+        except (ValueError, ImportError) as error:
+            raise ConfigError(str(error)) from None
+        except RLightningError:
+            raise  # Some are an `OSError`, too.
+        except OSError as error:
+            raise ConfigError(
+                f"--video {order.video}: can't be written: {error.strerror}"
+            ) from None
 
 
 def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:

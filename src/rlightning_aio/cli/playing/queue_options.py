@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.evaluation.episode_video import Wanted
 
 __all__ = [
     "EpisodesFile",
@@ -25,8 +24,6 @@ __all__ = [
     "Retries",
     "Seeds",
     "Tasks",
-    "VideoEpisodes",
-    "VideoFailed",
 ]
 
 EpisodesFile: TypeAlias = Annotated[
@@ -55,19 +52,6 @@ Retries: TypeAlias = Annotated[
         min=0, help="How often an episode is played again that was lost, before it has failed."
     ),
 ]
-VideoFailed: TypeAlias = Annotated[
-    bool,
-    typer.Option("--video-failed", help="Of a queue, keep only films of episodes without success."),
-]
-VideoEpisodes: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--video-episode",
-        metavar="TASK:SEED",
-        help="Of a queue, film this episode; may be repeated.",
-        show_default="all",
-    ),
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +61,6 @@ class QueueOptions:
     episodes_file: Path | None
     tasks: Sequence[str] | None
     seeds: str | None
-    video: Path | None
-    video_every: int | None
-    video_failed: bool
-    video_episodes: Sequence[str] | None
 
     @property
     def wanted(self) -> bool:
@@ -93,11 +73,6 @@ class QueueOptions:
             return True
         if self.tasks:
             raise ConfigError("--tasks needs the seeds of their episodes: add --seeds 0:50")
-        if self.video_failed or self.video_episodes:
-            raise ConfigError(
-                "--video-failed and --video-episode choose episodes of a queue; add --seeds or "
-                "--episodes-file"
-            )
         return False
 
     def specs(self, configs: Sequence[EnvConfig]) -> list[EpisodeSpec]:
@@ -119,39 +94,6 @@ class QueueOptions:
         if self.tasks or self.seeds is not None:
             raise ConfigError("--episodes-file names the episodes; leave --tasks and --seeds out")
         return _with_tasks(_in_file(self.episodes_file), configs)
-
-    def films(self, specs: Sequence[EpisodeSpec]) -> dict[str, Any]:
-        """Return what `evaluate` is to know of films.
-
-        Raises:
-            ConfigError: an option lacks --video, or names no episode.
-        """
-        chosen = set(self.video_episodes or ())
-        if self.video is None:
-            if chosen or self.video_failed or self.video_every:
-                raise ConfigError(
-                    "--video-episode, --video-failed and --video-every choose what to film; add "
-                    "--video FOLDER for the files"
-                )
-            return {}
-        for name in chosen - {_name(spec) for spec in specs}:
-            raise ConfigError(f"--video-episode {name}: is not in the queue; give TASK:SEED")
-        every = {_place(spec) for spec in specs[:: self.video_every or 1]}
-
-        def wanted(spec: EpisodeSpec) -> Wanted:
-            is_chosen = _place(spec) in every and (not chosen or _name(spec) in chosen)
-            return "failed" if is_chosen and self.video_failed else is_chosen
-
-        return {"video": self.video, "video_if": wanted}
-
-
-def _name(spec: EpisodeSpec) -> str:
-    return f"{spec.task}:{spec.seed}"
-
-
-def _place(spec: EpisodeSpec) -> Any:
-    """Return what identifies an episode before its entry is known."""
-    return spec.key[1:]
 
 
 def _seeds(text: str) -> list[int]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
-from rlightning_aio._core.group.api.aio import EnvGroup
+import rlightning_aio
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.cli.bench.plots import check_plot, draw_rollout
 from rlightning_aio.cli.option_files import check_option_file
@@ -25,7 +25,6 @@ from rlightning_aio.cli.options import (
     TraceFile,
     check_seed,
 )
-from rlightning_aio.cli.playing.films import Films, Video, VideoEnvs, VideoEvery, films_of
 from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.cli.policies.collecting import (
     Roster,
@@ -53,6 +52,8 @@ from rlightning_aio.errors import EnvFault, RLightningError
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
+    from rlightning_aio._core.group.api.aio import EnvGroup
+
 
 __all__ = ["rollout"]
 
@@ -71,7 +72,6 @@ class _Order:
     seed: int | None
     policy: Policy | None
     trace: Path | None
-    films: Films
 
     def left(self, statistics: RolloutStatistics) -> tuple[int, float | None] | None:
         """Return the steps and seconds that are left, or None at the end."""
@@ -112,9 +112,6 @@ def rollout(
     seed: _Seed = None,
     min_results: _MinResults = None,
     plot: PlotFile = None,
-    video: Video = None,
-    video_env: VideoEnvs = None,
-    video_every: VideoEvery = None,
     trace: TraceFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -133,17 +130,16 @@ def rollout(
         rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
-        rlightning-aio rollout configs/cartpole.yaml --video films --video-every 10
     """
     check_seed(seed)
-    configs, films = films_of(load_config(config, overrides or ()), video, video_env, video_every)
+    configs = load_config(config, overrides or ())
     check_plot(plot)
     limit = _STEPS if steps is None and seconds is None else steps
     chosen = load_policy(policy) if policy else None
-    order = _Order(limit, seconds, min_results, seed, chosen, trace, films)
+    order = _Order(limit, seconds, min_results, seed, chosen, trace)
     check_option_file("--trace", trace)
     statistics = RolloutStatistics(configs, keep_course=plot is not None)
-    group = EnvGroup(films.plan(configs))
+    group = rlightning_aio.build_env_group(list(configs), mixed_actions=True)
     interrupted = completed = False
     try:
         with Display(group, statistics, order.steps, seconds) as display:
@@ -176,7 +172,6 @@ async def _collect(
         roster = Roster(group)
         for server in roster.servers:
             display.line.say(f"{server.env_id} listens at {server.address}")
-        await order.films.begin(group)
         display.resetting()
         batch, _ = await group.reset(seed=order.seed)
         respond = responder(group, roster, order.policy, order.seed)
