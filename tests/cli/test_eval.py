@@ -103,9 +103,8 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     assert document["interrupted"]
     assert [one["env_id"] for one in document["attempts"]] == ["slow-0"]
     assert len(file.read_text().splitlines()) == 2
-    assert [path.name for path in films.iterdir()] == [
-        "slow-cli.judged_env_wait-seed-0-slow-0-episode-0.mp4"
-    ]
+    (film,) = films.iterdir()
+    assert film.name.endswith("-seed-0-slow-0-episode-0.mp4")
 
 
 def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:

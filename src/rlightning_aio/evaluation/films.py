@@ -100,7 +100,7 @@ class Films:
             )
         film = self._filmed[env_id]
         if film is None:
-            metadata = (yield from self._attribute(env_id, "metadata")) or {}
+            metadata: dict[str, Any] = (yield from self._attribute(env_id, "metadata")) or {}
             film = self._filmed[env_id] = self._encoder.write_frames(
                 str(self._partial(env_id)),
                 (frame.shape[1], frame.shape[0]),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -28,18 +28,12 @@ PreprocessFn = Callable[[PolicyResponse], Any]
 
 @dataclass(frozen=True)
 class Plan:
-    """The checked arguments of `build_env_group`.
-
-    Attributes:
-        filmed: ids of envs that will be filmed; each gets a worker of its own where possible, as
-            rendering would delay others.
-    """
+    """The checked arguments of `build_env_group`."""
 
     configs: list[EnvConfig]
     preprocess_fns: list[list[PreprocessFn | None]]
     mixed_actions: bool
     zero_copy: bool
-    filmed: frozenset[str] = frozenset()
 
 
 def plan_group(
@@ -49,9 +43,8 @@ def plan_group(
     *,
     mixed_actions: bool,
     zero_copy: bool,
-    filmed: Collection[str] = (),
 ) -> Plan:
-    """Check the arguments of `build_env_group`, and of commands that film (see `Plan`).
+    """Check the arguments of `build_env_group`.
 
     Raises:
         ConfigError: a config or a preprocess function can't be used.
@@ -72,7 +65,7 @@ def plan_group(
             )
         for make in _distinct(makers_of(config)):
             _check_sendable(config, "task", make)
-    return Plan(configs, fns, mixed_actions, zero_copy, frozenset(filmed))
+    return Plan(configs, fns, mixed_actions, zero_copy)
 
 
 def placement_for(config: EnvConfig) -> Placement:

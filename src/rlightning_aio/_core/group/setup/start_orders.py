@@ -14,7 +14,7 @@ from rlightning_aio.config import EnvConfig, makers_of
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
 
 __all__ = ["nums_hosts", "start_orders"]
 
@@ -62,7 +62,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
     return [
         (config, share)
         for (config, fns), num_hosts in zip(local, counts, strict=True)
-        for share in _shares(config, fns, num_hosts, plan.filmed)
+        for share in _shares(fns, num_hosts)
     ]
 
 
@@ -136,20 +136,8 @@ def _shares_cores(config: EnvConfig) -> bool:
     )
 
 
-def _shares(
-    config: EnvConfig,
-    fns: Sequence[PreprocessFn | None],
-    num_hosts: int,
-    filmed: Collection[str],
-) -> list[Share]:
-    """The envs of each host of an entry: consecutive ones, evenly divided.
-
-    Filmed envs have hosts of their own, unless the entry says how many envs share one.
-    """
-    count = len(fns)
-    envs = list(enumerate(fns))
-    bounds = {count * k // num_hosts for k in range(num_hosts + 1)}
-    if placement_for(config).spreads and config.envs_per_process == "auto":
-        alone = [k for k in range(count) if f"{config.name}-{k}" in filmed]
-        bounds |= {k + side for k in alone for side in (0, 1)}
-    return [envs[first:end] for first, end in itertools.pairwise(sorted(bounds))]
+def _shares(fns: Sequence[PreprocessFn | None], num_hosts: int) -> list[Share]:
+    """The envs of each host of an entry: consecutive ones, evenly divided."""
+    count, envs = len(fns), list(enumerate(fns))
+    bounds = [count * k // num_hosts for k in range(num_hosts + 1)]
+    return [envs[first:end] for first, end in itertools.pairwise(bounds)]
