@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -102,8 +101,8 @@ def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-def test_an_unread_stderr_hides_no_death() -> None:
-    """An env that prints to it waits; deaths are noticed; no output is lost."""
+def test_an_unread_stderr_delays_nobody() -> None:
+    """Neither an env that prints to it nor the news of deaths; what it can't take is dropped."""
     script = """
         import logging
         logging.disable()
@@ -113,7 +112,6 @@ def test_an_unread_stderr_hides_no_death() -> None:
             batch, _ = group.step(tokens.steps(["faulty-3"], {"faulty-3": "exit 3"}))
             say(batch["faulty-3"].info["worker_restarted"])
             tokens.check(group.step(tokens.steps(["faulty-3"]))[0])
-        say("read me")
         batch, _ = group.collect_async()
         tokens.check(batch)
         say("printed by " + batch.ids()[0])
@@ -123,10 +121,8 @@ def test_an_unread_stderr_hides_no_death() -> None:
     with trainer(script) as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        assert sum("exited with code 3" in line for line in read_until(process.stdout, "read")) == 3
-        with ThreadPoolExecutor() as pool:
-            reading = pool.submit(process.stderr.read)
-            read_until(process.stdout, "printed by faulty-0")
-            read_until(process.stdout, "closed")
-            written = reading.result()
-    assert written.count("e" * 1023 + "\n") == 3000
+        lines = read_until(process.stdout, "closed")
+        assert sum("exited with code 3" in line for line in lines) == 3
+        assert any("printed by faulty-0" in line for line in lines)
+        written = process.stderr.read()
+    assert 0 < written.count("e" * 1023 + "\n") < 3000

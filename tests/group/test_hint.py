@@ -109,9 +109,6 @@ class Worker(Host):
 
     current_request = traffic = catch_up = kill = destroy = _not_asked  # See `Killable`.
 
-    def inspect(self, slot: int, answer: Any, after: float) -> None:
-        answer(f"step of env {slot}, env.py:{after * 1000:.0f}", "all stacks")
-
 
 @dataclass
 class OnLoop(Host):
@@ -177,7 +174,6 @@ def test_envs_that_share_workers_and_wait_get_one_warning(
     queued: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It has the setting, and comes before each env has made twenty steps."""
-    caplog.set_level("DEBUG", "rlightning_aio")
     machine = Machine()
     machine.look()
     for _ in range(3):
@@ -185,8 +181,6 @@ def test_envs_that_share_workers_and_wait_get_one_warning(
         machine.look()
     (text,) = warned(caplog)
     assert "entry 'pole': 4 envs share each worker" in text
-    assert text.endswith(f"a step stands in step of env 0, env.py:{(5 * MS + queued // 2) // MS}")
-    assert "the stacks of a worker of entry 'pole':\nall stacks" in caplog.text
     takes = f"one takes {(10 * MS + queued) // MS} ms"
     assert f"{takes}, and keeps a core busy for 10 % of that" in text
     assert "up to 4.0 times as fast" in text

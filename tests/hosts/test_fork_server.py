@@ -118,12 +118,9 @@ def test_an_exit_is_reported_even_if_another_process_continues_to_write(
     os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
     server: Any = object.__new__(fork_server._ForkServer)
     server._poll = select.poll()
-    outlet = fork_server._Outlet(server._poll, 2)
     server._trainer = type("Trainer", (), {"send": sent.append})
     channel = os.open(os.devnull, os.O_RDONLY)
-    server._children = {
-        pid: fork_server._Child(7, pid, [fork_server._Output(reader, outlet)], channel)
-    }
+    server._children = {pid: fork_server._Child(7, pid, [fork_server._Output(reader, 2)], channel)}
     server._handle_exits()
     os.close(writer)
     (exited,) = sent

@@ -169,19 +169,6 @@ class Host(Protocol):
         nobody uses what it holds.
         """
 
-    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
-        """Find out where the code of an env stands, without blocking.
-
-        Args:
-            slot: of the env.
-            after: seconds from now, at which the host looks.
-            answer: gets the calls that it is in, from the outermost in (empty if that is not
-                known), and the stacks of all threads. Called now or soon, while the driver reads,
-                unless the host dies before.
-        """
-        del slot, after  # For those that know more.
-        answer("", "")
-
     def processor_times(self) -> tuple[int, int] | None:
         """Return the ns for which its threads have run, and have waited for a core, if known."""
         return None

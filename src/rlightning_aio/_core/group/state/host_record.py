@@ -17,7 +17,7 @@ from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -258,16 +258,6 @@ class HostRecord:
         before = self.traffic
         self.traffic = before if self.killable is None else self.killable.traffic
         return self.traffic != before
-
-    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float = 0.0) -> None:
-        """Have `answer` get where an env stands, as of `Host.inspect`.
-
-        Robots are not asked: the signal would end a system call of their SDK early.
-        """
-        if self.is_hardware:
-            answer("", "")
-        else:
-            self.host.inspect(slot, answer, after)
 
     def kill(self, *, dump: bool) -> None:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""

@@ -33,7 +33,6 @@ __all__ = [
     "host_loss",
     "late_fault",
     "start_fault",
-    "warn_where",
     "without_terminal",
 ]
 
@@ -41,36 +40,6 @@ _LINES: Final = 3
 _EVERY: Final = 100
 
 _log = logging.getLogger("rlightning_aio")
-
-
-def warn_where(
-    record: HostRecord,
-    slot: int,
-    text: str,
-    stands: str,
-    whose: str,
-    *,
-    rest: str = "",
-    after: float = 0.0,
-) -> None:
-    """Log a warning that says where an env stands if its host can say so, and the stacks at DEBUG.
-
-    Args:
-        record: of its host.
-        slot: of the env.
-        text: of the warning.
-        stands: what is said of the place, with {} for the env's calls.
-        whose: the stacks are.
-        rest: of the warning, after the place.
-        after: seconds from now, at which the host looks; the warning is logged after that.
-    """
-
-    def log(where: str, stacks: str) -> None:
-        _log.warning("%s%s%s", text, stands.format(where) if where else "", rest)
-        if stacks:
-            _log.debug("the stacks of %s:\n%s", whose, stacks)
-
-    record.inspect(slot, log, after)
 
 
 def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:

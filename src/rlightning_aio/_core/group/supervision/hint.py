@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio._core.group.supervision.fault_messages import warn_where
-
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -147,14 +145,7 @@ class Hints:
         together = max(len(record.slots) for record in records)
         if waits(spent):
             self._since[name] = None
-            warn_where(
-                records[0],
-                records[0].slots.start,
-                _advice(name, together, spent),
-                "; a step stands in {}",
-                f"a worker of entry {name!r}",
-                after=spent.step_seconds / 2,  # In a step, probably.
-            )
+            _log.warning("%s", _advice(name, together, spent))
 
     def _look_at_separate(self, name: str, records: Sequence[HostRecord]) -> None:
         """Warn if envs that have a worker each make steps so short that sharing is faster."""

@@ -7,13 +7,13 @@ which `HangDetector` takes care.
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Patient
-from rlightning_aio._core.group.supervision.fault_messages import warn_where
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["Overdue"]
 
 OWED_SECONDS = 60.0
+
+_log = logging.getLogger("rlightning_aio")
 _RESETS: Final = (Operation.RESET, Operation.RESTORE)
 
 
@@ -75,14 +77,11 @@ class Overdue:
         self._look_at(due)
 
     def _name(self, slot: int, seconds: float, setting: str) -> None:
-        """Log that an env owes a result, and where it stands if its host can say so."""
-        tables = self._tables
-        warn_where(
-            tables.record_of(slot),
-            slot,
-            f"{tables.envs.describe(slot)} has owed a result for {seconds:.0f} s, and nothing ends "
-            f"what it does: set {setting} of its entry, in seconds, to have it replaced; ",
-            "it stands in {}; ",
-            tables.envs.env_ids[slot],
-            rest="group.get_workers() tells who owes what",
+        """Log that an env owes a result."""
+        _log.warning(
+            "%s has owed a result for %.0f s, and nothing ends what it does: set %s of its entry, "
+            "in seconds, to have it replaced; group.get_workers() tells who owes what",
+            self._tables.envs.describe(slot),
+            seconds,
+            setting,
         )

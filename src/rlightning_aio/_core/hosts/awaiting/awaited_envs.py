@@ -369,11 +369,6 @@ class AwaitedEnvs:
         self._put_away(record, env, hung(f"hung in a {doing} and was cancelled", op, record.name))
         self._rebuild(record, message)
 
-    def waits_in(self, slot: int) -> str:
-        """Name the calls in which an env waits, from the outermost in; empty if it doesn't."""
-        env = self._records[slot - self._first_slot].env
-        return "" if env is None else awaited_calls(env.answering)
-
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""
         record = self._records[env.index]

@@ -21,7 +21,7 @@ from rlightning_aio.protocol.rings import WorkerBell, bell_size
 from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
+    from collections.abc import Coroutine, Sequence
 
     from numpy.typing import NDArray
 
@@ -102,16 +102,6 @@ class LoopHost(Host):
         """End requests by a cancellation of what their envs await; see `base.Host.abort`."""
         for entry in entries.tolist():
             self._envs.abort(entry)
-
-    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
-        """Name the calls that the env awaits; the trainer's own stack says nothing of it."""
-
-        def look() -> None:
-            if self._bell is not None:  # Not released meanwhile.
-                waits_in = self._envs.waits_in(slot)
-                answer(waits_in, waits_in)
-
-        asyncio.get_running_loop().call_later(after, look)
 
     # -- completions --------------------------------------------------------------
 

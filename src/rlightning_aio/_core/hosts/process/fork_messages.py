@@ -26,7 +26,6 @@ __all__ = [
     "Exited",
     "Fork",
     "Forked",
-    "Inspect",
     "Kill",
     "Message",
     "MessageSocket",
@@ -34,7 +33,6 @@ __all__ = [
     "Preload",
     "Ready",
     "Received",
-    "Stacks",
 ]
 
 
@@ -70,26 +68,10 @@ class Forked:
 
 @dataclass(frozen=True)
 class Kill:
-    """Kill worker `host_id`; with `dump`, the last of its output is its stacks."""
+    """Kill worker `host_id`; with `dump`, it writes its stacks to stderr first."""
 
     host_id: int
     dump: bool
-
-
-@dataclass(frozen=True)
-class Inspect:
-    """Have worker `host_id` write its stacks after some seconds; `Stacks` follows."""
-
-    host_id: int
-    after: float
-
-
-@dataclass(frozen=True)
-class Stacks:
-    """The stacks of the threads of worker `host_id`; empty if it is stopped."""
-
-    host_id: int
-    text: str
 
 
 @dataclass(frozen=True)
@@ -109,7 +91,7 @@ class NotForked:
     why: str
 
 
-Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited | Inspect | Stacks
+Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited
 
 REFUSED: Final = b"!"
 """First byte of the only packet of a fork server that can't import its code; a text follows."""

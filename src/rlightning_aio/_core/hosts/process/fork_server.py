@@ -31,13 +31,11 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     Forked,
-    Inspect,
     Kill,
     MessageSocket,
     NotForked,
     Preload,
     Ready,
-    Stacks,
 )
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 
@@ -85,9 +83,6 @@ _GRACE_SECONDS: Final = 1.2
 _DUMP_SECONDS: Final = 0.3
 """Time for a worker to write its stacks."""
 _ERROR_CHARACTERS: Final = 60_000
-_OUTLET_BYTES: Final = 1 << 20
-_READ_SECONDS: Final = 0.2
-"""If the reader of stdout or stderr reads nothing for this long, it is considered gone."""
 _STDOUT: Final = 1
 _STDERR: Final = 2
 
@@ -95,8 +90,7 @@ _STDERR: Final = 2
 @dataclass
 class _Child:
     """A worker. Its end of the channel stays open here until its exit is handled, so that it can be
-    shut down when the trainer is gone. The last of its outputs has the stacks that it writes
-    on request, which are forwarded to stderr only before it is killed.
+    shut down when the trainer is gone.
     """
 
     host_id: int
@@ -104,12 +98,10 @@ class _Child:
     outputs: list[_Output]
     channel: int
     kill_at: float | None = None
-    inspect_at: float | None = None
-    tell_at: float | None = None
 
     def tail(self) -> str:
-        """The end of what it wrote to stdout, of what it wrote to stderr, and of its stacks."""
-        return "".join(output.text() for output in self.outputs)
+        """The end of what it wrote to stdout, and of what it wrote to stderr."""
+        return "".join(output.tail.decode(errors="replace") for output in self.outputs)
 
 
 @dataclass
@@ -117,62 +109,26 @@ class _Output:
     """What a worker writes to stdout, to stderr, or to both if they are the same file here."""
 
     reader: int
-    outlet: _Outlet | None
+    descriptor: int
     tail: bytearray = field(default_factory=bytearray)
-    silent: bool = False
-
-    @property
-    def is_held_up(self) -> bool:
-        return self.outlet is not None and self.outlet.full
-
-    def text(self) -> str:
-        return self.tail.decode(errors="replace")
 
 
-class _Outlet:
-    """Forwards what workers write to a descriptor, and never blocks.
+def _pass_on(descriptor: int, data: bytes) -> None:
+    """Write as much as the descriptor takes at once.
 
-    The stderr of the trainer may be a pipe without a reader. Then output waits here, and when
-    there is too much of it, in the pipes of the workers.
+    The stderr of the trainer may be a pipe without a reader. The rest is dropped, because all
+    workers would wait while the fork server did.
     """
-
-    def __init__(self, poll: select.poll, descriptor: int) -> None:
-        self.descriptor = descriptor
-        self._poll = poll
-        self._waiting = bytearray()
-
-    @property
-    def full(self) -> bool:
-        return len(self._waiting) > _OUTLET_BYTES
-
-    def write(self, data: bytes) -> None:
-        self._waiting += data
-        self.flush()
-
-    def empty(self, until: float) -> None:
-        """Write the rest while the reader reads."""
-        reader = select.poll()
-        reader.register(self.descriptor, select.POLLOUT)
-        while self._waiting and time.monotonic() < until and reader.poll(_READ_SECONDS * 1000):
-            self.flush()
-
-    def flush(self) -> None:
-        """Write without blocking; poll for more room if necessary."""
-        probe = select.poll()
-        probe.register(self.descriptor, select.POLLOUT)
-        while self._waiting:
-            events = probe.poll(0)
-            if not events:
-                self._poll.register(self.descriptor, select.POLLOUT)
-                return
-            try:
-                # A pipe that is writable takes this much without blocking.
-                size = os.write(self.descriptor, self._waiting[: select.PIPE_BUF])
-                del self._waiting[:size]
-            except OSError:
-                self._waiting.clear()  # The reader is gone.
-        with contextlib.suppress(KeyError):
-            self._poll.unregister(self.descriptor)
+    probe = select.poll()
+    probe.register(descriptor, select.POLLOUT)
+    for begin in range(0, len(data), select.PIPE_BUF):
+        if not probe.poll(0):
+            return
+        try:
+            # A pipe that is writable takes this much without blocking.
+            os.write(descriptor, data[begin : begin + select.PIPE_BUF])
+        except OSError:  # The reader is gone.
+            return
 
 
 def die_with_parent() -> None:
@@ -202,8 +158,8 @@ class _ForkServer:
         if trainer_process >= 0:
             self._poll.register(trainer_process, select.POLLIN)
         # Where both are the same file, such as a terminal, one pipe keeps the order of lines.
-        streams = (_STDERR,) if os.path.sameopenfile(_STDOUT, _STDERR) else (_STDOUT, _STDERR)
-        self._outlets = [_Outlet(self._poll, stream) for stream in streams]
+        is_one = os.path.sameopenfile(_STDOUT, _STDERR)
+        self._streams = (_STDERR,) if is_one else (_STDOUT, _STDERR)
         # A byte arrives here whenever a child exits.
         self._wakeup, wakeup = socket.socketpair()
         self._wakeup.setblocking(False)
@@ -222,8 +178,7 @@ class _ForkServer:
         self._end_all()
 
     def _next_due(self) -> float | None:
-        children = self._children.values()
-        times = [at for one in children for at in (one.kill_at, one.inspect_at, one.tell_at) if at]
+        times = [one.kill_at for one in self._children.values() if one.kill_at]
         return min(times, default=None)
 
     def _step(self, until: float | None) -> bool:
@@ -239,7 +194,6 @@ class _ForkServer:
                     return False
             else:
                 self._attend(descriptor)
-        self._inspect_due()
         self._kill_due()
         self._handle_exits()
         return True
@@ -248,11 +202,6 @@ class _ForkServer:
         if descriptor == self._wakeup.fileno():
             with contextlib.suppress(BlockingIOError):
                 self._wakeup.recv(4096)
-        elif descriptor in (_STDOUT, _STDERR):
-            for outlet in self._outlets:
-                if outlet.descriptor == descriptor:
-                    outlet.flush()
-            self._choose_readable()
         else:
             self._forward(descriptor)
 
@@ -267,8 +216,6 @@ class _ForkServer:
             self._fork(received.message, received.descriptors)
         elif isinstance(received.message, Kill):
             self._kill(received.message)
-        elif isinstance(received.message, Inspect):
-            self._inspect(received.message)
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
@@ -277,7 +224,7 @@ class _ForkServer:
         try:
             if len(descriptors) < 2:
                 raise OSError("its descriptors didn't arrive: too many are open")
-            for _ in (*self._outlets, None):
+            for _ in self._streams:
                 pipes += os.pipe()
             pid = os.fork()
         except OSError as error:
@@ -293,10 +240,9 @@ class _ForkServer:
             os.close(descriptor)
         for reader in readers:
             os.set_blocking(reader, False)
-        outlets = (*self._outlets, None)
-        outputs = [_Output(*both) for both in zip(readers, outlets, strict=True)]
+            self._poll.register(reader, select.POLLIN)
+        outputs = [_Output(*both) for both in zip(readers, self._streams, strict=True)]
         self._children[pid] = _Child(order.place.host_id, pid, outputs, channel)
-        self._choose_readable()
         self._trainer.send(Forked(order.place.host_id, pid))
 
     def _become_worker(self) -> None:
@@ -316,27 +262,8 @@ class _ForkServer:
         for child in self._children.values():
             if child.host_id == order.host_id:
                 if order.dump:
-                    child.outputs[-1].outlet = self._outlets[-1]  # The log shows them.
                     os.kill(child.pid, DUMP_SIGNAL)
                 child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
-        self._choose_readable()
-
-    def _inspect(self, order: Inspect) -> None:
-        for child in self._children.values():
-            if child.host_id == order.host_id:
-                child.inspect_at = time.monotonic() + order.after
-
-    def _inspect_due(self) -> None:
-        now = time.monotonic()
-        for child in self._children.values():
-            if child.inspect_at is not None and child.inspect_at <= now:
-                os.kill(child.pid, DUMP_SIGNAL)
-                child.inspect_at, child.tell_at = None, now + _DUMP_SECONDS
-            if child.tell_at is not None and child.tell_at <= now:
-                child.tell_at = None
-                stacks = child.outputs[-1]
-                self._trainer.send(Stacks(child.host_id, stacks.text()))
-                stacks.tail.clear()
 
     def _kill_due(self) -> None:
         now = time.monotonic()
@@ -344,17 +271,6 @@ class _ForkServer:
             if child.kill_at is not None and child.kill_at <= now:
                 os.kill(child.pid, signal.SIGKILL)
                 child.kill_at = None
-
-    def _choose_readable(self) -> None:
-        """Read from all workers; if too much output waits, only from those about to be killed."""
-        for child in self._children.values():
-            for output in child.outputs:
-                is_read = not output.is_held_up or child.kill_at is not None
-                if is_read and not output.silent:
-                    self._poll.register(output.reader, select.POLLIN)
-                else:
-                    with contextlib.suppress(KeyError):
-                        self._poll.unregister(output.reader)
 
     def _forward(self, descriptor: int) -> None:
         """Forward the output of a worker, and keep the end of it."""
@@ -369,16 +285,11 @@ class _ForkServer:
         except BlockingIOError:
             return
         if not data:
-            output.silent = True
-            self._choose_readable()
+            self._poll.unregister(output.reader)
             return
         output.tail += data
         del output.tail[:-_TAIL_BYTES]
-        was_held_up = output.is_held_up
-        if output.outlet is not None:
-            output.outlet.write(data)
-        if output.is_held_up != was_held_up:
-            self._choose_readable()
+        _pass_on(output.descriptor, data)
 
     def _handle_exits(self) -> None:
         """Report the workers that exited."""
@@ -416,8 +327,6 @@ class _ForkServer:
             self._wait_for_children(until)
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)
-        for outlet in self._outlets:
-            outlet.empty(until)
 
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
@@ -441,10 +350,9 @@ def _run_worker(
     """Run a worker in a forked child; never returns."""
     code = 1
     try:
-        *printed, stacks = outputs
-        os.dup2(printed[0], _STDOUT)
-        os.dup2(printed[-1], _STDERR)
-        for output in printed:
+        os.dup2(outputs[0], _STDOUT)
+        os.dup2(outputs[-1], _STDERR)
+        for output in outputs:
             os.close(output)
         # What an env prints comes at once, and isn't lost if the worker is killed.
         cast("TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
@@ -453,7 +361,7 @@ def _run_worker(
         if os.getppid() != parent:
             os._exit(1)
         faulthandler.enable(all_threads=True)
-        faulthandler.register(DUMP_SIGNAL, stacks, all_threads=True)
+        faulthandler.register(DUMP_SIGNAL, all_threads=True)
         # Not at the top: the fork server sends messages before imports that may fail.
         from rlightning_aio._core.hosts.process import worker  # noqa: PLC0415
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import re
 import signal
 import socket
 import subprocess
@@ -25,13 +24,11 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     Forked,
-    Inspect,
     Kill,
     MessageSocket,
     NotForked,
     Preload,
     Ready,
-    Stacks,
 )
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
@@ -45,7 +42,7 @@ from rlightning_aio.protocol.rings import rings_size
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -60,8 +57,6 @@ __all__ = ["ForkServerHandle", "ProcessHost", "ending"]
 
 _STDERR: Final = 2
 _PACKAGE: Final = str(Path(__file__).parents[3])
-_FRAME: Final = re.compile(r'^  File "(.+)", line (\d+) in (.+)$', re.MULTILINE)
-_MOST_CALLS: Final = 3
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -166,11 +161,6 @@ class ForkServerHandle:
         else:
             self._send(self._server, Kill(host.host_id, dump))
 
-    def inspect(self, host: ProcessHost, after: float) -> None:
-        """Have the worker of `host` write its stacks, after some seconds; see `on_stacks`."""
-        if self._server is not None and self._ready:
-            self._send(self._server, Inspect(host.host_id, after))
-
     def note_used(self) -> None:
         """Note that the envs of all workers were built."""
         self._is_used = True
@@ -240,8 +230,6 @@ class ForkServerHandle:
             host.on_exit(message.exit_code, message.stderr_tail)
         elif isinstance(message, NotForked):
             self._hosts.pop(message.host_id).on_refused(message.why)
-        elif isinstance(message, Stacks):
-            self._hosts[message.host_id].on_stacks(message.text)
 
     def _lost(self) -> None:
         """Handle the exit of the fork server; the kernel killed its workers."""
@@ -318,7 +306,6 @@ class ProcessHost(Host):
         self._alive = False
         self._closing = False
         self._killed = ""
-        self._inspecting: list[Callable[[str, str], None]] = []
 
     # -- life ---------------------------------------------------------------------
 
@@ -355,19 +342,6 @@ class ProcessHost(Host):
     def destroy(self) -> None:
         self._fork_server.destroy()
 
-    def inspect(self, slot: int, answer: Callable[[str, str], None], after: float) -> None:
-        """See `base.Host.inspect`. A worker that steps one env stands where that stands."""
-        del slot
-        self._inspecting.append(answer)
-        if len(self._inspecting) == 1:
-            self._fork_server.inspect(self, after)
-
-    def on_stacks(self, text: str) -> None:
-        """Pass on what the worker wrote."""
-        inspecting, self._inspecting = self._inspecting, []
-        for answer in inspecting:
-            answer(calls_of_env(text), text)
-
     def close(self) -> None:
         self._closing = True
         if self._alive and self._link is not None:
@@ -381,7 +355,6 @@ class ProcessHost(Host):
 
     def _hang_up(self) -> None:
         self._alive = False
-        self._inspecting.clear()
         if self._link is not None:
             self._link.hang_up()
             self._link = None
@@ -469,20 +442,6 @@ def _new_channel() -> tuple[socket.socket, socket.socket]:
     theirs.close()
     occupy_standard_streams()  # The program has closed some since the group was built.
     return socket.socketpair()
-
-
-def calls_of_env(stacks: str) -> str:
-    """Name the last calls that an env is in, from the outermost in; empty if it is in none.
-
-    Args:
-        stacks: as `faulthandler` writes them, that of the main thread as the current one.
-    """
-    calls: list[str] = []
-    for file, line, function in _FRAME.findall(stacks.partition("Current thread")[2]):
-        if file.startswith(_PACKAGE) or len(calls) == _MOST_CALLS:
-            break
-        calls.insert(0, f"{function}, {file}:{line}")
-    return " > ".join(calls)
 
 
 def ending(exit_code: int) -> str:
