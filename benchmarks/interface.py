@@ -32,7 +32,7 @@ MODULES: Final = {
     "policies": "evaluation", "plugins.policy_servers": "evaluation",
     "plugins.lerobot": "evaluation", "plugins.export": "evaluation",
     "remote": "remote",
-    "errors": "errors", "spaces": "envs", "envs.contract": "envs", "envs.fast_path": "envs",
+    "errors": "errors", "spaces": "envs", "envs.fast_path": "envs",
     "registry": "envs", "legacy": "legacy",
 }  # fmt: skip
 """Modules that the documentation imports names from, each with its row of the table."""

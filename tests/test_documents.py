@@ -188,7 +188,6 @@ def public_names() -> dict[str, set[str]]:
     packages.
     """
     files = {"rlightning_aio": PACKAGE / "__init__.py"}
-    files["rlightning_aio.envs.contract"] = PACKAGE / "envs" / "contract.py"
     for path in (*PACKAGE.glob("*.py"), *PACKAGE.glob("*/__init__.py")):
         name = path.parent.name if path.name == "__init__.py" else path.stem
         if name not in INTERNAL | {"rlightning_aio"}:

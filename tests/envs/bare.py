@@ -9,7 +9,7 @@ from rlightning_aio.trees import as_numpy
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Expected
+    from kit.contract import Expected
 
 
 def gymnasium_outcomes(

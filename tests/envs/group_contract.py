@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from kit.contract import EnvContract, Expected, outcomes_of, same, values_of
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
-from rlightning_aio.envs.contract import EnvContract, Expected, outcomes_of, same, values_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from envs.bare import gymnasium_outcomes
 from envs.group_contract import GroupContract
+from kit.contract import Expected, same, values_of
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import Expected, same, values_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 

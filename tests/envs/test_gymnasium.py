@@ -17,7 +17,7 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Expected
+    from kit.contract import Expected
 
 
 class GymnasiumContract(GroupContract):

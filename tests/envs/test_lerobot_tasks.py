@@ -17,7 +17,7 @@ from rlightning_aio.evaluation import EpisodeSpec, evaluate
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Expected
+    from kit.contract import Expected
 
 pytest.importorskip("gym_pusht")
 pytest.importorskip("gym_aloha")

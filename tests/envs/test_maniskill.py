@@ -13,10 +13,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from envs.group_contract import GroupContract
+from kit.contract import Expected, same
 
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import Expected, same
 from rlightning_aio.envs.simulators.vulkan import render_device_is_usable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse

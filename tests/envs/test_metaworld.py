@@ -16,8 +16,9 @@ from rlightning_aio.evaluation import EpisodeSpec, evaluate
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from kit.contract import Expected
+
     import rlightning_aio as rl
-    from rlightning_aio.envs.contract import Expected
 
 pytest.importorskip("metaworld")
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS

@@ -19,7 +19,8 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.contract import Expected
+    from kit.contract import Expected
+
     from rlightning_aio.envs.simulators.pettingzoo import PettingZooEnv
     from rlightning_aio.types import MultiAgentEnvRet
 

@@ -12,11 +12,11 @@ import pytest
 from group import sample_envs
 from group.sample_envs import HALVED
 from gymnasium import spaces
+from kit.contract import same
 from kit.scripted import Counts
 
 import rlightning_aio.sync
 from rlightning_aio.batch.data import parts_of
-from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:

@@ -1,7 +1,6 @@
-"""`EnvContract`: tests that every env must pass; the author of a backend inherits them.
+"""`EnvContract`: tests that the env of every backend must pass.
 
-Rule: a subclass names a config and gets the tests; no test knows a simulator. pytest collects
-them, but the module does not import it, so the package needs no test tools.
+Rule: a subclass names a config and gets the tests; no test knows a simulator.
 Left out: speed, and the meaning of observations.
 """
 
