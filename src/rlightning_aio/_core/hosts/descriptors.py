@@ -1,67 +1,37 @@
 """What the trainer waits with: a set of descriptors, and a descriptor that threads make readable.
 
-Rule: the set is an epoll, or where the system has none (macOS) a kqueue with the same methods. Both
-are level-triggered, and have a descriptor of their own.
+Rule: the set is an epoll, or where the system has none (macOS) a selector with the same methods.
+Both are level-triggered, and have a descriptor of their own.
 """
 
 from __future__ import annotations
 
 import select
+import selectors
 import socket
-from typing import Any, Final, cast
+from typing import Final, cast
 
 __all__ = ["READABLE", "WRITABLE", "WakeUp", "new_descriptor_set"]
 
-READABLE: Final = select.POLLIN  # The numbers of epoll, too.
-WRITABLE: Final = select.POLLOUT
-_MAX_EVENTS: Final = 64
+# The numbers that epoll has; those of selectors are different.
+READABLE: Final = select.POLLIN if hasattr(select, "epoll") else selectors.EVENT_READ
+WRITABLE: Final = select.POLLOUT if hasattr(select, "epoll") else selectors.EVENT_WRITE
 
 
-class _Kqueue:
-    """A kqueue with the methods of `select.epoll`."""
-
-    def __init__(self) -> None:
-        # Known to type checkers on systems that have it.
-        self._system: Any = select
-        self._kqueue = self._system.kqueue()
-        self._masks: dict[int, int] = {}
+class _Selector(selectors.DefaultSelector):
+    """What `selectors` offers on this system, with the methods of `select.epoll`."""
 
     @property
     def closed(self) -> bool:
-        return self._kqueue.closed
-
-    def fileno(self) -> int:
-        return self._kqueue.fileno()
-
-    def close(self) -> None:
-        self._kqueue.close()
-
-    def register(self, descriptor: int, mask: int) -> None:
-        self._masks[descriptor] = 0
-        self.modify(descriptor, mask)
-
-    def unregister(self, descriptor: int) -> None:
-        self.modify(descriptor, 0)
-        del self._masks[descriptor]
-
-    def modify(self, descriptor: int, mask: int) -> None:
-        system = self._system
-        changed = self._masks[descriptor] ^ mask
-        for bit, kind in (READABLE, system.KQ_FILTER_READ), (WRITABLE, system.KQ_FILTER_WRITE):
-            if changed & bit:
-                action = system.KQ_EV_ADD if mask & bit else system.KQ_EV_DELETE
-                self._kqueue.control([system.kevent(descriptor, kind, action)], 0, 0)
-        self._masks[descriptor] = mask
+        return self.get_map() is None  # pyright: ignore[reportUnnecessaryComparison]
 
     def poll(self, seconds: float) -> list[tuple[int, int]]:
-        found = self._kqueue.control(None, _MAX_EVENTS, None if seconds < 0 else seconds)
-        reads = self._system.KQ_FILTER_READ
-        return [(event.ident, READABLE if event.filter == reads else WRITABLE) for event in found]
+        return [(key.fd, events) for key, events in self.select(None if seconds < 0 else seconds)]
 
 
 def new_descriptor_set() -> select.epoll:
     """Return an empty set, or what has the same methods."""
-    return select.epoll() if hasattr(select, "epoll") else cast("select.epoll", _Kqueue())
+    return select.epoll() if hasattr(select, "epoll") else cast("select.epoll", _Selector())
 
 
 class WakeUp:

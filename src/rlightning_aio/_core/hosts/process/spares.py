@@ -25,11 +25,6 @@ Key: TypeAlias = tuple[object, ...]
 
 _MOST: Final = 3
 _END_SECONDS: Final = 1.0
-_INHERITED: Final = (
-    *("Umask", "Uid", "Gid", "Groups"),
-    *("SigIgn", "NoNewPrivs", "Seccomp", "Cpus_allowed", "Mems_allowed"),
-)
-"""Lines of /proc/self/status about what a new process inherits."""
 
 
 class RunningForkServer(NamedTuple):
@@ -57,9 +52,7 @@ _spares: dict[Key, RunningForkServer] = {}
 
 
 def inherited() -> Key:
-    """Return what a process would inherit that this thread starts now."""
-    thread = Path("/proc/thread-self")
-    status = (thread / "status").read_text().splitlines()
+    """Return what programs change of what a process inherits that is started now."""
     try:
         folder = Path.cwd()
     except FileNotFoundError:  # It was deleted.
@@ -70,10 +63,6 @@ def inherited() -> Key:
         folder,
         _file(1),
         _file(2),
-        tuple(line for line in status if line.startswith(_INHERITED)),
-        (thread / "limits").read_text(),
-        (thread / "cgroup").read_text(),
-        os.getpriority(os.PRIO_PROCESS, 0),
     )
 
 
