@@ -4,8 +4,9 @@
     python examples/ppo.py --task CartPole-v1
 
 With the same seeds it learns the same weights, bit for bit, as that loop on Gymnasium's vector
-environments (SAME_STEP, its wrappers around each). Like that loop, it treats a truncated episode
-as a terminated one; ppo_async.py does better.
+environments (SAME_STEP, its wrappers around each), if there is one environment, or nothing is
+normalised: the statistics here are those of all environments together. Like that loop, it treats
+a truncated episode as a terminated one; ppo_async.py does better.
 """
 
 from __future__ import annotations
@@ -193,7 +194,7 @@ def train(args: Args) -> Run:
                 observation, sums = run.saved["observation"], run.saved["sums"].numpy().copy()
             else:
                 first, _ = envs.reset(seed=args.seed)
-                shown = normalizer.update_observations(everyone, first)
+                shown = normalizer.update_observations(first)
                 observation = torch.from_numpy(shown)
                 sums = np.zeros(args.num_envs)
             while run.goes_on():
@@ -220,13 +221,13 @@ def train(args: Args) -> Run:
                         result[k] = infos["final_obs"][k]
                     # Gymnasium's wrapper starts the return again with the reward that terminates.
                     scaled = normalizer.update_rewards(everyone, reward, terminated)
-                    shown = normalizer.update_observations(everyone, result)
+                    shown = normalizer.update_observations(result)
                     rewards[t], ended[t] = torch.from_numpy(scaled), torch.from_numpy(done)
                     sums += reward
                     if done.any():
                         returns += sums[over].tolist()
                         sums[over] = 0.0
-                        shown[over] = normalizer.update_observations(over, first)
+                        shown[over] = normalizer.update_observations(first)
                     observation = torch.from_numpy(shown)
                 with run.learning(), group.span("learner") if group else nullcontext():
                     optimizer.param_groups[0]["lr"] = args.learning_rate * run.remaining

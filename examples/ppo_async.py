@@ -82,9 +82,9 @@ class Learner:
 
     def columns(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Columns for `learn`, with a fixed normaliser."""
-        after = self.normalizer.normalized(rollout.end_observation, rollout.at_ends("index"))
+        after = self.normalizer.normalized(rollout.end_observation)
         after = torch.from_numpy(after).flatten(1)
-        rollout.reward[:] = self.normalizer.scaled(rollout.reward, rollout.index)
+        rollout.reward[:] = self.normalizer.scaled(rollout.reward)
         seen = torch.from_numpy(rollout.seen)
         with torch.no_grad():
             value, next_value = self.agent.value(seen), self.agent.value(after)

@@ -1,10 +1,10 @@
 """Running normalisation of observations and rewards, in the trainer.
 
-Each env has its own statistics, by the formulas of Gymnasium's `NormalizeObservation` and
-`NormalizeReward` around each env. Unlike theirs, the discounted return starts again with each
-episode: Gymnasium's drops what was before a termination one step early, and never starts again
-after a truncation. A batch takes a few operations on whole arrays; workers do nothing. Left out:
-torch, whose CPU tensors share the arrays.
+All envs of a group share one mean and one variance, by the formulas of Gymnasium's
+`NormalizeObservation` and `NormalizeReward` of vector envs. Unlike theirs, the discounted return
+starts again with each episode: Gymnasium's drops what was before a termination one step early, and
+never starts again after a truncation. A batch takes a few operations on whole arrays; workers do
+nothing. Left out: torch, whose CPU tensors share the arrays.
 """
 
 from __future__ import annotations
@@ -30,46 +30,28 @@ _FIRST_COUNT: Final = 1e-4
 # Gymnasium's wrapper of observations starts its sum of squares as this float32.
 _FIRST_VARIANCE: Final = float(np.float32(_FIRST_COUNT)) / _FIRST_COUNT
 _RETURN: Final = "return"
+_SAVED: Final = ("mean", "variance", "count")
 
 
 class _Statistics:
-    """Mean and variance of the values of each env: ``[num_envs, *shape]``."""
+    """Mean and variance of values of one shape, and their number."""
 
     def __init__(self, shape: tuple[int, ...], first_variance: float) -> None:
-        self._first_variance = first_variance
-        self.mean = np.zeros((0, *shape))
-        self.variance = np.zeros((0, *shape))
-        self.count = np.zeros((0, *(1 for _ in shape)))
+        self.mean = np.zeros(shape)
+        self.variance = np.full(shape, first_variance)
+        self.count = np.array(_FIRST_COUNT)
 
-    def make_room(self, num_envs: int) -> None:
-        """Add envs without values, so that there are `num_envs` or more."""
-        more = num_envs - len(self.mean)
-        if more > 0:
-            for name, first in (
-                ("mean", 0.0), ("variance", self._first_variance), ("count", _FIRST_COUNT),
-            ):  # fmt: skip
-                known = getattr(self, name)
-                new = np.full((more, *known.shape[1:]), first)
-                setattr(self, name, np.concatenate([known, new]))
-
-    def update(self, index: NDArray[np.int64], values: NDArray[Any]) -> None:
-        """Add one value of each env in `index`, where each occurs once."""
-        mean, count = self.mean[index], self.count[index]
-        total = count + 1.0
-        delta = values - mean
-        squares = self.variance[index] * count + np.square(delta) * count / total
-        self.mean[index] = mean + delta / total
-        self.variance[index] = squares / total
-        self.count[index] = total
-
-    def of(self, index: NDArray[np.int64] | None) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Mean and variance of each env in `index`; of all values of all envs, if it is None."""
-        if index is not None:
-            self.make_room(int(index.max(initial=-1)) + 1)
-            return self.mean[index], self.variance[index]
-        weight = self.count / self.count.sum(axis=0)
-        mean = (self.mean * weight).sum(axis=0)
-        return mean, ((self.variance + np.square(self.mean - mean)) * weight).sum(axis=0)
+    def update(self, values: NDArray[Any]) -> None:
+        """Add values ``[n, *shape]``."""
+        if not len(values):
+            return
+        count, more = self.count, len(values)
+        total = count + more
+        delta = values.mean(axis=0) - self.mean
+        squares = self.variance * count + values.var(axis=0) * more
+        self.mean = self.mean + delta * more / total
+        self.variance = (squares + np.square(delta) * count * more / total) / total
+        self.count = total
 
 
 class Normalizer:
@@ -90,8 +72,8 @@ class Normalizer:
             return {"action": act(seen), "seen": seen}
 
         rollout = collector.collect()
-        rewards = normalizer.scaled(rollout.reward, rollout.index)
-        after = normalizer.normalized(rollout.end_observation, rollout.at_ends("index"))
+        rewards = normalizer.scaled(rollout.reward)
+        after = normalizer.normalized(rollout.end_observation)
 
     To save it, pass ``normalizer.state_dict()`` to `numpy.savez`; to continue, pass what
     `numpy.load` returns to `load_state_dict`.
@@ -109,9 +91,7 @@ class Normalizer:
         self._observations, self._rewards = observations, rewards
         # By the keys that lead to an array; and that of the discounted returns.
         self._statistics: dict[str, _Statistics] = {}
-        # By env: the discounted return so far, and whether the next reward starts an episode.
-        self._sums = np.zeros(0)
-        self._starts = np.zeros(0, np.bool_)
+        self._sums = np.zeros(0)  # By env: the discounted return so far.
 
     # -- with an update -----------------------------------------------------------
 
@@ -124,48 +104,46 @@ class Normalizer:
         Raises:
             TypeError: the batch has rewards of several agents.
         """
-        index = batch.index
         if self._rewards:
-            self._observe_rewards(batch, index.reshape(-1))
-        return self.update_observations(index, batch.observation)
+            self._observe_rewards(batch)
+        return self.update_observations(batch.observation, batch.index.ndim)
 
-    def _observe_rewards(self, batch: BatchedData, index: NDArray[np.int64]) -> None:
+    def _observe_rewards(self, batch: BatchedData) -> None:
         reward: Any = batch.reward
         if isinstance(reward, dict):
             raise TypeError("rewards of several agents can't be normalised; give rewards=False")
+        index, is_reset = batch.index.reshape(-1), batch.is_reset.reshape(-1)
         self._make_room(index)
-        is_reset = batch.is_reset.reshape(-1)
-        self._starts[index[is_reset]] = True
-        stepped = ~is_reset
-        index = index[stepped]
-        self.update_rewards(index, reward.reshape(-1)[stepped], self._starts[index])
-        self._starts[index] = batch.done.reshape(-1)[stepped]
+        self._sums[index[is_reset]] = 0
+        self.update_rewards(index[~is_reset], reward.reshape(-1)[~is_reset])
+        self._sums[index[batch.done.reshape(-1)]] = 0
 
-    def update_observations(self, index: NDArray[np.int64], observation: Any) -> Any:
-        """Add one observation of each env in `index`, and return them normalised.
+    def update_observations(self, observation: Any, axes: int = 1) -> Any:
+        """Add observations to the statistics, and return them normalised.
 
         Args:
-            index: which envs, each once; see `BatchedData.index`.
-            observation: an array, or dicts and tuples of arrays: ``[*index.shape, *obs]``.
+            observation: an array, or dicts and tuples of arrays: ``[n, *obs]``.
+            axes: number of leading axes, more than one for ``[m, num_envs, *obs]``.
         """
 
         def updated(path: str, leaf: NDArray[Any]) -> NDArray[np.float32]:
-            statistics = self._of(path, leaf.shape[index.ndim :], _FIRST_VARIANCE)
-            statistics.make_room(int(index.max(initial=-1)) + 1)
-            statistics.update(
-                index.reshape(-1), leaf.reshape(index.size, *leaf.shape[index.ndim :])
-            )
-            return _normal(leaf, *statistics.of(index))
+            shape = leaf.shape[axes:]
+            known = self._statistics.setdefault(path, _Statistics(shape, _FIRST_VARIANCE))
+            known.update(leaf.reshape(-1, *shape))
+            return self._normal(path, leaf)
 
         return self._normalised(updated, observation)
 
     def update_rewards(
-        self, index: NDArray[np.int64], reward: NDArray[Any], starts: NDArray[np.bool_]
+        self,
+        index: NDArray[np.int64],
+        reward: NDArray[Any],
+        starts: NDArray[np.bool_] | bool = False,
     ) -> NDArray[Any]:
         """Add one reward of each env in `index`, and return them scaled.
 
         Args:
-            index: ``[n]``, which envs, each once.
+            index: ``[n]``, which envs, each once; see `BatchedData.index`.
             reward: ``[n]``.
             starts: ``[n]``, whether the discounted return starts again with this reward.
         """
@@ -173,45 +151,36 @@ class Normalizer:
             return reward
         self._make_room(index)
         self._sums[index] = sums = self._sums[index] * self.gamma * (1 - starts) + reward
-        statistics = self._of(_RETURN, (), 1.0)
-        statistics.make_room(len(self._sums))
-        statistics.update(index, sums)
-        return self.scaled(reward, index)
+        self._statistics.setdefault(_RETURN, _Statistics((), 1.0)).update(sums)
+        return self.scaled(reward)
 
     # -- without ------------------------------------------------------------------
 
-    def normalized(self, observation: Any, index: NDArray[np.int64] | None = None) -> Any:
+    def normalized(self, observation: Any) -> Any:
         """Observations normalised by the present statistics, which don't change.
 
         Args:
-            observation: an array, or dicts and tuples of arrays: ``[*index.shape, *obs]``.
-            index: which env each is of; one may occur more than once. None uses the statistics
-                of all envs together, for envs that took no part: an evaluation's.
+            observation: an array, or dicts and tuples of arrays, with any leading axes:
+                ``[…, *obs]``.
         """
+        return self._normalised(self._normal, observation)
 
-        def found(path: str, leaf: NDArray[Any]) -> NDArray[np.float32]:
-            known = self._statistics.get(path)
-            return leaf.astype(np.float32) if known is None else _normal(leaf, *known.of(index))
-
-        return self._normalised(found, observation)
-
-    def scaled(self, reward: NDArray[Any], index: NDArray[np.int64] | None = None) -> NDArray[Any]:
-        """Rewards scaled by the present statistics; arguments as of `normalized`."""
+    def scaled(self, reward: NDArray[Any]) -> NDArray[Any]:
+        """Rewards of any shape, scaled by the present statistics, which don't change."""
         known = self._statistics.get(_RETURN)
         if not self._rewards or known is None:
             return reward
-        _, variance = known.of(index)
-        return np.clip(reward / np.sqrt(variance + _EPSILON), -_LIMIT, _LIMIT)
+        return np.clip(reward / np.sqrt(known.variance + _EPSILON), -_LIMIT, _LIMIT)
 
     # -- saving -------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """Copies of the statistics, as arrays by name."""
-        state = {"sums": self._sums, "starts": self._starts}
+        state = {"sums": self._sums}
         for path, statistics in self._statistics.items():
             for name in _SAVED:
                 state[f"{path}.{name}"] = getattr(statistics, name)
-        return {name: array.copy() for name, array in state.items()}
+        return {name: np.array(array) for name, array in state.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from what `state_dict` returned: arrays, or CPU tensors.
@@ -219,15 +188,13 @@ class Normalizer:
         Raises:
             KeyError: `state` lacks a part; nothing was changed.
         """
-        sums, starts = _copied(state["sums"]), _copied(state["starts"])
+        sums = _copied(state["sums"])
         found: dict[str, _Statistics] = {}
         for path in (name.removesuffix(".mean") for name in state if name.endswith(".mean")):
-            first = 1.0 if path == _RETURN else _FIRST_VARIANCE
-            mean = np.asarray(state[f"{path}.mean"])
-            found[path] = _Statistics(mean.shape[1:], first)
+            found[path] = _Statistics((), 1.0)
             for name in _SAVED:
                 setattr(found[path], name, _copied(state[f"{path}.{name}"]))
-        self._sums, self._starts, self._statistics = sums, starts, found
+        self._sums, self._statistics = sums, found
 
     # -- parts --------------------------------------------------------------------
 
@@ -244,26 +211,17 @@ class Normalizer:
         leaves = iter([found(path, leaf) for path, leaf in walked(observation)])
         return mapped(lambda _: next(leaves), observation)
 
-    def _of(self, path: str, shape: tuple[int, ...], first_variance: float) -> _Statistics:
-        if path not in self._statistics:
-            self._statistics[path] = _Statistics(shape, first_variance)
-        return self._statistics[path]
+    def _normal(self, path: str, values: NDArray[Any]) -> NDArray[np.float32]:
+        known = self._statistics.get(path)
+        if known is None:
+            return values.astype(np.float32)
+        found = (values - known.mean) / np.sqrt(known.variance + _EPSILON)
+        return np.clip(found.astype(np.float32), -_LIMIT, _LIMIT)
 
     def _make_room(self, index: NDArray[np.int64]) -> None:
         more = int(index.max(initial=-1)) + 1 - len(self._sums)
         if more > 0:
             self._sums = np.concatenate([self._sums, np.zeros(more)])
-            self._starts = np.concatenate([self._starts, np.ones(more, np.bool_)])
-
-
-_SAVED: Final = ("mean", "variance", "count")
-
-
-def _normal(
-    values: NDArray[Any], mean: NDArray[Any], variance: NDArray[Any]
-) -> NDArray[np.float32]:
-    found = (values - mean) / np.sqrt(variance + _EPSILON)
-    return np.clip(found.astype(np.float32), -_LIMIT, _LIMIT)
 
 
 def _copied(array: Any) -> NDArray[Any]:
