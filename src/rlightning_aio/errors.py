@@ -261,7 +261,11 @@ class EnvHung(WorkerDied):
 
 
 class EnvAway(EnvFault):
-    """The client of a remote env is not connected; it may come back."""
+    """The client of a remote env is not connected; it may come back.
+
+    An awaitable env whose step raises it has lost what it talks to, and so its episode: the env is
+    made anew, as a worker that has died is.
+    """
 
     _outcome = "env_away", "infrastructure"
 

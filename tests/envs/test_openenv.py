@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import asyncio
-import math
+import json
+import logging
 from functools import wraps
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from cli.command import invoke, start, write_config
 from envs.misbehaving_openenv import Misbehaving, numbers
 from gymnasium import spaces
 from patience import HANG
@@ -19,6 +21,9 @@ import rlightning_aio as rl
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.loop_thread import LoopThread
 from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerRefused
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 ENVS = 4
 
@@ -39,127 +44,81 @@ def steps_of(*env_ids: str) -> rl.BatchedData:
     return rl.BatchedData(list(env_ids), steps)
 
 
-async def until_free(server: Misbehaving) -> None:
-    while server.sessions:  # noqa: ASYNC110  # It has still to see the sockets close.
-        await asyncio.sleep(0.001)
-
-
 def entry(url: str, **fields: Any) -> dict[str, Any]:
     fields = {"num_workers": ENVS, "placement": "loop", **fields}
     return {"name": "o", "backend": "openenv", "task": url, **fields}
 
 
-@on_asyncio
-async def test_a_lost_socket_ends_the_episode_as_truncated() -> None:
-    """With the last observation, and the cause in the info; the next step begins a new episode."""
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-        group.auto_reset(math.inf),
-    ):
-        batch, _ = await group.reset()
-        batch, _ = await group.step(batch.respond(action=[{"number": next(numbers)}]))
-        before = batch.observation
-        server.fates.append("lost after")
-        batch, _ = await group.step(batch.respond(action=[{"number": next(numbers)}]))
-        assert batch.truncated.all()
-        assert batch.observation == before
-        assert server.url in batch.info("session_lost")[0]
-        batch, _ = await group.step(batch.respond(action=[{"number": 0}]))
-        assert batch.is_reset.all()
-
-
-def kept(server: Misbehaving, **fields: Any) -> dict[str, Any]:
-    return entry(server.url, num_workers=1, env_kwargs={"session": "keep"}, **fields)
-
-
 @pytest.mark.parametrize("fate", ["idle loss", "lost before", "lost after", "restart"])
-def test_a_kept_session_repeats_no_action_that_may_have_run(fate: str) -> None:
-    """The step after a lost socket continues if the server can say that the action has not run."""
+def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
+    """The step is answered by the first result of a new episode; its action is not sent again."""
     asyncio.run(_lose(fate))
 
 
 async def _lose(fate: str) -> None:
-    async with Misbehaving(capacity=1) as server:
-        async with rl.build_env_group(kept(server)) as group:
-            await group.reset()
-            (session,) = server.sessions.values()
-            await group.step(steps_of("o-0"))
-            server.fates.append(fate)
-            batch, _ = await group.step(steps_of("o-0"))
-            if fate == "idle loss":
-                batch, _ = await group.step(steps_of("o-0"))
-            assert batch.truncated.all() == (fate in ("lost after", "restart"))
-            assert set(server.executed.values()) == {1}
-            assert len(server.executed) == 3 if fate == "idle loss" else 2
-            await group.reset()
-            assert (session in server.sessions.values()) == (fate != "restart")
-        assert not server.sessions
-
-
-@on_asyncio
-async def test_an_action_goes_only_to_its_own_session() -> None:
-    """The server has forgotten the session before the first step."""
-    async with Misbehaving(capacity=1) as server, rl.build_env_group(kept(server)) as group:
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
         await group.reset()
-        server.restart()
+        await group.step(steps_of("o-0"))
+        server.fates.append(fate)
         batch, _ = await group.step(steps_of("o-0"))
-        assert batch.truncated.all()
-        assert not server.executed
+        if fate == "idle loss":
+            assert not batch.restarted.any()
+            while server.sockets:  # noqa: ASYNC110  # The client has still to see it close.
+                await asyncio.sleep(0.001)
+            batch, _ = await group.step(steps_of("o-0"))
+        assert (batch.is_reset & batch.restarted & batch.truncated).all()
+        assert batch.reward.tolist() == [0.0]
+        assert batch.observation[0]["count"] == 0
+        (outcome,) = batch.outcome
+        assert (outcome.kind, outcome.blame) == ("env_away", "infrastructure")
+        assert server.url in outcome.cause
+        assert set(server.executed.values()) == {1}
+        batch, _ = await group.step(steps_of("o-0"))
+        assert batch.observation[0]["count"] == 1
+        assert not batch.truncated.any()
 
 
 @on_asyncio
-async def test_a_session_that_comes_too_late_is_closed() -> None:
-    """Its env was closed while the server was creating it."""
-    async with Misbehaving(capacity=1) as server:
-        server.may_create.clear()
-        group = rl.build_env_group(kept(server))
-        await group.init()
-        resetting = asyncio.create_task(group.reset())
-        await server.creating.wait()
-        resetting.cancel()
-        closing = asyncio.create_task(group.close())
-        await asyncio.wait({resetting})
-        server.may_create.set()
-        await closing
-        await until_free(server)
-        assert server.most == 1
-
-
-@on_asyncio
-async def test_a_session_is_closed_even_if_nobody_waits_for_it() -> None:
-    async with Misbehaving(capacity=1) as server:
-        session = OpenEnvSession(server.url, keep=True)
-        await session.open({"type": "state"})
-        closing = asyncio.create_task(session.close())
-        await asyncio.sleep(0)
-        closing.cancel()
-        await until_free(server)
-
-
-@on_asyncio
-async def test_sessions_are_closed_even_if_another_server_is_dead() -> None:
-    async with Misbehaving(capacity=1) as lasting:
-        async with Misbehaving(capacity=1) as dying:
-            config = kept(dying)
-            config["env_kwargs"] |= {"urls": [lasting.url]}
-            group = rl.build_env_group(config)
-            await group.init()
-            await group.reset()
+async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_again() -> None:
+    """As workers that die do."""
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1, max_restarts=1)) as group,
+    ):
         await group.reset()
-        assert len(lasting.sessions) == 1
-        with pytest.warns(UserWarning, match="can't be reached"):
-            await group.close()
-        assert not lasting.sessions
+        server.fates.extend(["lost after", "ok", "lost after"])
+        batch, _ = await group.step(steps_of("o-0"))
+        assert batch.restarted.all()
+        with pytest.raises(rl.EnvAway, match=f"lost its session: {server.url}.*max_restarts"):
+            await group.step(steps_of("o-0"))
+        batch, _ = await group.step(steps_of("o-0"))
+        assert batch.restarted.all()
+        batch, _ = await group.step(steps_of("o-0"))
+        assert not batch.restarted.any()
+
+
+@on_asyncio
+async def test_a_call_of_a_lost_session_is_an_error() -> None:
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
+        await group.reset()
+        assert (await group["o-0"].call("state"))["step_count"] == 0
+        server.fates.append("lost before")
+        with pytest.raises(rl.EnvRaised, match=f"{server.url} was lost"):
+            await group["o-0"].call("state")
 
 
 @on_asyncio
 async def test_a_refusal_is_read_even_if_the_socket_is_closed() -> None:
     async with Misbehaving(capacity=0) as server:
-        session = OpenEnvSession(server.url, keep=False)
-        await session._connect(may_create=True)
-        assert session._socket is not None
-        await session._socket._socket.wait_closed()
+        session = OpenEnvSession(server.url)
+        session._socket = await session._connected()
+        await session._socket.wait_closed()
         with pytest.raises(ServerRefused, match="CAPACITY_REACHED"):
             await session.ask({"type": "state"})
 
@@ -184,9 +143,9 @@ async def test_sessions_outlive_a_learner_that_holds_the_event_loop() -> None:
     """They are in one worker by default, which answers the pings of their servers meanwhile."""
 
     async def ping_all() -> int:
-        for socket in [*server._sockets]:
-            await socket.ping()
-        return len(server._sockets)
+        for socket in [*server.sockets]:
+            await (await socket.ping())
+        return len(server.sockets)
 
     thread, server = LoopThread("server"), Misbehaving(capacity=ENVS)
     thread.submit(server.__aenter__()).result()
@@ -213,13 +172,63 @@ async def test_envs_of_a_dead_server_move_to_another() -> None:
             await group.init()
             await group.reset()
             assert len(dying.sessions) == len(lasting.sessions) == 2
-        with group.auto_reset(math.inf):
-            batch, _ = await group.step(steps_of(*group.env_ids))
-            for _ in range(2):
-                batch, _ = await group.step(steps_of(*group.env_ids))
-        assert not batch.truncated.any()
+        batch, _ = await group.step(steps_of(*group.env_ids))
+        assert batch.restarted.tolist() == [True, False, True, False]
+        batch, _ = await group.step(steps_of(*group.env_ids))
+        assert not batch.restarted.any()
         assert len(lasting.sessions) == ENVS
         await group.close()
+
+
+KEY = "Bearer tell-nobody"
+
+
+def test_a_private_server_gets_headers_that_no_log_has(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    """Both over WebSockets and over HTTP; without them it refuses, and is named."""
+    with caplog.at_level(logging.DEBUG):
+        asyncio.run(_use_private(tmp_path))
+    assert KEY not in caplog.text
+    # They hold connections, and so the frames of the error that has ended one, and its env.
+    caplog.clear()
+
+
+async def _use_private(folder: Path) -> None:
+    async with Misbehaving(capacity=2, authorization=KEY) as server:
+        config = entry(server.url, num_workers=2)
+        config["env_kwargs"] = {"headers": {"Authorization": KEY}}
+        async with rl.build_env_group(config) as group:
+            await group.reset()
+            batch, _ = await group.step(steps_of(*group.env_ids))
+            assert batch.reward.tolist() == [1, 1]
+        with start("check", write_config(folder, config), "--json") as check:
+            printed, complaints = await asyncio.to_thread(check.communicate)
+        offers = json.loads(printed)["entries"][0]["offers"]
+        assert offers["schema"]["path"] == "/schema"
+        assert offers["metadata"]["name"] == "misbehaving"
+        assert KEY not in printed + complaints
+        config["env_kwargs"] = {"connect_timeout": 0.01}
+        async with rl.build_env_group(config) as group:
+            with pytest.raises(rl.EnvRaised, match=f"{server.url} can't be reached: .*401"):
+                await group.reset()
+
+
+@pytest.mark.parametrize("headers", [{"A b": KEY}, {"Authorization": f"{KEY}\r\nX: 1"}], ids=str)
+def test_headers_that_can_not_be_sent_are_refused(headers: dict[str, str]) -> None:
+    """The error names the header and not its value."""
+    config = entry("http://127.0.0.1:1", env_kwargs={"headers": headers})
+    with pytest.raises(rl.ConfigError, match=r"headers: .*header") as failed:
+        asyncio.run(rl.build_env_group(config).init())
+    assert next(iter(headers)) in str(failed.value)
+    assert KEY not in str(failed.value)
+
+
+def test_a_server_that_is_not_there_is_named_by_check(tmp_path: Path) -> None:
+    url = "http://127.0.0.1:1"
+    done = invoke("check", write_config(tmp_path, entry(url)))
+    assert done.exit_code == 2
+    assert url in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -228,7 +237,6 @@ async def test_envs_of_a_dead_server_move_to_another() -> None:
         ({"columns": {"a": {"shap": [3]}}}, "columns.a"),
         ({"columns": {"a": 5}, "observation_field": "b"}, "exclude each other"),
         ({"url": "x"}, "Known fields: urls"),
-        ({"session": "kept"}, "session"),
     ],
     ids=str,
 )

@@ -84,12 +84,12 @@ class Machine(RuleBasedStateMachine):
 
     steps = sent = executed = 0
 
-    @initialize(session=st.sampled_from(["own", "keep"]), loses_pongs=st.booleans())
-    def begin(self, session: str, *, loses_pongs: bool) -> None:
+    @initialize(loses_pongs=st.booleans())
+    def begin(self, *, loses_pongs: bool) -> None:
         self.runner = asyncio.Runner()
         self.asked: dict[str, int] = {}
         self.raised: set[str] = set()
-        self.run(self._begin(session, loses_pongs=loses_pongs))
+        self.run(self._begin(loses_pongs=loses_pongs))
 
     @invariant()
     def count(self) -> None:
@@ -98,13 +98,13 @@ class Machine(RuleBasedStateMachine):
     def run(self, coroutine: Any) -> Any:
         return self.runner.run(asyncio.wait_for(coroutine, HANG))
 
-    async def _begin(self, session: str, *, loses_pongs: bool) -> None:
+    async def _begin(self, *, loses_pongs: bool) -> None:
         self.server = await Misbehaving(ENVS).__aenter__()
         self.server.loses_pongs = loses_pongs
         self.server.on_never = self._give_up_on
         entry = {"name": "o", "backend": "openenv", "task": self.server.url, "num_workers": ENVS}
         entry |= {"placement": "loop", "step_timeout": HANG, "max_restarts": 10**6}
-        self.group = rl.build_env_group({**entry, "env_kwargs": {"session": session}})
+        self.group = rl.build_env_group(entry)
         await self.group.init()
         self.patience = Patience.made.pop()
         self.resetting = self.group.auto_reset(math.inf)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import random
@@ -61,7 +60,7 @@ CUT = {"truncated_field": "late", "columns": {"total": 1000}}
 
 @pytest.mark.parametrize("kind", ["dice", "echo", "tools"])
 def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
-    """Observations, rewards, ends and metadata, over 64 sessions of both sorts."""
+    """Observations, rewards, ends and metadata, over 64 sessions, here and in a worker."""
     episodes = int(os.environ.get("RLIGHTNING_AIO_EPISODES", "2"))
     command = [*OPENENV, "direct", kind, "64", str(episodes)]
     with (
@@ -69,8 +68,8 @@ def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
         subprocess.Popen(command, stdout=subprocess.PIPE, env=AS_USUAL) as direct,
     ):
         found = [
-            asyncio.run(play(kind, url, session, placement, 64, episodes), debug=False)
-            for session, placement in (("own", "loop"), ("keep", "process"))
+            asyncio.run(play(kind, url, placement, 64, episodes), debug=False)
+            for placement in ("loop", "process")
         ]
         assert direct.stdout is not None
         expected = json.load(direct.stdout)
@@ -79,10 +78,10 @@ def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
 
 
 async def play(
-    kind: str, url: str, session: str, placement: str, count: int, episodes: int
+    kind: str, url: str, placement: str, count: int, episodes: int
 ) -> list[list[list[Any]]]:
     """Rows of observation, reward, done and metadata: of each session, each episode."""
-    kwargs = {"session": session, **(CUT if kind == "dice" else {})}
+    kwargs = CUT if kind == "dice" else {}
     entry = {"name": "d", "backend": "openenv", "task": url, "num_workers": count}
     entry |= {"placement": placement, "env_kwargs": kwargs, "close_timeout": HANG}
     played: list[list[list[Any]]] = [[] for _ in range(count)]
@@ -119,17 +118,13 @@ def rows_of(batch: Any) -> list[list[Any]]:
     return rows
 
 
-@pytest.mark.parametrize("session", ["own", "keep"])
-def test_attempts_over_servers_of_openenv(session: str) -> None:
+def test_attempts_over_servers_of_openenv() -> None:
     """Some are cut off in a step that never ends; later one of the two servers is killed."""
     with served("dice", 64) as (first, process), served("dice", 64) as (second, _):
-        kwargs = {"session": session, "truncated_field": "late", "urls": [second]}
+        kwargs = {"truncated_field": "late", "urls": [second]}
         fields = {"backend": "openenv", "env_kwargs": kwargs, "placement": "loop"}
         entry = {"name": "dice", "task": first, "num_workers": 8, **fields}
-        # A kept session can't be closed at a server that is gone.
-        warned = pytest.warns(UserWarning, match="can't be reached")
-        with warned if session == "keep" else contextlib.nullcontext():
-            cut, killed = asyncio.run(attempts_over(entry, process), debug=False)
+        cut, killed = asyncio.run(attempts_over(entry, process), debug=False)
     for found in cut:
         kinds = [attempt.outcome.kind for attempt in found]
         assert kinds == ["cancelled", "terminated", "terminated"]

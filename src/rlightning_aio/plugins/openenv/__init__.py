@@ -1,1 +1,1 @@
-"""Envs of an OpenEnv server: the env, its WebSocket session, and headers that no log shows."""
+"""Envs of an OpenEnv server: the env, and its session over a WebSocket."""

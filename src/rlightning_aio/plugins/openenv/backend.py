@@ -1,4 +1,4 @@
-"""The description of the backend ``openenv``, which the trainer reads without aiohttp."""
+"""The description of the backend ``openenv``, which the trainer reads without websockets."""
 
 from __future__ import annotations
 

@@ -1,32 +1,29 @@
 """`openenv`: sessions of OpenEnv servers as awaitable envs.
 
 Each env is one session. A reset begins an episode in it, over a new connection if the old one is
-lost, and on another server if its own is gone. A step whose connection is lost ends the episode as
-truncated, for its action may have taken effect: no action is ever sent twice.
+lost, and on another server if its own is gone. A step whose connection is lost has lost its env, as
+a worker that dies has: its action may have taken effect, so no action is ever sent twice.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 import uuid
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 from gymnasium import spaces
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from rlightning_aio import Anything, BaseEnv, EnvRet, Outcome
+from rlightning_aio import Anything, BaseEnv, EnvAway, EnvRet
 from rlightning_aio.envs.options import read_options
 from rlightning_aio.errors import BadAction, ConfigError
-from rlightning_aio.plugins.one_frame import check_headers
 from rlightning_aio.plugins.openenv.session import (
     OpenEnvSession,
     ServerGone,
-    ServerRefused,
+    check_headers,
     get_json,
     pauses,
 )
@@ -58,8 +55,6 @@ class OpenEnvOptions(BaseModel):
     """Field of the metadata or the observation that says that a done episode was only cut."""
     reset: dict[str, Any] = Field(default_factory=dict)
     """Arguments that are sent with each reset."""
-    session: Literal["own", "keep"] = "own"
-    """``keep``: the session survives a lost socket."""
     connect_timeout: float = Field(default=60.0, gt=0)
     """Seconds that a reset waits for a server that can be reached."""
     headers: dict[str, str] = Field(default_factory=dict, repr=False)
@@ -114,21 +109,12 @@ class OpenEnv(BaseEnv):
         self._columns = {
             name: _space_of(self.env_id, name, given) for name, given in options.columns.items()
         }
-        keep = options.session == "keep"
-        self._servers = [
-            OpenEnvSession(url, keep=keep, headers=options.headers)
-            for url in (config.task_name, *options.urls)
-        ]
-        self._server = worker_index % len(self._servers)
-        self._last: Any = None
-        # Of this episode; steps that were answered, and whether the server counts them as well.
-        self._episode_id: Any = None
-        self._steps = 0
-        self._is_counted: bool | None = None
+        self._urls = (config.task_name, *options.urls)
+        self._url = worker_index % len(self._urls)
+        self._session = self._new_session()
 
-    @property
-    def _session(self) -> OpenEnvSession:
-        return self._servers[self._server]
+    def _new_session(self) -> OpenEnvSession:
+        return OpenEnvSession(self._urls[self._url], self._options.headers)
 
     def get_observation_space(self) -> gym.Space[Any]:
         """A value for each row, or columns with the ``rest``."""
@@ -157,8 +143,8 @@ class OpenEnv(BaseEnv):
         if seed is not None:
             arguments["seed"] = seed
         data = await self._first_reply({"type": "reset", "data": arguments})
-        self._episode_id, self._steps = arguments["episode_id"], 0
-        return self._result(self._read(data))
+        observation, info = self._read(data)
+        return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
     async def _first_reply(self, message: dict[str, Any]) -> dict[str, Any]:
         """Ask this server, or else the first that can be reached again."""
@@ -170,10 +156,11 @@ class OpenEnv(BaseEnv):
             except ServerGone:
                 failures += 1
                 if failures > 1:  # At first only the socket may be lost.
-                    self._server = (self._server + 1) % len(self._servers)
+                    self._url = (self._url + 1) % len(self._urls)
+                    self._session = self._new_session()
                 if time.monotonic() > give_up_at:
                     raise
-            if failures > len(self._servers):
+            if failures > len(self._urls):
                 await asyncio.sleep(next(pause))
 
     async def step(self, policy_resp: PolicyResponse) -> EnvRet:
@@ -181,6 +168,7 @@ class OpenEnv(BaseEnv):
 
         Raises:
             BadAction: the action is no dict.
+            EnvAway: the session is lost.
             ServerRefused: the server's environment has raised, or does not know the action.
         """
         action = self._preprocess_fn(policy_resp)
@@ -190,93 +178,48 @@ class OpenEnv(BaseEnv):
             raise BadAction(
                 f"an action of env {self.env_id!r} is a dict of its fields, not {action!r}"
             )
-        message = {"type": "step", "data": _plain(action)}
         try:
-            data = await self._ask(message)
+            data = await self._session.ask({"type": "step", "data": _plain(action)})
         except ServerGone as gone:
-            repeated = await self._repeated(message)
-            if repeated is None:
-                away = Outcome("env_away", "infrastructure", str(gone), self.env_id)
-                info = {"session_lost": str(gone), "outcome": away}
-                return self._result(info, last_truncated=True)
-            data = repeated
-        self._steps += 1
-        if self._options.session == "keep" and self._is_counted is None:
-            self._is_counted = await self._has_executed(self._steps)
+            raise EnvAway(f"lost its session: {gone}", env_id=self.env_id) from gone
+        observation, info = self._read(data)
         done = bool(data.get("done"))
-        info = self._read(data)
         cut = done and self._is_cut(data, info)
-        return self._result(
-            info,
+        return EnvRet(
+            env_id=self.env_id,
+            observation=observation,
             last_reward=float(data.get("reward") or 0.0),
             last_terminated=done and not cut,
             last_truncated=cut,
+            info=info,
         )
 
-    async def _ask(self, message: dict[str, Any]) -> dict[str, Any]:
-        """Ask on the open socket, or on a new one of a kept session if that was lost before."""
-        try:
-            return await self._session.ask(message)
-        except ServerGone as gone:
-            if self._options.session != "keep" or not gone.is_unsent:
-                raise
-            return await self._session.open(message, may_create=False)
-
-    async def _repeated(self, message: dict[str, Any]) -> dict[str, Any] | None:
-        """Send an action again whose socket was lost, if the server says that it has not run."""
-        if self._options.session != "keep" or not self._is_counted:
-            return None
-        try:
-            if await self._has_executed(self._steps):
-                return await self._session.open(message, may_create=False)
-        except ServerGone:
-            pass
-        return None
-
-    async def _has_executed(self, steps: int) -> bool | None:
-        """Ask if the episode goes on and has had so many steps; None if the server is gone."""
-        try:
-            state = await self._session.open({"type": "state"}, may_create=False)
-        except ServerGone:
-            return None
-        except ServerRefused:
-            return False
-        is_same = state.get("episode_id") in (None, self._episode_id)
-        return is_same and state.get("step_count") == steps
-
-    def _read(self, data: dict[str, Any]) -> dict[str, Any]:
-        """Keep the observation; returns the info."""
+    def _read(self, data: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Return the observation and the info."""
         fields: dict[str, Any] = dict(data.get("observation") or {})
         inner = fields.pop("metadata", None)
         info: dict[str, Any] = dict(data.get("metadata") or inner or {})
-        with contextlib.suppress(TypeError, ValueError, KeyError):  # Other servers' is no outcome.
-            info["outcome"] = replace(Outcome.from_json(info["outcome"]), env_id=self.env_id)
         if self._columns:
             columns = {
                 name: _value_in(space, fields.pop(name)) for name, space in self._columns.items()
             }
-            self._last = {**columns, "rest": fields}
-        else:
-            field = self._options.observation_field
-            self._last = fields if field is None else fields[field]
-        return info
+            return {**columns, "rest": fields}, info
+        field = self._options.observation_field
+        return (fields if field is None else fields[field]), info
 
     def _is_cut(self, data: dict[str, Any], info: dict[str, Any]) -> bool:
         field = self._options.truncated_field
         observation: dict[str, Any] = data.get("observation") or {}
         return field is not None and bool(info.get(field, observation.get(field)))
 
-    def _result(self, info: dict[str, Any], **fields: Any) -> EnvRet:
-        return EnvRet(env_id=self.env_id, observation=self._last, info=info, **fields)
-
     async def state(self) -> dict[str, Any]:
         """The server's state of the session, such as ``step_count``."""
-        return await self._ask({"type": "state"})
+        return await self._session.ask({"type": "state"})
 
     async def mcp(self, method: str, params: dict[str, Any] | None = None) -> Any:
         """Call a method of the environment's MCP server, such as ``tools/list``."""
         request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params or {}}
-        return await self._ask({"type": "mcp", "data": request})
+        return await self._session.ask({"type": "mcp", "data": request})
 
     def save_state(self) -> Any:
         """Refuse: a session is at its server, which can't copy it.
@@ -288,10 +231,7 @@ class OpenEnv(BaseEnv):
 
     async def close(self) -> None:
         """Close the session, and give its slot at the server back."""
-        closing = (session.close() for session in self._servers)
-        for error in await asyncio.gather(*closing, return_exceptions=True):
-            if error is not None:
-                raise error
+        await self._session.close()
 
 
 def _space_of(env_id: str, name: str, given: Any) -> gym.Space[Any]:

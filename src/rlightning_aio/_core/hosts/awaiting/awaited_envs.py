@@ -2,7 +2,8 @@
 
 The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each env has
 a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
-is then closed, rebuilt and reset, and that result answers the request, marked as a restart.
+is then closed, rebuilt and reset, and that result answers the request, marked as a restart. So it
+is if a step raises `EnvAway`: the env has lost what it talks to.
 Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
 Left out: how requests and completions travel.
 """
@@ -41,7 +42,7 @@ from rlightning_aio._core.hosts.messages import ErrorText, Faulted, Lost, NotBui
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
-from rlightning_aio.errors import EnvHung, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvFault, EnvHung, WorkerDied
 from rlightning_aio.outcomes import Loss, Outcome
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
@@ -90,7 +91,7 @@ class _EnvRecord:
         self.lost = _CANCELLED
         self.leaving: asyncio.Task[None] | None = None
         self.rebuilding: asyncio.Task[None] | None = None
-        self.fault: WorkerDied | None = None
+        self.fault: EnvFault | None = None
 
     @property
     def name(self) -> str:
@@ -295,8 +296,14 @@ class AwaitedEnvs:
         self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
     ) -> None:
         record = self._records[env.index]
-        if error is None and op_of(entry) == Operation.STEP:
-            record.losses = 0
+        if op_of(entry) == Operation.STEP:
+            if isinstance(error, EnvAway) and not self._ending:
+                why = Loss(str(error), "env_away", "infrastructure", record.name)
+                self._put_away(record, env, why)
+                self._rebuild(record, f"env {record.name!r} {error}", EnvAway)
+                return
+            if error is None:
+                record.losses = 0
         completion = completion_of(self._host_id, env.runner, entry, outcome, error)
         self._finish(record, completion, by=env)
 
@@ -426,18 +433,21 @@ class AwaitedEnvs:
         task.add_done_callback(self._tasks.discard)
         return task
 
-    def _rebuild(self, record: _EnvRecord, message: str = "") -> None:
+    def _rebuild(
+        self, record: _EnvRecord, message: str = "", kind: type[EnvFault] = EnvHung
+    ) -> None:
         """Make another env, which answers the request; see `_rebuilt`."""
-        record.rebuilding = self._spawn(self._rebuilt(record, message))
+        record.rebuilding = self._spawn(self._rebuilt(record, message, kind))
 
-    async def _rebuilt(self, record: _EnvRecord, message: str) -> None:
+    async def _rebuilt(self, record: _EnvRecord, message: str, kind: type[EnvFault]) -> None:
         """Build another env. A step, and what the env before was lost in, is answered by its reset.
 
         Args:
             record: without an env, and with a request.
             message: why the env was lost that has executed the request; empty if it was idle.
+            kind: of the error if that was one loss too many.
         """
-        entry, kind = record.entry, EnvHung
+        entry = record.entry
         is_reset = bool(message) or op_of(entry) == Operation.STEP
         while True:
             if message:
@@ -491,7 +501,7 @@ class AwaitedEnvs:
         out_of_band = found.out_of_band if isinstance(found, Result) else {}
         return Result(self._host_id, entry, out_of_band, restarted=why)
 
-    def _counted(self, record: _EnvRecord, kind: type[WorkerDied], message: str) -> Faulted | None:
+    def _counted(self, record: _EnvRecord, kind: type[EnvFault], message: str) -> Faulted | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         record.losses += 1
         is_borne, then = self._restarts.count(record.losses, self._loop.time())
@@ -502,11 +512,12 @@ class AwaitedEnvs:
         if not for_good:
             then += ", so this request ends here; the next one tries again"
         fault = kind(f"{message}; {then}", env_id=record.name)
-        if kind is EnvHung:
-            fault.outcome = record.lost.outcome(record.name)
-        else:
+        if isinstance(fault, WorkerDied):
+            fault.env_ids = (record.name,)
+        if kind is WorkerDied:
             fault.outcome = Outcome("not_started", "env", message, record.name)
-        fault.env_ids = (record.name,)
+        else:
+            fault.outcome = record.lost.outcome(record.name)
         if for_good:
             record.fault = fault
         return Faulted(self._host_id, record.entry, fault, for_good)
