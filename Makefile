@@ -60,7 +60,6 @@ test-newest: | $(NEWEST)/bin/python ## all of these tests, with the newest versi
 
 # SEEDS=1000 programs from FIRST=0 on; SEED=7 replays one; REAL=1 uses real processes.
 simulate: export PYTHONPATH := tests
-simulate: export RLIGHTNING_AIO_DEBUG := 1
 simulate: $(VENV)/installed-test ## random programs in a simulated world, compared with a model: SEEDS=1000, SEED=n, REAL=1
 	$(PY) -m simulator --seeds $(or $(SEEDS),1000) --first $(or $(FIRST),0) $(SEED:%=--seed %) $(REAL:1=--real)
 

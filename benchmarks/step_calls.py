@@ -236,7 +236,8 @@ def step_and_collect_async() -> Calls:
 
 def vector_step() -> Calls:
     """Count `VectorEnv.step`."""
-    env = VectorEnv([lambda: gym.make("CartPole-v1")] * NUM_ENVS)
+    makers = [lambda: gym.make("CartPole-v1")] * NUM_ENVS
+    env = VectorEnv(makers, envs_per_process=NUM_ENVS // 2)
     env.reset(seed=0)
     actions = np.zeros(NUM_ENVS, np.int64)
     try:

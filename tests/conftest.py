@@ -25,6 +25,7 @@ import pytest
 import pytest_asyncio
 import uvloop
 from hypothesis import HealthCheck, settings
+from kit import checked
 
 from rlightning_aio.registry import BACKENDS
 
@@ -52,8 +53,8 @@ def _where(frames: Any, *, limit: int | None = None, **options: Any) -> tracebac
 
 traceback.StackSummary.extract = _where
 
-# Every group that a test builds checks what happens to its requests: `group/state/checked.py`.
-os.environ["RLIGHTNING_AIO_DEBUG"] = "1"
+# Every group that a test builds checks what happens to its requests.
+checked.install()
 
 # A group continues with the fork server of the one before only if the environment is the same, and
 # pytest would write the name of each test there.

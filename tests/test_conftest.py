@@ -70,7 +70,8 @@ def test_leftovers_of_a_test_fail_it(pytester: pytest.Pytester) -> None:
     """A process, a zombie, a descriptor, shared memory and a task are each an error."""
     pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text() + CLEAN_UP)
     pytester.makepyfile(test_leaks=LEAKS)
-    pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope=function")
+    options = "asyncio_mode = auto\nasyncio_default_fixture_loop_scope=function"
+    pytester.makeini(f"[pytest]\n{options}\npythonpath = {Path(__file__).parent}")
     result = pytester.runpytest_subprocess("-q")
     result.assert_outcomes(passed=10, errors=6)
     output = result.stdout.str()

@@ -31,7 +31,7 @@ MOST = {
 def test_a_step_makes_few_calls() -> None:
     """The counts are exact, so a step that passes by one more object is noticed here."""
     command = [sys.executable, str(SCRIPT), "--json"]
-    # The debug modes that tests run in, asyncio's and ours, make calls of their own.
+    # The debug mode of asyncio, in which tests run, makes calls of its own.
     surroundings = {name: value for name, value in os.environ.items() if "DEBUG" not in name}
     ended = subprocess.run(command, capture_output=True, check=True, text=True, env=surroundings)
     found = json.loads(ended.stdout)

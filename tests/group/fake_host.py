@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from gymnasium import spaces
+from kit.checked import CheckedRequests
 
 from rlightning_aio._core.group.drivers.wait import Parked
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
-from rlightning_aio._core.group.state.checked import CheckedRequests
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.slab_layout import SlabLayout

@@ -7,15 +7,12 @@ events of several hosts lead to, random programs show (`tests/simulator`).
 from __future__ import annotations
 
 import itertools
-import os
-import subprocess
-import sys
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pytest
+from kit.checked import CheckedRequests
 
-from rlightning_aio._core.group.state.checked import CheckedRequests
 from rlightning_aio._core.group.state.request_states import (
     COLLECTOR,
     LEGAL,
@@ -333,7 +330,9 @@ def test_results_that_came_first_are_taken_first() -> None:
     ],
     ids=named,
 )
-def test_the_debug_mode_refuses_an_illegal_event(state: State, owner: Owner, event: Event) -> None:
+def test_the_checked_table_refuses_an_illegal_event(
+    state: State, owner: Owner, event: Event
+) -> None:
     """The error names the event, the slot and its state, and nothing has changed."""
     table = brought_to(state, owner).table
     slots = table.alone(SLOT)
@@ -350,25 +349,9 @@ def test_the_debug_mode_refuses_an_illegal_event(state: State, owner: Owner, eve
     assert (State(table.state.item(SLOT)), kind_of(table.owner.item(SLOT))) == (state, owner)
 
 
-def test_the_debug_mode_refuses_a_change_without_an_event() -> None:
+def test_the_checked_table_refuses_a_change_without_an_event() -> None:
     """Whatever writes to the table must say what happened."""
     table = brought_to(State.BUSY, Owner.COLLECTOR).table
     table.state[SLOT] = State.IDLE
     with pytest.raises(RuntimeError, match=f"slot {SLOT} became IDLE for COLLECTOR without"):
         table.withdraw(SLOT)
-
-
-@pytest.mark.parametrize(("value", "checked"), [("1", True), ("", False)])
-def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bool) -> None:
-    """A group has the checked table, or the other."""
-    variables = {**os.environ, "RLIGHTNING_AIO_DEBUG": value}
-    program = (
-        "from rlightning_aio.sync import build_env_group\n"
-        "group = build_env_group({'name': 'pole', 'backend': 'gymnasium',"
-        " 'task': 'CartPole-v1', 'placement': 'inline'})\n"
-        "print(type(group._core.requests).__name__)\n"
-        "group.close()\n"
-    )
-    command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, capture_output=True, check=True, text=True, env=variables)
-    assert ended.stdout.split() == ["CheckedRequests" if checked else "Requests"]

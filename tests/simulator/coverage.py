@@ -10,11 +10,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from kit.checked import CheckedRequests
 from simulator.program import OPS
 
 from rlightning_aio import errors
 from rlightning_aio._core.group.episodes import continuity
-from rlightning_aio._core.group.state import checked
 from rlightning_aio._core.group.state.request_states import LEGAL, Owner, State
 
 if TYPE_CHECKING:
@@ -84,8 +84,8 @@ def row_key(row: str) -> str:
 
 
 def watch(counts: Counter[str]) -> None:
-    """Count each transition from now on; requests only in the debug mode."""
-    original, owners = checked.CheckedRequests.changes, list(Owner)
+    """Count each transition from now on."""
+    original, owners = CheckedRequests.changes, list(Owner)
 
     def changes(self: Any, *events: Any) -> Any:
         if not self._is_changing:
@@ -95,7 +95,7 @@ def watch(counts: Counter[str]) -> None:
                     counts[f"request {State(state).name} {owners[owner].name} {event.name}"] += 1
         return original(self, *events)
 
-    checked.CheckedRequests.changes = changes  # type: ignore[method-assign]
+    CheckedRequests.changes = changes  # type: ignore[method-assign]
 
     class Counting(dict[Any, Any]):
         def get(self, key: Any, default: Any = None) -> Any:

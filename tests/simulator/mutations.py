@@ -90,7 +90,7 @@ def search_apart(mutation: Mutation, source: Path, first: int, most: int) -> tup
     words = [str(word) for word in ("--search", first, "--most", most, "--only", mutation.name)]
     done = subprocess.run(
         [sys.executable, "-m", "simulator.mutations", *words],
-        env=os.environ | {"PYTHONPATH": path, "RLIGHTNING_AIO_DEBUG": "1"},
+        env=os.environ | {"PYTHONPATH": path},
         stdout=subprocess.PIPE, text=True, check=True,
     )  # fmt: skip
     seed, _, how = done.stdout.strip().partition(" ")

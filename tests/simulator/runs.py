@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from kit import checked
 from simulator.attempting import Attempts
 from simulator.coverage import watch
 from simulator.play import Play
@@ -105,6 +106,7 @@ def prepare() -> None:
     """Make a process ready for many runs."""
     # Envs press Ctrl-C, also where it is ignored: in the background of a shell.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    checked.install()
     watch(transitions)
     logging.getLogger("rlightning_aio").setLevel(logging.CRITICAL)
     gc.collect()

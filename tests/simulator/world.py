@@ -51,7 +51,6 @@ from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, WakeUp, run_in_process
 
 from rlightning_aio import sharing
-from rlightning_aio._core.group.engine import results
 from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import overdue
 from rlightning_aio._core.hosts import inbox
@@ -218,7 +217,6 @@ class World:
             # A call that would wait for ever must be found to.
             (overdue, "OWED_SECONDS", math.inf),
             # So that steps are ordinary sooner.
-            (results, "_NUM_CHECKED", 1),
             (
                 rays.MODULES["rlightning_aio._core.hosts.ray.cluster"],
                 "ray",

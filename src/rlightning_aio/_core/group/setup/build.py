@@ -12,7 +12,6 @@ from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.setup.plan import host_class, placement_for
 from rlightning_aio._core.group.setup.start_orders import start_orders
-from rlightning_aio._core.group.state.checked import DEBUG, CheckedRequests
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.requests import Requests
@@ -111,7 +110,7 @@ def _tables(
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)
-    requests = (CheckedRequests if DEBUG else Requests)(hosts, len(orders), conditions)
+    requests = Requests(hosts, len(orders), conditions)
     return Tables(
         envs=envs,
         requests=requests,

@@ -1,19 +1,18 @@
-"""The debug mode: each change of a request's state is checked against the table `LEGAL`.
+"""`CheckedRequests`: each change of a request's state is checked against the table `LEGAL`.
 
-`CheckedRequests` replaces `Requests` if the environment variable `RLIGHTNING_AIO_DEBUG` is 1 when
-this module is imported. It applies each event to a copy of the table by `LEGAL`, and compares the
-two. So it refuses an event that can't happen, a change that the event doesn't make, and a change
-without an event. Without the variable, nothing here is called.
+It applies each event to a copy of the table by `LEGAL`, and compares the two. So it refuses an
+event that can't happen, a change that the event doesn't make, and a change without an event.
+`install` has all groups of this process use it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from rlightning_aio._core.group.setup import build
 from rlightning_aio._core.group.state.request_states import COLLECTOR, LEGAL, Event, Owner, State
 from rlightning_aio._core.group.state.requests import Requests
 
@@ -25,13 +24,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.conditions import Conditions
     from rlightning_aio._core.group.state.requests import Ticket
 
-__all__ = ["DEBUG", "CheckedRequests"]
-
 Change: TypeAlias = "tuple[Event, NDArray[np.intp]]"
 Changes: TypeAlias = "list[Change]"
 Rules: TypeAlias = "dict[str, Callable[[Any, Any], Changes]]"
-DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
-"""Groups check their requests."""
 
 _OWNERS: Final = list(Owner)
 _TICKET: Final = _OWNERS.index(Owner.TICKET)
@@ -171,3 +166,8 @@ class CheckedRequests(Requests):
 def _named(code: int) -> str:
     state, owner = divmod(code, len(_OWNERS))
     return f"{State(state).name} for {_OWNERS[owner].name}"
+
+
+def install() -> None:
+    """Have each group that is built from now on check its requests."""
+    build.Requests = CheckedRequests
