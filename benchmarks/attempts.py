@@ -47,7 +47,6 @@ from waiting import IDLE, MEAN, Waits
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
-from rlightning_aio.attempts.rules import seed_of
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
@@ -87,16 +86,17 @@ def fault_of(seed: int, index: int, faults: list[str]) -> str:
 class Tool(gym.Env[Any, Any]):
     """Ends after some steps, each of which earns 1; an action may be a fault.
 
-    A reset fails once if a file of the folder in its options has the seed as its name.
+    A reset fails for each file of the folder in its options whose name begins with the seed.
     """
 
     observation_space = action_space = Anything()
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         self.steps = 0
-        with contextlib.suppress(FileNotFoundError):
-            Path(options["folder"], str(seed)).unlink()
-            raise RuntimeError("the tool could not be prepared")
+        for file in Path(options["folder"]).glob(f"{seed}-*"):
+            with contextlib.suppress(FileNotFoundError):  # Another attempt may have had it.
+                file.unlink()
+                raise RuntimeError("the tool could not be prepared")
         return {}, {}
 
     def step(self, action: Any) -> Any:
@@ -163,7 +163,7 @@ async def ours(
     groups: list[AttemptGroup] = []
     lags: list[float] = []
     began = time.monotonic()
-    rules = Rules(attempt_timeout=8, seeds="distinct", max_concurrency=256)
+    rules = Rules(attempt_timeout=8, max_concurrency=256)
     agent = Agent({key: fault for key, fault in faults.items() if fault != "fails to reset"})
     limits: dict[str, Any] = {"step_timeout": 2.0, "max_restarts": 100}
     async with rl.build_env_group(name="tool", **entry(place), **limits) as group:
@@ -207,8 +207,7 @@ async def gathered(
         nonlocal ended
         while jobs:
             spec, index = jobs.pop()
-            seed = seed_of(Rules(seeds="distinct"), spec, index)
-            async with group.episode(env_id, seed, dict(spec.options or {})) as episode:
+            async with group.episode(env_id, spec.seed, dict(spec.options or {})) as episode:
                 await agent.play(episode, faults.get((spec.seed, index), ""))
             ended += 1
 
@@ -240,8 +239,7 @@ def compared(place: str, number: int) -> dict[str, Any]:
             for spec in tasks:
                 for index in range(SIZE):
                     if faults.get((spec.seed, index)) == "fails to reset":
-                        seed = seed_of(Rules(seeds="distinct"), spec, index)
-                        Path(folder, str(seed)).touch()
+                        Path(folder, f"{spec.seed}-{index}").touch()
             found[name] = rl.run(program(place, tasks, faults))
     kinds = Counter("{} ({})".format(*FAULTS[fault]) for fault in faults.values())
     found["injected"] = dict(sorted(kinds.items()))
@@ -381,7 +379,7 @@ async def many(
         spent = time.thread_time()
         watching = asyncio.create_task(watch(lags))
         with collector_pauses() as pauses:
-            async for attempts in play(group, tasks(), agent, SIZE, Rules(seeds="distinct")):
+            async for attempts in play(group, tasks(), agent, SIZE):
                 assert attempts.is_complete
         watching.cancel()
         spent = time.thread_time() - spent

@@ -13,7 +13,6 @@ from kit.scripted import DIE, GO, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.attempts.file import log_of
 from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, endless, evaluate
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
@@ -248,7 +247,7 @@ def test_the_first_of_two_episodes_to_end_is_not_repeated(
     with ResultsFile(tmp_path / "one.jsonl") as results:
         whole = evaluated(group_of(both), 2, seed=0)
         assert [one[4] for one in by_number(whole) if one[2] == 0] == [SHORT, LONG]
-        log_of(results).add(whole.attempts[0])
+        results.add(whole.attempts[0])
         found = evaluated(group_of(both, placement="process"), 2, seed=0, policy=dies_once)
         assert found.failures
         assert by_number(found) == by_number(whole)

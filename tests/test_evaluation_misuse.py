@@ -10,13 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kit.scripted import RAISE
 from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
-from rlightning_aio import Outcome, sync
-from rlightning_aio.attempts import Attempt
-from rlightning_aio.attempts.file import log_of
+from rlightning_aio import sync
 from rlightning_aio.evaluation import EpisodeSpec, ResultsFile, evaluate
 
 
@@ -98,35 +95,6 @@ def test_a_policy_must_answer_all_results(as_list: bool) -> None:
 
     with pytest.raises(rl.BadAction, match="has answered 1 of 3 results"):
         evaluated(group_of(), policy=policy, min_results=3)
-
-
-def test_failures_in_the_file_count(tmp_path: Path) -> None:
-    """An evaluation that was killed goes on with the tries that are left."""
-    died = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
-    with ResultsFile(tmp_path / "results.jsonl") as results:
-        log_of(results).add_failure(EpisodeSpec("1", 0, entry="env"), 0, 0, died)
-    for _ in range(2):
-        with ResultsFile(tmp_path / "results.jsonl") as results:
-            group = group_of(1, env_kwargs={"breaks": {"1": RAISE}})
-            found = evaluated(group, [EpisodeSpec("1", 0)], results=results, retries=1)
-        (attempt,) = found.failed
-        assert (attempt.outcome.kind, attempt.outcome.attempt) == ("env_raised", 1)
-        assert (attempt.failures, attempt.reward) == ((died,), None)
-
-
-def test_failures_of_a_task_that_is_there_twice_are_counted_apart(tmp_path: Path) -> None:
-    """Those of the one that has ended are forgotten, also when the file is read again."""
-    path, spec = tmp_path / "results.jsonl", EpisodeSpec("1", 0, entry="env")
-    first = Outcome("env_died", "either", "was killed by SIGKILL", "env-0")
-    second = Outcome("env_raised", "either", "raised ValueError", "env-1")
-    with ResultsFile(path) as results:
-        log_of(results).add_failure(spec, 0, 0, first)
-        log_of(results).add_failure(spec, 0, 0, second)
-        ended = Outcome("terminated", "policy", "its episode ended", "env-0", attempt=1)
-        log_of(results).add(Attempt(spec, 0, outcome=ended, failures=(first,), reward=1.0))
-        assert log_of(results).failures(spec, 0) == [second]
-    with ResultsFile(path) as results:
-        assert log_of(results).failures(spec, 0) == [second]
 
 
 class Dies(Tasks):

@@ -181,13 +181,11 @@ class Attempts(InContext):
 
     def _rules(self, rng: Random) -> Rules:
         times = "timeouts" in self.features and rng.random() < 0.6
-        kind = rng.choice(["all", "all", "at_least", "first"])
         return Rules(
             attempt_timeout=10 ** rng.uniform(-3, 1) if times and not self.plain else None,
             on_timeout=rng.choice(["fail", "end"]),
             retries=rng.randint(0, 3),
-            at_least=rng.randint(1, 4) if kind == "at_least" else None,
-            first=rng.randint(1, 4) if kind == "first" else None,
+            first=rng.randint(1, 4) if rng.random() < 0.25 else None,
             max_concurrency=rng.choice([None, None, 1, 2]),
         )
 
@@ -266,7 +264,7 @@ class Attempts(InContext):
         indices = [one.index for one in attempts]
         require(indices == [*range(size)], "other attempts", indices)
         whole = len(attempts.rewards)
-        needed = min(size, rules.first or rules.at_least or size)
+        needed = min(size, rules.first or size)
         require(attempts.is_complete == (whole >= needed), "complete, or not", attempts)
         require(rules.first is None or whole <= needed, "more than the first", attempts)
         self.counts["groups of attempts"] += 1

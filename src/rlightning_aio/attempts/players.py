@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from rlightning_aio.attempts.spec import EpisodeSpec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from rlightning_aio.attempts.waiting import WaitingEpisodes, Waits
-
 __all__ = ["Players"]
-
-W = TypeVar("W", bound="Waits")
 
 
 class _Player(NamedTuple):
@@ -36,7 +32,6 @@ class Players:
         self._metas = {meta.env_id: meta for meta in group.metas}
         self._players: dict[str, _Player] = {}
         self._kinds: dict[_Player, None] = {}  # All that differ, the newest last.
-        self._task_of: dict[str, str] = {}  # Each env's own, or that of its last reset.
         self.entry_of: dict[str, str] = {}
         self.gone: set[str] = set()
         self.refresh()
@@ -55,7 +50,7 @@ class Players:
                 player = _Player(worker["entry"])
                 if meta is not None:
                     player = _Player(worker["entry"], meta.task, meta.switches_task)
-                self._players[env_id], self._task_of[env_id] = player, player.task
+                self._players[env_id] = player
                 self._kinds.pop(player, None)
                 self._kinds[player] = None
                 self.entry_of[env_id] = player.entry
@@ -96,23 +91,11 @@ class Players:
             raise ValueError(f"the options of an episode must not name a task: {spec}")
         return replace(spec, entry=entry, task=spec.task or player.task)
 
-    def take(self, env_id: str, waiting: WaitingEpisodes[W]) -> W:
-        """Remove the episode of its entry that an env is to play."""
-        entry = self.entry_of[env_id]
-        others = (
-            task
-            for other, task in self._task_of.items()
-            if other not in (env_id, *self.gone) and self.entry_of[other] == entry
-        )
-        return waiting.take(self._task_of[env_id], others)
-
-    def begin(self, env_id: str, spec: EpisodeSpec) -> dict[str, Any] | None:
-        """Note the task of an env that begins an episode; return the options of its reset."""
-        options = None if spec.options is None else {**spec.options}
+    def options(self, env_id: str, spec: EpisodeSpec) -> dict[str, Any] | None:
+        """Return the options of the reset that begins an episode on an env."""
         if self._players[env_id].switches_task:
-            self._task_of[env_id] = spec.task
-            return {"task": spec.task, **(options or {})}
-        return options
+            return {"task": spec.task, **(spec.options or {})}
+        return None if spec.options is None else {**spec.options}
 
     def can_play(self, entries: Iterable[str]) -> bool:
         """Return True unless all envs of one of these entries are gone."""

@@ -80,7 +80,8 @@ async def play(
 
     Raises:
         EnvBusy: an env has a request in flight, or a result that was not collected.
-        ValueError: `size` is below 1, or no entry can play a task, or more than one can.
+        ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
+            is a file, and a task is there twice.
         WorkerDied, EnvHung: all envs that could play a task are gone for good.
     """
     if size < 1:
@@ -200,8 +201,9 @@ class _Engine:
 
     def _start(self, env_id: str) -> None:
         (job,) = self._queue.take(env_id)
-        seed, options = self._queue.begin(env_id, job)
-        view = AttemptInPlay(self._group.episode(env_id, seed, options), job.spec, job.index)
+        options = self._queue.players.options(env_id, job.spec)
+        episode = self._group.episode(env_id, job.spec.seed, options)
+        view = AttemptInPlay(episode, job.spec, job.index)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         task = asyncio.create_task(one.run())
         self._playing[task] = job, one

@@ -1,21 +1,20 @@
 """`AttemptQueue`: which attempts wait, which env plays what next, and what is tried again.
 
-Rule: it plays nothing and waits for nothing. `play` plays its attempts with agents, and `evaluate`
-with a policy for all envs at once. Every attempt ends once: after its last try, or by withdrawal.
+Rule: first in, first out: an env that is free takes what has waited longest for its entry. It plays
+nothing and waits for nothing. `play` plays its attempts with agents, and `evaluate` with a policy
+for all envs at once. Every attempt ends once: after its last try, or by withdrawal.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.attempts.file import log_of
 from rlightning_aio.attempts.players import Players
-from rlightning_aio.attempts.rules import seed_of, tries_again
-from rlightning_aio.attempts.waiting import WaitingEpisodes
+from rlightning_aio.attempts.rules import tries_again
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.file import ResultsFile
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.attempts.rules import Rules
-    from rlightning_aio.attempts.spec import EpisodeSpec
+    from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
     from rlightning_aio.errors import WorkerDied
     from rlightning_aio.outcomes import Outcome
 
@@ -89,15 +88,16 @@ class AttemptQueue:
     """
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
-        self._rules, self._log = rules, None if results is None else log_of(results)
+        self._rules, self._results = rules, results
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ not in self.players.gone}
         self.fault: WorkerDied | None = None
-        self._waiting: dict[str, WaitingEpisodes[Job]] = {}
+        self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
-        self._before = {} if self._log is None else self._log.by_place()
-        self._repeats = Counter[Any]()
+        played = [] if results is None else results.played
+        self._before = {(one.spec.key, one.index, one.sub_env): one for one in played}
+        self._places: set[tuple[EpisodeKey, int, int]] = set()
 
     # -- what waits -------------------------------------------------------------------
 
@@ -105,7 +105,8 @@ class AttemptQueue:
         """Queue the attempts at a task that are not in the file.
 
         Raises:
-            TypeError, ValueError: see `Players.assigned`.
+            TypeError, ValueError: see `Players.assigned`; or there is a file, and the task was
+                queued before.
         """
         task = TaskInPlay(self.players.assigned(spec), size)
         missing = [job for index in range(size) if not self._is_known(job := Job(task, index))]
@@ -122,22 +123,25 @@ class AttemptQueue:
         return task
 
     def _is_known(self, job: Job) -> bool:
-        """Add what the file has of an attempt; True if it has ended there."""
+        """Add an attempt that is in the file; True if it is there."""
+        if self._results is None:
+            return False
         place = job.spec.key, job.index, job.sub_env
-        repeat = self._repeats[place]
-        self._repeats[place] += 1
-        found = self._before.get(place, ())
-        if repeat < len(found):
-            job.task.attempts[job.index] = found[repeat]
-            return True
-        if self._log is not None and repeat == len(found):
-            job.failures += self._log.failures(*_written_as(job))
-        return False
+        if place in self._places:
+            raise ValueError(
+                f"a file of results knows each task once, but {job.spec} is there twice: give it "
+                "another seed, or use another file for the next round"
+            )
+        self._places.add(place)
+        if place not in self._before:
+            return False
+        job.task.attempts[job.index] = self._before.pop(place)
+        return True
 
     def _wait(self, job: Job) -> None:
         spec, job.since = job.spec, time.monotonic()
         if not spec.env_id:
-            self._waiting.setdefault(spec.entry, WaitingEpisodes[Job]()).add(job)
+            self._waiting.setdefault(spec.entry, deque()).append(job)
             return
         queue = self._pinned.setdefault(spec.env_id, {}).setdefault(job.sub_env, deque())
         if queue and queue[0].index > job.index:  # It is tried again.
@@ -153,9 +157,8 @@ class AttemptQueue:
     def withdraw(self, task: TaskInPlay) -> list[Job]:
         """Remove the attempts at a task that wait, and return them."""
         removed: list[Job] = []
-        if (waiting := self._waiting.get(task.spec.entry)) is not None:
-            removed += waiting.remove(lambda job: job.task is task)
-        for queue in self._pinned.get(task.spec.env_id, {}).values():
+        queues = [self._waiting.get(task.spec.entry, deque[Job]())]
+        for queue in (*queues, *self._pinned.get(task.spec.env_id, {}).values()):
             removed += [job for job in queue if job.task is task]
             kept = [job for job in queue if job.task is not task]
             queue.clear()
@@ -185,7 +188,7 @@ class AttemptQueue:
         if pinned:
             first = min(queue[0].index for queue in pinned)
             return [queue.popleft() for queue in pinned if queue[0].index == first]
-        return [self.players.take(env_id, self._waiting[self.players.entry_of[env_id]])]
+        return [self._waiting[self.players.entry_of[env_id]].popleft()]
 
     def take_next(self, env_id: str, sub_env: int) -> Job | None:
         """Remove what a sub-environment plays next that resets itself.
@@ -197,11 +200,6 @@ class AttemptQueue:
             return None
         return queue.popleft()
 
-    def begin(self, env_id: str, job: Job) -> tuple[int | None, dict[str, Any] | None]:
-        """Seed and options of the reset that begins an attempt on an env."""
-        seed = seed_of(self._rules, job.spec, job.index)
-        return seed, self.players.begin(env_id, job.spec)
-
     # -- what has ended ---------------------------------------------------------------
 
     def end(self, job: Job, attempt: Attempt) -> bool:
@@ -211,14 +209,12 @@ class AttemptQueue:
             return False
         if tries_again(self._rules, outcome, job.failures):
             job.failures.append(outcome)
-            if self._log is not None:
-                self._log.add_failure(*_written_as(job), outcome)
             self._wait(job)
             return False
         attempt.failures = tuple(job.failures)
         job.task.attempts[job.index] = attempt
-        if self._log is not None:
-            self._log.add(attempt)
+        if self._results is not None:
+            self._results.add(attempt)
         return True
 
     def is_done(self, task: TaskInPlay) -> bool:
@@ -257,7 +253,3 @@ class AttemptQueue:
         gone = not self.players.gone.isdisjoint(self._pinned_to())
         if gone or not self.players.can_play(self._entries()):
             raise self.fault or RLightningError("no env of this group is left that could play")
-
-
-def _written_as(job: Job) -> tuple[EpisodeSpec, int, int]:
-    return job.spec, job.index, job.sub_env

@@ -136,7 +136,7 @@ class PolicyPlay:
                 self._note_fault(fault)
 
     def _begin(self, env_id: str, job: Job) -> None:
-        seed, options = self._queue.begin(env_id, job)
+        seed, options = job.spec.seed, self._queue.players.options(env_id, job.spec)
         seeds = None if seed is None else {env_id: seed - job.sub_env}
         self._group.reset_async(seed=seeds, options=options, env_ids=[env_id])
         self._pending.add(env_id)
