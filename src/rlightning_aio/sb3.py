@@ -68,8 +68,7 @@ def make_vec_env(
         env_id: a registered name, or a callable that makes an env.
         n_envs: the number of envs.
         seed: env k gets ``seed + k`` at the next reset.
-        env_kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads`` and
-            ``randomize``.
+        env_kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads``.
         vec_env_kwargs: of `VecEnv`: fields of a config entry. Envs with one are separate.
         vec_env_cls: ignored if it is `SubprocVecEnv` or `DummyVecEnv`.
         more: further arguments of Stable-Baselines3's function.
@@ -77,8 +76,8 @@ def make_vec_env(
     Raises:
         ValueError: `vec_env_cls` is another class.
         TypeError: an argument is unknown.
-        ConfigError: ``num_threads`` or ``randomize`` is wrong, or another argument keeps the envs
-            of the task separate.
+        ConfigError: ``num_threads`` is wrong, or another argument keeps the envs of the task
+            separate.
     """
     vec_envs = import_module("stable_baselines3.common.vec_env")
     if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, vec_envs.DummyVecEnv):

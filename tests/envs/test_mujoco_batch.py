@@ -239,6 +239,14 @@ def ants(reason: str, mode: AutoresetMode, folder: Path) -> MujocoBatch:
     return MujocoBatch(make("Ant-v5", options)(), 2, mode, num_threads=2)
 
 
+def move(batch: MujocoBatch, k: int, positions: Any, velocities: Any) -> None:
+    """Put simulation `k` elsewhere, by its state, which begins with time, positions, velocities."""
+    state = batch.save_state()
+    moving = np.concatenate([positions, velocities])
+    state["simulations"][0][k, 1 : 1 + len(moving)] = moving
+    batch.load_state(state)
+
+
 @pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("reason", [SMALL, WILD])
@@ -255,8 +263,7 @@ def test_a_simulation_that_fails_ends_its_own_episode(
     actions[:, 0] = 0.0  # It stands, and never touches the ground with more than its feet.
     if reason == WILD:
         data = batch.call_one(1, "data")
-        batch.call_one(1, "set_state", data.qpos, data.qvel + 1e9)
-        before[1] = batch.call_one(1, "_get_obs")
+        move(batch, 1, data.qpos, data.qvel + 1e9)
     for action in actions:
         observations, rewards, terminated, truncated, infos = batch.step(action)
         expected = alone.step(action[0])
@@ -286,6 +293,23 @@ def test_a_simulation_that_fails_ends_its_own_episode(
     alone.close()
 
 
+def test_methods_of_single_simulations_cannot_be_called() -> None:
+    """Their attributes can be read, also by Gymnasium's own accessors."""
+    batch = MujocoBatch(make("Hopper-v5", {})(), 2)
+    batch.reset(seed=0)
+    for name, arguments in (("set_state", (1, 2)), ("get_wrapper_attr", ("step",)), ("close", ())):
+        with pytest.raises(NotImplementedError, match=f"{name}.*vectorization_mode='async'"):
+            batch.call(name, *arguments)
+    data = batch.call("data")[1]
+    data.qpos[:] = 5.0  # A copy.
+    assert (batch.call_one(1, "data").qpos != data.qpos).all()
+    assert batch.call("dt") == batch.call("get_wrapper_attr", "dt") == (0.008, 0.008)
+    assert batch.call("has_wrapper_attr", "nothing") == (False, False)
+    with pytest.raises(AttributeError, match="nothing"):
+        batch.call("nothing")
+    batch.close()
+
+
 @pytest.mark.parametrize("values", [[], (3,), [3, 3, 3]])
 def test_an_attribute_needs_one_value_for_each_simulation(values: Any) -> None:
     batch = MujocoBatch(make("Hopper-v5", {})(), 2)
@@ -303,8 +327,8 @@ def test_a_failure_and_an_end_in_one_step_have_infos_of_their_own(
     batch.reset(seed=0)
     lying, still = batch.env.init_qpos.copy(), batch.env.init_qvel
     lying[1] = 0.3
-    batch.call_one(0, "set_state", batch.env.init_qpos, still + 1e11)
-    batch.call_one(1, "set_state", lying, still)
+    move(batch, 0, batch.env.init_qpos, still + 1e11)
+    move(batch, 1, lying, still)
     _, _, terminated, truncated, infos = batch.step(np.zeros((3, 3), np.float32))
     assert (terminated.tolist(), truncated.tolist()) == ([False, True, False], [True, False, False])
     last = infos["final_info"]
@@ -316,128 +340,10 @@ def test_a_failure_and_an_end_in_one_step_have_infos_of_their_own(
     batch.close()
 
 
-RANGES = {
-    "body_mass": [0.7, 1.3],
-    "geom_friction": [0.5, 1.5],
-    "opt.gravity": [0.8, 1.1],
-    "actuator_gear": [0.9, 1.1],
-}
-
-
-def with_factors(env: Any, task: str, factors: dict[str, Any], k: int) -> None:
-    """Give a Gymnasium env the model drawn for simulation k."""
-    model, own = gym.make(task).unwrapped.model, env.unwrapped.model  # type: ignore[attr-defined]
-    for name in RANGES:
-        owners = (own.opt, model.opt) if name.startswith("opt.") else (own, model)
-        mine, nominal = (getattr(owner, name.removeprefix("opt.")) for owner in owners)
-        mine[:] = nominal * factors[name][k]
-    mujoco.mj_setConst(own, mujoco.MjData(own))
-
-
-@pytest.mark.usefixtures("implementation")
-@pytest.mark.parametrize("task", ["Humanoid-v5", "Hopper-v5"])
-def test_randomized_simulations_equal_gymnasiums_with_the_same_models(task: str) -> None:
-    """Each reset draws masses, friction, gravity and gears; its info has the factors."""
-    options = {"max_episode_steps": 4}
-    ours = MujocoBatch(make(task, options)(), 2, num_threads=2, randomize=RANGES)
-    theirs: list[Any] = [make(task, options)() for _ in range(2)]
-    observations, infos = ours.reset(seed=4)
-    factors = infos["randomized"]
-    assert all(0.5 <= factors[name].min() < factors[name].max() <= 1.5 for name in RANGES)
-    for k, env in enumerate(theirs):
-        with_factors(env, task, factors, k)
-        np.testing.assert_array_equal(observations[k], env.reset(seed=4 + k)[0])
-    over = [False, False]
-    ours.action_space.seed(0)
-    for _ in range(10):
-        actions = ours.action_space.sample()
-        observations, rewards, _, _, infos = ours.step(actions)
-        for k, env in enumerate(theirs):
-            if over[k]:
-                with_factors(env, task, infos["randomized"], k)
-                expected = env.reset()[0], 0.0, False, False
-            else:
-                expected = env.step(actions[k])
-            over[k] = expected[2] or expected[3]
-            np.testing.assert_array_equal(observations[k], expected[0])
-            assert rewards[k] == expected[1]
-    again = MujocoBatch(make(task, options)(), 2, num_threads=1, randomize=RANGES)
-    assert_alike(again.reset(seed=4)[1]["randomized"], factors)
-    for batch in (ours, again, *theirs):
-        batch.close()
-
-
-def test_a_snapshot_has_the_randomized_fields() -> None:
-    """Another group continues with the same models, and draws the same next ones."""
-    entry = {"name": "a", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2}
-    entry |= {"env_kwargs": {"randomize": RANGES}, "max_episode_steps": 3, "placement": "inline"}
-    actions = np.random.default_rng(0).uniform(-1, 1, (8, 1, 2, 3)).astype(np.float32)
-
-    def steps(group: Any, batch: Any, actions: Any) -> list[Any]:
-        found: list[Any] = []
-        for action in actions:
-            batch, _ = group.step(batch.respond(action=action))
-            found.append((batch.observation, batch.reward, batch.info()))
-        return found
-
-    with sync.build_env_group(entry) as one, sync.build_env_group(entry) as other:
-        batch, _ = one.reset(seed=1)
-        steps(one, batch, actions[:2])
-        snapshot = one.snapshot()
-        expected = steps(one, one.restore(snapshot)[0], actions[2:])
-        other.reset(seed=5)
-        assert_alike(steps(other, other.restore(snapshot)[0], actions[2:]), expected)
-
-
-@pytest.mark.parametrize(
-    ("saved", "here", "message"),
-    [
-        ({"randomize": RANGES}, {}, "are randomized, and this env's are not"),
-        ({}, {"randomize": RANGES}, "randomize of the snapshot's simulations is None"),
-    ],
-)
-def test_a_state_of_other_simulations_is_refused(saved: Any, here: Any, message: str) -> None:
-    """Nothing is changed."""
-    actions = np.ones((2, 3), np.float32)
-    one, other, alike = (make_vec("Hopper-v5", 2, **given) for given in (saved, here, here))
-    for envs in (one, other, alike):
-        envs.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        other.load_state(one.save_state())
-    assert_alike(other.step(actions), alike.step(actions))
-    for envs in (one, other, alike):
-        envs.close()
-
-
-@pytest.mark.parametrize(
-    ("randomize", "message"),
-    [
-        ({"opt.timestep": [1, 2]}, "rewards assume"),
-        ({"body_weight": [1, 2]}, "no number 'body_weight'"),
-        ({"geom_type": [1, 2]}, "no number 'geom_type'"),
-        ({"body_mass": [1, float("inf")]}, r"is \[1, inf\], but must be .* finite"),
-        ({"body_invweight0": [1, 2]}, "MuJoCo computes this field from others"),
-        ({"body_mass": [2, 1]}, r"is \[2, 1\], but must be \[lowest, highest\]"),
-        ({"body_mass": 0.5}, r"is 0.5, but must be \[lowest, highest\]"),
-        (["body_mass"], "must map fields to ranges"),
-    ],
-)
-def test_a_wrong_randomization_raises(randomize: Any, message: str) -> None:
-    """The message names the field, and valid values."""
-    with pytest.raises(ConfigError, match=message):
-        MujocoBatch(make("Hopper-v5", {})(), 2, randomize=randomize)
-
-
-def test_randomization_needs_simulations_that_are_stepped_together() -> None:
-    """A single env can't differ from others."""
-    config = EnvConfig(
-        name="x", backend="mujoco", task="Hopper-v5", env_kwargs={"randomize": RANGES}
-    )
-    with pytest.raises(ConfigError, match="stepped together: num_envs above 1"):
-        MujocoEnv(config)
-    for options in ({"randomize": RANGES}, {"num_threads": 2}):
-        with pytest.raises(ConfigError, match=f"{next(iter(options))} needs envs that are stepped"):
-            make_vec("Hopper-v5", 2, "async", **options)
+def test_threads_are_only_those_of_envs_that_are_stepped_together() -> None:
+    """The error says what separates them."""
+    with pytest.raises(ConfigError, match="num_threads needs envs that are stepped"):
+        make_vec("Hopper-v5", 2, "async", num_threads=2)
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])

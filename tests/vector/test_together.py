@@ -15,7 +15,6 @@ import pytest
 from gymnasium.error import (
     AlreadyPendingCallError,
     ClosedEnvironmentError,
-    NoAsyncCallError,
     ResetNeeded,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -78,29 +77,14 @@ def test_envs_that_are_stepped_together_need_no_group(monkeypatch: pytest.Monkey
     assert not steps_together(gym.spec(PENDULUM), {})
 
 
-def test_a_batch_is_called_in_two_halves_as_gymnasiums() -> None:
-    """The second half computes; errors are Gymnasium's, also those of a closed one."""
+def test_a_batch_that_was_never_reset_or_is_closed_raises() -> None:
+    """With Gymnasium's errors."""
     env: Any = make_vec(PENDULUM, 3)
-    with pytest.raises(NoAsyncCallError, match="without any prior call to `step_async`"):
-        env.step_wait()
-    env.reset_async(seed=4, options={})
-    with pytest.raises(AlreadyPendingCallError, match="pending call to `reset`"):
-        env.call("dt")
-    first, _ = env.reset_wait(timeout=1.0)
     actions = env.action_space.sample()
-    env.step_async(actions)
-    expected = actions.copy()
-    actions[:] = 0.0  # The call has a copy.
-    found = env.step_wait()
-    env.call_async("state_vector")
-    assert len(env.call_wait()) == 3
-    again, _ = env.reset(seed=4)
-    np.testing.assert_array_equal(again, first)
-    assert_alike(env.step(expected), found)
     with pytest.raises(ResetNeeded):
-        make_vec(PENDULUM, 2).step(np.zeros((2, 1), np.float32))
+        env.step(actions)
     env.close()
-    for use in (lambda: env.step(actions), env.save_state, lambda: env.render_one(0)):
+    for use in (lambda: env.step(actions), env.snapshot, lambda: env.render_one(0)):
         with pytest.raises(ClosedEnvironmentError, match="this MujocoVectorEnv is closed"):
             use()
 
@@ -123,19 +107,33 @@ def test_simulations_that_were_never_reset_make_no_step(fields: dict[str, Any]) 
     theirs.close()
 
 
-@pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
-def test_a_mask_that_changes_before_the_resets_are_awaited(fields: dict[str, Any]) -> None:
+def test_a_mask_that_changes_before_the_resets_are_awaited() -> None:
     """As an array of ends that a program writes to: the first half of the call has a copy."""
-    env = make_vec(PENDULUM, 2, autoreset_mode=AutoresetMode.DISABLED, **fields)
+    env: Any = make_vec(PENDULUM, 2, autoreset_mode=AutoresetMode.DISABLED, **INLINE)
     before, _ = env.reset(seed=0)
     mask = np.array([True, False])
     env.reset_async(seed=7, options={"reset_mask": mask})
     mask[:] = False, True
     after, _ = env.reset_wait()
     assert (after != before).any(axis=1).tolist() == [True, False]
-    with pytest.raises(ValueError, match="at least one True"):
-        env.reset_async(options={"reset_mask": np.zeros(2, np.bool_)})
     env.close()
+
+
+@pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
+def test_a_mask_that_resets_nothing_is_refused(fields: dict[str, Any]) -> None:
+    env = make_vec(PENDULUM, 2, autoreset_mode=AutoresetMode.DISABLED, **fields)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="at least one True"):
+        env.reset(options={"reset_mask": np.zeros(2, np.bool_)})
+    env.close()
+
+
+def saved(env: Any) -> Any:
+    return env.save_state() if isinstance(env, VectorEnv) else env.snapshot()
+
+
+def put_back(env: Any, state: Any) -> Any:
+    return env.load_state(state) if isinstance(env, VectorEnv) else env.restore(state)
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
@@ -151,7 +149,7 @@ def test_a_state_can_be_restored_again(
     one.action_space.seed(0)
     actions = [one.action_space.sample() for _ in range(9)]
     one.step(actions[0])
-    kept = pickle.loads(pickle.dumps(one.save_state()))
+    kept = pickle.loads(pickle.dumps(saved(one)))
 
     def steps(env: Any) -> list[Any]:
         found = [env.step(each) for each in actions[1:5]]
@@ -161,7 +159,7 @@ def test_a_state_can_be_restored_again(
     found = steps(one)
     copies = copy.deepcopy(found)
     for env in (one, one, other):
-        env.load_state(kept)
+        put_back(env, kept)
         assert_alike(steps(env), copies)
     assert_alike(found, copies)
     one.close()
@@ -183,8 +181,8 @@ def test_a_batch_refuses_the_state_of_another_one(other: str) -> None:
     ours, alike = make_vec(PENDULUM, **fields), make_vec(PENDULUM, **fields)
     for env in (theirs, ours, alike):
         env.reset(seed=0)
-    with pytest.raises(ValueError, match="the state is of a batch with"):
-        ours.load_state(theirs.save_state())
+    with pytest.raises(SnapshotError, match=r"into a MujocoVectorEnv.*nothing was changed"):
+        put_back(ours, saved(theirs))
     actions = np.zeros((2, 1), np.float32)
     for _ in range(5):
         assert_alike(ours.step(actions), alike.step(actions))
@@ -215,26 +213,44 @@ def test_separate_envs_refuse_the_state_of_another_mode_or_limit(other: str) -> 
 def test_nothing_is_saved_before_a_reset_or_while_a_step_is_pending() -> None:
     for env in (make_vec(PENDULUM, 2), make_vec(PENDULUM, 2, vector_kwargs=INLINE)):
         with pytest.raises((ResetNeeded, SnapshotError)):
-            env.save_state()
+            saved(env)
         env.reset(seed=0)
-        state = env.save_state()
-        env.step_async(np.zeros((2, 1), np.float32))
-        with pytest.raises(AlreadyPendingCallError):
-            env.save_state()
-        with pytest.raises(AlreadyPendingCallError):
-            env.load_state(state)
-        env.step_wait()
+        state = saved(env)
+        if isinstance(env, VectorEnv):
+            env.step_async(np.zeros((2, 1), np.float32))
+            with pytest.raises(AlreadyPendingCallError):
+                env.save_state()
+            with pytest.raises(AlreadyPendingCallError):
+                env.load_state(state)
+            env.step_wait()
         env.close()
+
+
+def test_what_is_restored_is_returned_as_by_a_reset() -> None:
+    """The observations that were returned last, in arrays of one's own."""
+    envs: Any = make_vec("Hopper-v5", 2)
+    envs.reset(seed=0)
+    shown = envs.step(envs.action_space.sample())[0]
+    snapshot = envs.snapshot()
+    envs.reset(seed=5)
+    observations, infos = envs.restore(snapshot)
+    np.testing.assert_array_equal(observations, shown)
+    assert infos == {}
+    with pytest.raises(SnapshotError, match=r"checksum doesn't match.*nothing was changed"):
+        envs.restore(snapshot[:-1] + b"?")
+    observations[:] = 0.0
+    np.testing.assert_array_equal(envs.restore(snapshot)[0], shown)
+    envs.close()
 
 
 def test_the_state_of_another_kind_of_vector_env_is_refused() -> None:
     together, separate = make_vec(PENDULUM, 2), make_vec(PENDULUM, 2, vector_kwargs=INLINE)
     for env in (together, separate):
         env.reset(seed=0)
-    with pytest.raises(ValueError, match="of envs that are stepped together"):
-        separate.load_state(together.save_state())
-    with pytest.raises(ValueError, match="of a group of separate envs"):
-        together.load_state(separate.save_state())
+    with pytest.raises(SnapshotError, match="can't be put into a MujocoVectorEnv: its "):
+        put_back(together, separate.group.snapshot())
+    with pytest.raises(SnapshotError):
+        separate.group.restore(saved(together))
     together.close()
     separate.close()
 

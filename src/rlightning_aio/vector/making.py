@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["batch_of", "imports_of", "make_vec", "steps_together", "vector_entry_point"]
 
 Made = TypeVar("Made", bound="gym.vector.VectorEnv[Any, Any, Any]")
-BATCH_OPTIONS: Final = ("num_threads", "randomize")
-"""Options of envs that are stepped together, in addition to those of the task."""
 _OF_EVERY_VECTOR_ENV: Final = {"autoreset_mode", "shared_memory", "copy", "context", "daemon"}
 """Arguments of `VectorEnv` without a meaning for a group."""
 _WHICH_ENVS: Final = {
@@ -62,13 +60,13 @@ def make_vec(
             run (``step_timeout``, ``envs_per_process``, …) and ``autoreset_mode`` may also be given
             without it.
         wrappers: applied to each env, the first innermost; envs with wrappers are separate.
-        kwargs: of `gymnasium.make`; for envs that are stepped together also `BATCH_OPTIONS`.
+        kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads``.
             ``disable_env_checker`` is True by default, because Gymnasium's checker slows every
             step; envs with the checker are separate.
 
     Raises:
-        ConfigError: `BATCH_OPTIONS` are wrong, or given for a task that `mujoco_batch` supports
-            with an argument that keeps its envs separate.
+        ConfigError: ``num_threads`` is wrong, or given for a task that `envs.mujoco` supports with
+            an argument that keeps its envs separate.
         ValueError: the mode is unknown.
     """
     mode = getattr(vectorization_mode, "value", vectorization_mode)
@@ -102,17 +100,17 @@ def batch_of(
 
     Args:
         spec: of the task.
-        kwargs: of `gymnasium.make`, and `BATCH_OPTIONS`.
+        kwargs: of `gymnasium.make`, and ``num_threads``.
         num_envs: the number of envs.
         mode: when an env is reset after the end of its episode.
     """
     # It imports MuJoCo.
     from rlightning_aio.vector.mujoco import MujocoVectorEnv  # noqa: PLC0415
 
-    options = {name: kwargs[name] for name in BATCH_OPTIONS if name in kwargs}
-    one = OneOf(spec, {name: kwargs[name] for name in kwargs if name not in options})
+    of_one = dict(kwargs)
+    num_threads = of_one.pop("num_threads", None)
     with outdated_assets_accepted():
-        return MujocoVectorEnv(one(), num_envs, mode, **options)
+        return MujocoVectorEnv(OneOf(spec, of_one)(), num_envs, mode, num_threads=num_threads)
 
 
 def vector_entry_point(
@@ -140,7 +138,7 @@ def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any], *, separate: bool =
         separate: other arguments need separate envs.
 
     Raises:
-        ConfigError: `BATCH_OPTIONS` of a task that allows it are wrong, or its envs are separate.
+        ConfigError: ``num_threads`` of a task that allows it is wrong, or its envs are separate.
     """
     if not is_batched(spec):
         return False
@@ -148,14 +146,13 @@ def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any], *, separate: bool =
     window = kwargs.get("render_mode", spec.kwargs.get("render_mode")) == "human"
     if not (separate or window or not kwargs.get("disable_env_checker", True)):
         return True
-    for name in BATCH_OPTIONS:
-        if kwargs.get(name) is not None:
-            raise ConfigError(
-                f"{name} needs envs that are stepped together: leave out what separates them "
-                "(wrappers, monitors of single envs, Gymnasium's checker, a window, fields of a "
-                "config entry, vectorization_mode='async'), or make an EnvGroup with "
-                "EnvConfig(num_envs=...)"
-            )
+    if kwargs.get("num_threads") is not None:
+        raise ConfigError(
+            "num_threads needs envs that are stepped together: leave out what separates them "
+            "(wrappers, monitors of single envs, Gymnasium's checker, a window, fields of a "
+            "config entry, vectorization_mode='async'), or make an EnvGroup with "
+            "EnvConfig(num_envs=...)"
+        )
     return False
 
 

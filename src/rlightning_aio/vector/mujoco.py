@@ -5,24 +5,31 @@ No group is around them, so there is nothing to lose, to restart or to copy.
 
 from __future__ import annotations
 
-import copy
-from functools import partial
+import pickle
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.error import ResetNeeded
 
+from rlightning_aio._core.group.episodes.snapshot_format import (
+    EnvSnapshot,
+    check_same,
+    pack,
+    unpack,
+)
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
 from rlightning_aio.envs.wrappers import name_of
+from rlightning_aio.errors import SnapshotError
 from rlightning_aio.vector.lazy_infos import LazyColumns
-from rlightning_aio.vector.pending import check_free, check_sent
+from rlightning_aio.vector.pending import check_running
 from rlightning_aio.vector.proxies import CalledEnvs, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import numpy as np
     from gymnasium.vector import AutoresetMode
     from numpy.typing import NDArray
 
@@ -39,11 +46,8 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
     call changes them. Infos are made when they are first read.
 
     Args:
-        env, num_envs, autoreset_mode, num_threads, randomize: see `MujocoBatch`.
+        env, num_envs, autoreset_mode, num_threads: see `MujocoBatch`.
     """
-
-    _pending: str | None = None
-    _do: Callable[[], Any]
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
@@ -77,15 +81,11 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         Raises:
             ClosedEnvironmentError: the vector env is closed.
         """
-        check_free(self, self._pending, "reset_async")
-        return self._resetting(seed, options)()
-
-    def _resetting(self, seed: Any, options: dict[str, Any] | None) -> Callable[[], Any]:
-        """Check the arguments of a reset, and return what does it; they may change meanwhile."""
+        check_running(self)
         if options is not None and "reset_mask" in options:
             mask = checked_mask(options["reset_mask"], self.num_envs)
             options = {**options, "reset_mask": mask}
-        return partial(super().reset, seed=seeds_of_envs(seed, self.num_envs), options=options)
+        return super().reset(seed=seeds_of_envs(seed, self.num_envs), options=options)
 
     def step(
         self, actions: NDArray[Any]
@@ -93,105 +93,78 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:  # fmt: skip
         """Step all envs, or reset those that are over; see `MujocoBatch.step`."""
-        check_free(self, self._pending, "step_async")
+        check_running(self)
         return super().step(actions)
 
-    # -- in two halves, of which the second computes -----------------------------------------
+    # -- attributes -------------------------------------------------------------------------
 
-    def reset_async(
-        self,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        """Note a reset; `reset_wait` resets."""
-        check_free(self, self._pending, "reset_async")
-        self._note("reset", self._resetting(seed, options))
-
-    def reset_wait(self, timeout: float | None = None) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Reset as `reset_async` was told; `timeout` is ignored."""
-        return self._noted("reset", timeout)
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Note actions; `step_wait` steps."""
-        self._note("step", partial(super().step, np.array(actions)))
-
-    def step_wait(self, timeout: float | None = None) -> Any:
-        """Step as `step_async` was told; `timeout` is ignored."""
-        return self._noted("step", timeout)
-
-    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
-        """Note a call; `call_wait` calls."""
+    def call(self, name: str, /, *args: Any) -> tuple[Any, ...]:
+        """Get attribute `name` of each env; see `MujocoBatch.call`."""
+        check_running(self)
         check_name(name)
-        self._note("call", partial(super().call, name, *args, **kwargs))
-
-    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Call as `call_async` was told; `timeout` is ignored."""
-        return self._noted("call", timeout)
-
-    def _note(self, what: str, do: Callable[[], Any]) -> None:
-        check_free(self, self._pending, f"{what}_async")
-        self._pending, self._do = what, do
-
-    def _noted(self, what: str, timeout: float | None) -> Any:
-        del timeout
-        check_sent(self, self._pending, what)
-        self._pending = None
-        return self._do()
-
-    # -- methods and attributes -----------------------------------------------------------
-
-    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call method `name` of each env, or get an attribute."""
-        check_free(self, self._pending, "call_async")
-        check_name(name)
-        return super().call(name, *args, **kwargs)
+        return super().call(name, *args)
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value, or to equal values in a list or tuple."""
-        check_free(self, self._pending, "set_attr")
+        check_running(self)
         super().set_attr(name, values)
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
         is_method = callable(getattr(self.env, name, None))
         return is_method, None if is_method else self._call_one(place, name)
 
-    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of env `place`, or get its attribute."""
-        check_free(self, self._pending, "call_async")
-        check_name(name)
-        return self.call_one(place, name, *args, **kwargs)
+    def _call_one(self, place: int, name: str, /, *args: Any) -> Any:
+        """Get attribute `name` of env `place`."""
+        check_running(self)
+        return self.call_one(place, name, *args)
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
-        check_free(self, self._pending, "call_async")
+        check_running(self)
         return self.is_wrapped(name_of(wrapper_class))
 
     # -- state and rendering ---------------------------------------------------------------
 
-    def save_state(self) -> dict[str, Any]:
-        """Return the state of all envs, as a copy that can be pickled.
+    def snapshot(self) -> bytes:
+        """Return the state of all envs.
 
         Raises:
             ResetNeeded: there was no reset yet, or a step or reset was interrupted.
         """
-        check_free(self, self._pending, "save_state")
+        check_running(self)
         if self._ended is None or not self._is_whole:
             raise ResetNeeded("there is no state to save before reset()")
-        return copy.deepcopy(super().save_state())
+        state = pickle.dumps(self.save_state())
+        return pack([EnvSnapshot("simulations", self._identity(), 0, False, state)])
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore the state of all envs, of this vector env or of another one of the same task.
+    def restore(self, snapshot: bytes) -> tuple[NDArray[Any], dict[str, Any]]:
+        """Put all envs into a state that `snapshot` has returned, here or in a run before.
+
+        Returns what `reset` does: the observations that were returned last, and infos, which are
+        empty.
 
         Raises:
-            ValueError: it is that of another model, number of envs, mode or step limit, of envs
-                with another `randomize`, or of separate envs; nothing was changed.
+            SnapshotError: it is damaged, or of another task, model, number of envs, mode or step
+                limit, or of separate envs; nothing was changed.
         """
-        check_free(self, self._pending, "load_state")
-        if "simulations" not in state:
-            raise ValueError("this is the state of a group of separate envs")
-        super().load_state(copy.deepcopy(state))
+        check_running(self)
+        saved, *_ = unpack(snapshot)
+        check_same(saved, self._identity(), f"a {type(self).__name__}")
+        state = pickle.loads(saved.state)  # noqa: S301  # See docs/state.md.
+        try:
+            self.load_state(state)
+        except ValueError as error:
+            raise SnapshotError(f"{error}; nothing was changed") from None
+        return self._last.copy(), {}
+
+    def _identity(self) -> dict[str, str]:
+        """What the envs of a snapshot must share, by name."""
+        task = "" if self.spec is None else self.spec.id
+        kind = {name: str(value) for name, value in self._kind.items()}
+        versions = {"version of mujoco": version("mujoco")}
+        return {"backend": "simulations", "task": task, **kind, **versions}
 
     def render_one(self, k: int) -> Any:
         """Render a frame of env k in the render mode of the task."""
-        check_free(self, self._pending, "render_one")
+        check_running(self)
         return super().render_one(k)

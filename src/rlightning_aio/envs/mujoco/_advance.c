@@ -44,7 +44,6 @@ typedef struct {
     double low;
     double high;
     const double *weights;
-    int64_t weights_row; /* Values from one simulation to the next; 0 if all have the same. */
     int64_t is_column;
     int64_t place;       /* In an observation, or of the first column. */
 } Part;
@@ -205,9 +204,9 @@ is_within(const double *values, int64_t count, double low, double high)
 
 /* The centre of bodies in the plane, in the order of NumPy's sums over the first of two axes. */
 static void
-find_centre(const Part *part, const double *from, int simulation, double *to, int64_t column)
+find_centre(const Part *part, const double *from, double *to, int64_t column)
 {
-    const double *weights = part->weights + simulation * part->weights_row;
+    const double *weights = part->weights;
     const int64_t bodies = part->count / 3;
     const double all = sum_of(weights, bodies, 0.0, 0.0);
     for (int64_t axis = 0; axis < 2; axis++) {
@@ -234,7 +233,7 @@ copy_part(const Plan *plan, const Part *part, const void *data, int simulation)
     else if (part->kind == ALSO_WITHIN)
         *to = *to != 0.0 && is_within(from, part->count, low, high);
     else if (part->kind == CENTRE)
-        find_centre(part, from, simulation, to, column);
+        find_centre(part, from, to, column);
     else if (column == 1 && isinf(low) && isinf(high))
         memcpy(to, from, (size_t)part->count * sizeof *to);
     else
@@ -400,7 +399,8 @@ add_address(PyObject *module)
     PyObject *address = PyLong_FromVoidPtr((void *)(uintptr_t)advance);
     int failed = PyModule_AddObjectRef(module, "ADVANCE", address);
     Py_XDECREF(address);
-    return failed ? failed : PyModule_AddIntConstant(module, "PLAN_SIZE", sizeof(Plan));
+    return failed ? failed
+                  : PyModule_AddIntConstant(module, "PLAN_SIZE", sizeof(Plan) + sizeof(Part));
 }
 
 static PyModuleDef_Slot slots[] = {
@@ -414,7 +414,7 @@ static PyModuleDef_Slot slots[] = {
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT,
     .m_name = "rlightning_aio.envs.mujoco._advance",
-    .m_doc = "ADVANCE: the address of a function for `mjb_apply`; PLAN_SIZE: of its argument.",
+    .m_doc = "ADVANCE: the address of a function for `mjb_apply`; PLAN_SIZE: of its argument, with one part.",
     .m_slots = slots,
 };
 

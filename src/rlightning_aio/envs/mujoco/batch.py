@@ -21,17 +21,16 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.mujoco.infos import Begun, Finished, of_resets, of_step
-from rlightning_aio.envs.mujoco.randomize import Randomizer
+from rlightning_aio.envs.mujoco.infos import Begun, Finished, of_step
 from rlightning_aio.envs.mujoco.resets import can_draw, drawn, generator_of, noise_of
 from rlightning_aio.envs.mujoco.tasks import task_of
-from rlightning_aio.envs.mujoco.threads import Simulations, state_of
+from rlightning_aio.envs.mujoco.threads import Simulations
 from rlightning_aio.envs.state import load_state, save_state
 from rlightning_aio.envs.wrappers import ClassName, has_wrapper, wrappers_of
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -49,6 +48,7 @@ _OWN: Final = ("_np_random", "_np_random_seed", "goal", "goal_pos", "cylinder_po
 """Attributes of the Gymnasium env that belong to one simulation, in addition to its data."""
 _FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
 """Attributes that can't be set from outside."""
+_READERS: Final = ("get_wrapper_attr", "has_wrapper_attr")
 _NEXT_STEP: Final = AutoresetMode.NEXT_STEP
 _SAME_STEP: Final = AutoresetMode.SAME_STEP
 _BRIEF_NS: Final = 500_000
@@ -69,7 +69,7 @@ def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
 class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     """Simulations of one task.
 
-    They share their model, so a change of it affects all, unless it is randomized.
+    They share their model and all options, so a change of these affects all.
 
     Args:
         env: the task, from `gymnasium.make`.
@@ -77,8 +77,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         autoreset_mode: when a simulation is reset after the end of its episode.
         num_threads: number of threads for steps, including the caller's; None for one per core
             that this process may use.
-        randomize: factors of model fields, drawn at each reset; see `mujoco_randomize`. The info
-            of a reset has them as ``randomized``.
 
     Attributes:
         env: the unwrapped env, in the state of the simulation that used it last.
@@ -89,7 +87,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     Raises:
         NotImplementedError: the task isn't one of Gymnasium's v5 tasks, or is wrapped; or MuJoCo is
             older than 3.17.
-        ConfigError: `randomize` is wrong.
     """
 
     fresh_results = True
@@ -102,7 +99,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
         *,
         num_threads: int | None = None,
-        randomize: Mapping[str, Any] | None = None,
     ) -> None:
         self.env: Any = env.unwrapped
         self.num_envs = num_envs
@@ -115,22 +111,15 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self.observation_space: gym.Space[Any] = batch_space(self.env.observation_space, num_envs)
         self.action_space: gym.Space[Any] = batch_space(self.env.action_space, num_envs)
         kind = task_of(env)
-        self._simulations = Simulations(
-            self.env.model,
-            num_envs,
-            num_threads or num_cores(),
-            forces=kind.needs_forces,
-            own_models=bool(randomize),
-        )
-        self._randomizer = Randomizer(self._simulations, randomize) if randomize else None
+        threads = num_threads or num_cores()
+        self._simulations = Simulations(self.env.model, num_envs, threads, forces=kind.needs_forces)
         # Where the generator of a simulation is; not for those of the set, which have new ones.
         self._generators, self._unknown = np.zeros(num_envs, np.uintp), set(range(num_envs))
         # The Gymnasium env resets and renders with these data.
         self._data = self.env.data
         self._made: Any = env
         self._mode = autoreset_mode
-        # Steps of all; those of a simulation began at its element of `_began`, and `_soonest` is
-        # the first at which one of them can be truncated.
+        # Steps of all; those of a simulation began at its element of `_began`.
         self._clock = 0
         self._began = self._simulations.began
         self._read_options(kind)
@@ -153,7 +142,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             if isinstance(wrapper, gym.wrappers.TimeLimit):
                 self._limiter = wrapper
                 self._limit = self._limiter._max_episode_steps  # noqa: SLF001
-        self._soonest = 0
         simulations, env = self._simulations, self.env
         simulations.limit(self._limit)
         self._task = task = kind(env, simulations)
@@ -175,7 +163,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     @_num_steps.setter
     def _num_steps(self, values: NDArray[np.int64]) -> None:
-        self._began[:], self._soonest = self._clock - values, 0
+        self._began[:] = self._clock - values
 
     # -- resets -------------------------------------------------------------------------
 
@@ -212,7 +200,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._ended = ended if ended.any() else self._nobody
         self._is_whole = True
         self._keep(observations)
-        return observations, self._infos(partial(of_resets, begun, self.num_envs, self._add_info))
+        return observations, self._infos(partial(begun.added, {}, self.num_envs))
 
     def _infos(self, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Return infos."""
@@ -241,41 +229,30 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._began[ids] = self._clock
         if not self._resets_together:
             given = [None] * len(ids) if seeds is None else seeds
-            each = [
+            for k, seed in zip(ids.tolist(), given, strict=True):
                 self._reset(k, observations, seed, options)
-                for k, seed in zip(ids.tolist(), given, strict=True)
-            ]
-            return Begun(ids, None, each)
+            return Begun(ids, self._task.begun(ids))
         task = self._task
-        each = self._draw(ids, seeds)
+        self._draw(ids, seeds)
         task.renew(observations)
         self._simulations.advance(ids.astype(np.int32))
         task.finish(ids)
         task.settle(ids)
-        return Begun(ids, task.begun(ids), each)
+        return Begun(ids, task.begun(ids))
 
-    def _draw(
-        self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None
-    ) -> list[dict[str, Any]]:
-        """Draw first states of the simulations `ids`, for MuJoCo to begin with. Return infos."""
-        simulations, each = self._simulations, list[dict[str, Any]]()
-        if seeds is not None or self._unknown or self._randomizer is not None or self._draws:
+    def _draw(self, ids: NDArray[np.intp], seeds: Sequence[int | None] | None = None) -> None:
+        """Draw first states of the simulations `ids`, for MuJoCo to begin with."""
+        simulations = self._simulations
+        if seeds is not None or self._unknown or self._draws:
             chosen = list[int](ids.tolist())
             given = [None] * len(chosen) if seeds is None else seeds
             found = [self._generator(k, seed) for k, seed in zip(chosen, given, strict=True)]
-            if self._randomizer is not None:
-                each = [
-                    {"randomized": self._randomizer.draw(k, seed)}
-                    for k, seed in zip(chosen, given, strict=True)
-                ]
-                simulations.set_const(ids.astype(np.int32))
             if self._draws:
                 env, kind = self.env, self._task.noise
                 scale: Any = env._reset_noise_scale  # noqa: SLF001
                 noise = drawn(found, kind, scale, env.model.nq, env.model.nv)
                 simulations.starts[ids] = np.concatenate([env.init_qpos, env.init_qvel]) + noise
         simulations.begin(ids)
-        return each
 
     def _generator(self, k: int, seed: int | None) -> np.random.Generator:
         """The generator of simulation `k`, seeded like that of a Gymnasium env."""
@@ -291,19 +268,13 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _reset(
         self, k: int, observations: NDArray[Any], seed: int | None, options: dict[str, Any] | None
-    ) -> dict[str, Any]:
-        """Reset simulation k by the Gymnasium env. Return the info."""
-        factors = None
-        if self._randomizer is not None:
-            factors = self._randomizer.draw(k, seed)
-            self._simulations.set_const(np.array([k], np.int32))
-        self._simulations.show_model(k)
+    ) -> None:
+        """Reset simulation k by the Gymnasium env."""
         self._lend(k)
-        observations[k], info = self.env.reset(seed=seed, options=options)
+        observations[k], _ = self.env.reset(seed=seed, options=options)
         _ = self.env.np_random  # Without a seed, this makes a randomly seeded generator.
         self._take_back(k)
         self._task.put(k, self._data)
-        return info if factors is None else {**info, "randomized": factors}
 
     def _lend(self, k: int) -> None:
         """Set the attributes of the Gymnasium env to those of simulation k, except for its data."""
@@ -372,10 +343,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         """Complete the ends of a step, and rewards of those that did none. Return who has ended."""
         simulations, limit = self._simulations, self._limit
         has_judged, any_ended = simulations.has_judged, simulations.any_ended
-        if not has_judged and self._clock < self._soonest:
-            frame.truncated[:] = False
-        elif not has_judged:
-            self._soonest = int(self._began.min()) + limit
+        if not has_judged:
             frame.truncated[:] = self._clock - self._began >= limit
         if due is not None and not (has_judged and self._resets_together):
             self._began[due], frame.rewards[due] = self._clock, 0.0
@@ -404,60 +372,52 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             ids = np.setdiff1d(np.arange(self.num_envs, dtype=np.int32), due)
             task.renew(self._last.copy())
         else:
-            each = None if due is None else self._draw(due)
+            if due is not None:
+                self._draw(due)
             task.renew()
-            if due is not None and each is not None:
-                begun = Begun(due, task.begun(due), each)
+            if due is not None:
+                begun = Begun(due, task.begun(due))
         failures = simulations.advance(ids, self._clock)
         if failures:
             # What was not computed may be anything.
             task.keep(list(failures), self._last)
         return begun, failures
 
-    # -- calls --------------------------------------------------------------------------
+    # -- attributes ---------------------------------------------------------------------
 
-    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call method `name` of the env of each simulation, or get its attribute."""
-        if name == "set_wrapper_attr":
-            attribute, value = _attribute(*args, **kwargs)
-            self.set_attr(attribute, [value] * self.num_envs)
-            return (True,) * self.num_envs
-        return tuple(self.call_one(k, name, *args, **kwargs) for k in range(self.num_envs))
+    def call(self, name: str, /, *args: Any) -> tuple[Any, ...]:
+        """Get attribute `name` of the env of each simulation; ``render`` renders a frame of each.
 
-    def call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env of simulation `k`, or get its attribute.
-
-        The env has a copy of the data of the simulation; changes of them take effect.
+        Args:
+            name: of the attribute, or ``get_wrapper_attr`` or ``has_wrapper_attr``.
+            args: the name for these two.
 
         Raises:
-            ValueError: the call sets an attribute, which all simulations share.
+            NotImplementedError: it is another method, which exists once for all simulations.
         """
-        if name == "set_wrapper_attr":
-            raise _shared(_attribute(*args, **kwargs)[0])
+        return tuple(self.call_one(k, name, *args) for k in range(self.num_envs))
+
+    def call_one(self, k: int, name: str, /, *args: Any) -> Any:
+        """The same for simulation `k` alone. Of its ``data`` this is a copy."""
         if name == "render":
             return self.render_one(k)
         self._lend(k)
-        self.env.data = data = self._simulations.data_of(k)
+        self.env.data = self._simulations.data_of(k)
         if self._limiter is not None and self._ended is not None:
             self._limiter._elapsed_steps = int(self._num_steps[k])  # noqa: SLF001
         try:
             found = self._made.get_wrapper_attr(name)
-            if not callable(found):
-                return found
-            try:
-                return found(*args, **kwargs)
-            finally:
-                self._note_options(self._task.place)
+            if name in _READERS:
+                found = found(*args)
         finally:
             self._take_back(k)
             self.env.data = self._data
-            state = np.empty_like(self._simulations.rows[k])
-            state_of(self.env.model, data, state)
-            if not np.array_equal(state, self._simulations.rows[k], equal_nan=True):
-                self._task.put(k, data)
-            if self._limiter is not None and self._limiter._elapsed_steps is not None:  # noqa: SLF001
-                self._began[k] = self._clock - self._limiter._elapsed_steps  # noqa: SLF001
-                self._soonest = 0
+        if callable(found):
+            raise NotImplementedError(
+                f"{name}() can't be called for simulations that are stepped together: read "
+                "attributes, such as data, or make separate envs (vectorization_mode='async')"
+            )
+        return found
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value.
@@ -498,7 +458,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             "simulations": self._simulations.save_state(),
             "place": None if self._task.place is None else self._task.place.copy(),
             "own": self._own,
-            "randomizer": None if self._randomizer is None else self._randomizer.save_state(),
             **{name: getattr(self, name) for name in _STATE},
         }
 
@@ -507,15 +466,10 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
         Raises:
             ValueError: it is that of another model, another number of simulations, another mode or
-                step limit, or of simulations with another `randomize`; nothing was changed.
+                step limit; nothing was changed.
         """
         if state["kind"] != self._kind:
             raise ValueError(f"the state is of a batch with {state['kind']}, not {self._kind}")
-        drawn = state["randomizer"]
-        if self._randomizer is not None:
-            self._randomizer.check_fits(drawn)
-        elif drawn is not None:
-            raise ValueError("the snapshot's simulations are randomized, and this env's are not")
         was_whole, self._is_whole = self._is_whole, False
         try:
             load_state(self._made, state["env"])
@@ -526,8 +480,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._simulations.load_state(state["simulations"])
         self._own = [dict(own) for own in state["own"]]
         self._unknown.update(range(self.num_envs))
-        if self._randomizer is not None:
-            self._randomizer.load_state(drawn)
         for name in _STATE:
             setattr(self, name, state[name])
         self._is_whole = True
@@ -557,12 +509,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         del kwargs
         self._simulations.close()
         cast("gym.Env[Any, Any]", self.env).close()
-
-
-def _attribute(name: str, value: Any, *, force: bool = True) -> tuple[str, Any]:
-    """Return name and value from the arguments of `set_wrapper_attr`."""
-    del force
-    return name, value
 
 
 def _shared(name: str) -> ValueError:

@@ -7,34 +7,28 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from rlightning_aio.envs.mujoco.task import Columns
 
-__all__ = ["Begun", "Finished", "of_resets", "of_step"]
+__all__ = ["Begun", "Finished", "of_step"]
 
 Infos = dict[str, Any]
 
 
 class Begun(NamedTuple):
-    """Simulations that were reset: their ids, and their infos as columns or one by one."""
+    """Simulations that were reset: their ids, and their infos."""
 
     ids: NDArray[np.intp]
-    columns: Columns | None
-    each: Sequence[Infos] = ()
+    columns: Columns
 
-    def added(self, infos: Infos, count: int, add_info: Any) -> Infos:
+    def added(self, infos: Infos, count: int) -> Infos:
         """Add their infos to those of all `count` simulations."""
         ids = self.ids
-        columns: Infos = {} if self.columns is None else self.columns()
-        for name, values in columns.items():
+        for name, values in self.columns().items():
             mask = infos.setdefault("_" + name, np.zeros(count, np.bool_))
             column = infos.setdefault(name, np.zeros((count, *values.shape[1:]), values.dtype))
             column[ids], mask[ids] = values, True
-        for k, info in zip(ids.tolist(), self.each, strict=False):
-            infos = add_info(infos, info, k)
         return infos
 
 
@@ -43,11 +37,6 @@ class Finished(NamedTuple):
 
     mask: NDArray[np.bool_]
     last: NDArray[Any]
-
-
-def of_resets(begun: Begun, count: int, add_info: Any) -> Infos:
-    """Infos of a reset of some of `count` simulations."""
-    return begun.added({}, count, add_info)
 
 
 def of_step(
@@ -83,7 +72,7 @@ def of_step(
     for k, info in failures.items():
         infos = add_info(infos, info, k)
     if instead is not None:
-        infos = instead.added(infos, count, add_info)
+        infos = instead.added(infos, count)
     if ended is None or begun is None:
         return infos
     final = np.full(count, None, object)
@@ -91,7 +80,7 @@ def of_step(
         final[k] = row
     mask = ended.mask
     infos, final_info = _only(infos, ~mask), _only(infos, mask)
-    infos = begun.added(infos, count, add_info)
+    infos = begun.added(infos, count)
     infos.update(final_obs=final, _final_obs=mask.copy())
     infos.update(final_info=final_info, _final_info=mask.copy())
     return infos

@@ -16,7 +16,7 @@ import sys
 from ctypes import c_double, c_int64, c_void_p
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -65,7 +65,7 @@ class FieldPart(NamedTuple):
         kind: ``copy``, clipped; ``squares``, the sum of squares of the clipped values; ``within``,
             1 if all are between `low` and `high`, else 0; ``also_within``, the same, and to be
             joined to the part before, which is 0 then; ``centre``, of places of bodies in the
-            plane, with their `weights`, of all simulations or ``[n, bodies]``.
+            plane, with their `weights`.
     """
 
     field: str
@@ -76,13 +76,12 @@ class FieldPart(NamedTuple):
     kind: Literal["copy", "squares", "within", "also_within", "centre"] = "copy"
     weights: NDArray[np.float64] | None = None
 
-    def of(self, field: NDArray[Any], ids: Any) -> NDArray[Any]:
-        """Make the part of fields ``[n, ...]`` of the simulations `ids`."""
+    def of(self, field: NDArray[Any]) -> NDArray[Any]:
+        """Make the part of fields ``[n, ...]`` of n simulations."""
         if self.weights is not None:
-            weights = self.weights if self.weights.ndim == 1 else self.weights[ids].T
             places = np.ascontiguousarray(field[..., :2].transpose(1, 2, 0))
-            scales = weights.reshape(len(weights), 1, -1)
-            return (np.add.reduce(scales * places, axis=0) / self.weight_of(ids)).T
+            scaled = self.weights[:, np.newaxis, np.newaxis] * places
+            return (np.add.reduce(scaled, axis=0) / np.add.reduce(self.weights)).T
         found = field.reshape(len(field), math.prod(field.shape[1:]))[:, self.first : self.stop]
         if self.kind.endswith("within"):
             return np.all((self.low < found) & (found < self.high), axis=1, keepdims=True)
@@ -91,11 +90,6 @@ class FieldPart(NamedTuple):
         if self.kind == "squares":
             return np.add.reduce(np.square(found), axis=1, keepdims=True)
         return found
-
-    def weight_of(self, ids: Any) -> Any:
-        """Sum of the weights."""
-        weights = cast("NDArray[np.float64]", self.weights)
-        return np.add.reduce(weights if weights.ndim == 1 else weights[ids], axis=-1)
 
     def width(self, template: Any) -> int:
         """The number of values that it adds to those before."""
@@ -178,7 +172,6 @@ class _Part(ctypes.Structure):
         ("low", c_double),
         ("high", c_double),
         ("weights", c_void_p),
-        ("weights_row", c_int64),
         ("is_column", c_int64),
         ("place", c_int64),
     )
@@ -253,6 +246,10 @@ class AdvancePlan(ctypes.Structure):
     )
 
 
+_PLAN_SIZE: Final = AdvancePlan.parts.offset + ctypes.sizeof(_Part)
+"""As the compiled function has it: up to its first part, and of that."""
+
+
 def _most_references(arrays: tuple[NDArray[Any], ...]) -> int:
     """Return the most references to one of the arrays, those of views and tensors included."""
     return max(map(sys.getrefcount, arrays))
@@ -309,7 +306,6 @@ class Outputs:
             slot.place = place - (part.kind == "also_within")
             if part.weights is not None:
                 slot.weights = address_of(part.weights)
-                slot.weights_row = slot.count // 3 if part.weights.ndim == 2 else 0
             place += part.width(template)
 
     def _made(
@@ -364,7 +360,7 @@ class Outputs:
     ) -> None:
         first = 0
         for part in parts:
-            found = part.of(fields[part.field], ids)
+            found = part.of(fields[part.field])
             if part.kind == "also_within":
                 first -= 1
                 found = found & (rows[ids, first : first + 1] != 0)
@@ -385,7 +381,7 @@ def compiled() -> int | None:
         from rlightning_aio.envs.mujoco import _advance
     except ImportError:
         return None
-    is_ours = getattr(_advance, "PLAN_SIZE", None) == AdvancePlan.parts.offset
+    is_ours = getattr(_advance, "PLAN_SIZE", None) == _PLAN_SIZE
     return _advance.ADVANCE if is_ours else None
 
 

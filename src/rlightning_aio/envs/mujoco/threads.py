@@ -35,7 +35,7 @@ from rlightning_aio.envs.mujoco.outputs import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Simulations", "state_of"]
+__all__ = ["Simulations"]
 
 # Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
@@ -82,7 +82,6 @@ def _library() -> Any:
         ("state", c_void_p),
         ("stateComponent", c_void_p),
         ("output", c_void_p),
-        ("expand", c_void_p),
         ("warning", c_void_p),
         ("status", c_void_p),
         ("error", c_char_p),
@@ -92,7 +91,7 @@ def _library() -> Any:
     return library
 
 
-def state_of(model: Any, data: Any, row: NDArray[np.float64]) -> None:
+def _state_of(model: Any, data: Any, row: NDArray[np.float64]) -> None:
     """Write the integration state of `data` to `row`."""
     mujoco.mj_getState(model, data, row, _INTEGRATION)
 
@@ -101,11 +100,10 @@ class Simulations:
     """Simulations of one model.
 
     Args:
-        model: shared by all simulations, so changes of it take effect; copied if `own_models`.
+        model: shared by all simulations, so changes of it take effect.
         count: the number of simulations.
         num_threads: number of threads for steps, including the caller's.
         forces: compute contact forces (``cfrc_ext``) after each step.
-        own_models: each simulation has its own values of fields passed to `expand`.
 
     Attributes:
         rows: states of the simulations, ``[count, ...]`` float64.
@@ -124,15 +122,7 @@ class Simulations:
         NotImplementedError: MuJoCo is older than 3.17.
     """
 
-    def __init__(
-        self,
-        model: Any,
-        count: int,
-        num_threads: int,
-        *,
-        forces: bool,
-        own_models: bool = False,
-    ) -> None:
+    def __init__(self, model: Any, count: int, num_threads: int, *, forces: bool) -> None:
         self._library = library = _library()
         self.count, self._model = count, model
         self._template = mujoco.MjData(model)
@@ -151,11 +141,9 @@ class Simulations:
         if not address:
             raise RuntimeError(f"MuJoCo can't make {count} simulations: {error.value.decode()}")
         self._batch = c_void_p(address)
-        self._own_models = own_models
         self.close = weakref.finalize(self, library.mjb_deleteBatch, c_void_p(address))
-        if not own_models:
-            models = (c_void_p * count)(*[model._address] * count)  # noqa: SLF001
-            library.mjb_setModels(self._batch, models)
+        models = (c_void_p * count)(*[model._address] * count)  # noqa: SLF001
+        library.mjb_setModels(self._batch, models)
         size = library.mjb_nstate(self._batch)
         self.rows = _array(library.mjb_state(self._batch), np.float64, (count, size))
         self._signature = _moving(model)
@@ -181,7 +169,6 @@ class Simulations:
         warnings = _array(library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2))
         self._warned, self._warnings = warnings.view(np.int64).reshape(-1), warnings[..., 1]
         self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
-        self._expanded: dict[str, NDArray[Any]] = {}
         self.busy_ns = 0
 
     def _planned(self) -> AdvancePlan:
@@ -274,55 +261,6 @@ class Simulations:
         address = self._library.mjb_output(self._batch, name.encode(), byref(size), byref(width))
         return _array(address, _DTYPES[width.value], (self.count, *shape))
 
-    # -- models -------------------------------------------------------------------------
-
-    def expand(self, name: str) -> NDArray[Any]:
-        """Give each simulation its own value of a model field, initially that of the model.
-
-        Call `set_const` after a change.
-
-        Args:
-            name: of the field, in `MjModel` or, after ``opt.``, in `MjOption`.
-
-        Returns:
-            The values, ``[count, ...]``.
-
-        Raises:
-            AttributeError: there is no such field, or it can't differ.
-        """
-        owner = self._model.opt if name.startswith("opt.") else self._model
-        template: NDArray[Any] = np.asarray(getattr(owner, name.removeprefix("opt."), None))
-        width, address = c_int(), None
-        if template.dtype.kind == "f":
-            encoded = name.encode()
-            address = self._library.mjb_expand(self._batch, encoded, None, byref(width))
-        if not address:
-            raise AttributeError(f"MuJoCo has no number {name!r} that simulations can differ in")
-        found = _array(address, _DTYPES[width.value], (self.count, *template.shape))
-        self._expanded[name] = found
-        return found
-
-    def model_field(self, name: str, ids: Any = ...) -> NDArray[Any]:
-        """A field of the model: that of each simulation in `ids` if they differ in it."""
-        found = self._expanded.get(name)
-        return getattr(self._model, name) if found is None else found[ids]
-
-    def set_const(self, ids: NDArray[np.int32] | None = None) -> None:
-        """Compute the fields that depend on others, in the models of all simulations or of `ids`.
-
-        Raises:
-            ValueError: MuJoCo refuses the values.
-        """
-        chosen, count = _chosen(ids)
-        if self._library.mjb_setConst(self._batch, chosen, count):
-            raise ValueError(f"MuJoCo refuses a model: {'; '.join(self._failures().values())}")
-
-    def show_model(self, k: int) -> None:
-        """Write the model of simulation `k` to the common model, if simulations differ."""
-        if self._own_models:
-            address = c_void_p(self._model._address)  # noqa: SLF001
-            self._library.mjb_getModel(self._batch, k, address)
-
     # -- steps --------------------------------------------------------------------------
 
     def advance(
@@ -406,7 +344,7 @@ class Simulations:
         failures: dict[int, str] = {}
         if len(begun):
             mujoco.mj_resetData(self._model, self._template)
-            state_of(self._model, self._template, first := np.empty_like(self.rows[0]))
+            _state_of(self._model, self._template, first := np.empty_like(self.rows[0]))
             self.rows[begun], nq = first, self._model.nq
             self._field("qpos")[begun] = self.starts[begun, :nq]
             self._field("qvel")[begun] = self.starts[begun, nq:]
@@ -453,7 +391,7 @@ class Simulations:
 
     def put(self, k: int, data: Any) -> None:
         """Continue simulation `k` from `data`, and copy its parts to the columns."""
-        state_of(self._model, data, self.rows[k])
+        _state_of(self._model, data, self.rows[k])
         self.before[k] = self.moving[k]
         self.begin(k)
         fields = {part.field: getattr(data, part.field)[np.newaxis] for part in self._parts}
@@ -461,7 +399,6 @@ class Simulations:
 
     def data_of(self, k: int) -> Any:
         """All data of simulation `k` after its last step, by repeating that step."""
-        self.show_model(k)
         data, num_steps = mujoco.MjData(self._model), int(self.num_steps[k])
         state, before = self.rows[k].copy(), self.before[k]
         state[: len(before)] = before

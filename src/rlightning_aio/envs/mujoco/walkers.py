@@ -295,9 +295,8 @@ class Humanoid(Walker):
         return observed_of_humanoid(self.env)
 
     def watched(self) -> list[FieldPart]:
-        masses = self.simulations.model_field("body_mass")  # Changes show here.
         return [
-            FieldPart("xipos", kind="centre", weights=masses),
+            FieldPart("xipos", kind="centre", weights=self.env.model.body_mass),
             FieldPart("qpos", 0, 3),
             FieldPart("qpos", 2, 3, *self.env._healthy_z_range, kind="within"),
             *costs_and_tendons(),

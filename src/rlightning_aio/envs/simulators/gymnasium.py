@@ -15,7 +15,6 @@ from rlightning_aio.envs.background import Background
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.fast_path import BareReset, BareStep, BareStepAsync, BareStepWait, FastPath
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
-from rlightning_aio.errors import ConfigError
 from rlightning_aio.sharing import check_threads, num_cores
 from rlightning_aio.trees import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
@@ -157,19 +156,12 @@ class MujocoEnv(GymnasiumEnv):
     """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …).
 
     With ``num_envs`` a task of version 5 is stepped by MuJoCo's threads, as many as
-    ``env_kwargs.num_threads`` says, with models that differ as ``env_kwargs.randomize`` says; see
-    `mujoco_batch`.
+    ``env_kwargs.num_threads`` says; see `MujocoBatch`.
     """
 
     def _make(self) -> Any:
         num_threads = self.config.env_kwargs.pop("num_threads", None)
-        randomize = self.config.env_kwargs.pop("randomize", None)
         check_threads(f"env {self.env_id!r}: env_kwargs.num_threads", num_threads)
-        if randomize and self.config.num_envs == 1:
-            raise ConfigError(
-                f"env {self.env_id!r}: env_kwargs.randomize needs simulations that are stepped "
-                "together: num_envs above 1"
-            )
         with outdated_assets_accepted():
             if self.config.num_envs == 1:
                 return super()._make()
@@ -183,9 +175,7 @@ class MujocoEnv(GymnasiumEnv):
                     # The envs of an entry compute at the same time, here and in workers.
                     num_threads = max(1, num_threads // config.num_workers)
             try:
-                return MujocoBatch(
-                    one, self.config.num_envs, num_threads=num_threads, randomize=randomize
-                )
+                return MujocoBatch(one, self.config.num_envs, num_threads=num_threads)
             except NotImplementedError as error:
                 one.close()
                 warnings.warn(
