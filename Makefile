@@ -208,7 +208,7 @@ $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	grep -vE '^(mujoco|numpy|opencv|pygame-ce)' constraints.txt > $(ROBOTS)/constraints.txt
 	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable '.[metaworld,pusht,aloha]' \
 	    anyio hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
-	$(PIP_INSTALL) --no-deps openpi-client==0.1.2 vla-eval==0.8.0
+	$(PIP_INSTALL) --no-deps openpi-client==0.1.2
 	@touch $@
 
 $(LEROBOT)/bin/python: PYTHON := $(PYTHON_OF_LEROBOT)

@@ -29,7 +29,7 @@ MODULES: Final = {
     "": "the package", "sync": "blocking", "vector": "vector", "sb3": "vector",
     "collecting": "collecting", "normalize": "collecting", "evaluation": "evaluation",
     "attempts": "attempts",
-    "policies": "evaluation", "plugins.policy_servers": "evaluation",
+    "policies": "evaluation", "plugins.openpi": "evaluation",
     "plugins.lerobot": "evaluation", "plugins.export": "evaluation",
     "remote": "remote",
     "errors": "errors", "spaces": "envs", "envs.fast_path": "envs",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).resolve().parent.parent
 SRC = ROOT / "src" / "rlightning_aio"
 SMALL = [
-    "__init__", "__main__", "calling", "errors", "files", "json_text", "loop_thread", "outcomes",
+    "__init__", "__main__", "calling", "errors", "files", "json_text", "outcomes",
     "sealing", "sharing", "spaces", "sync", "trees", "types",
 ]  # fmt: skip
 """Modules beside the packages of the engine that belong to it."""

@@ -24,7 +24,6 @@ INTERNAL |= {
     "calling",
     "files",
     "json_text",
-    "loop_thread",
     "outcomes",
     "plugins",
     "trees",
@@ -246,7 +245,7 @@ def test_plug_ins_use_only_names_of_the_reference() -> None:
                     used |= {f"{module}.{name.name}" for name in node.names}
     assert used - described == set()
     for name in (
-        "policy_servers.OpenPiPolicy",
+        "openpi.OpenPiPolicy",
         "lerobot",
         "export",
     ):

@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import threading
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,6 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.loop_thread import LoopThread
 from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerRefused
 
 if TYPE_CHECKING:
@@ -147,20 +147,27 @@ async def test_sessions_outlive_a_learner_that_holds_the_event_loop() -> None:
             await (await socket.ping())
         return len(server.sockets)
 
-    thread, server = LoopThread("server"), Misbehaving(capacity=ENVS)
-    thread.submit(server.__aenter__()).result()
+    def there(coroutine: Any) -> Any:
+        return asyncio.run_coroutine_threadsafe(coroutine, loop).result(HANG)
+
+    loop, server = asyncio.new_event_loop(), Misbehaving(capacity=ENVS)
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    there(server.__aenter__())
     try:
         config = {"name": "o", "backend": "openenv", "task": server.url, "num_workers": ENVS}
         async with rl.build_env_group(config) as group:
             await group.reset()
             assert len(group.get_workers()) == 1
             # It waits for the answers without its event loop, as a learner computes.
-            assert thread.submit(ping_all()).result(HANG) == ENVS
+            assert there(ping_all()) == ENVS
             batch, _ = await group.step(steps_of(*group.env_ids))
             assert not batch.truncated.any()
     finally:
-        thread.submit(server.__aexit__()).result()
-        thread.close()
+        there(server.__aexit__())
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
 
 
 @on_asyncio

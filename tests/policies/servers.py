@@ -1,7 +1,7 @@
-"""Policy servers as threads of the test: openpi's protocol and vla-eval's, by `websockets`.
+"""A policy server as a thread of the test: openpi's protocol, by `websockets`.
 
-Their codecs are written here from the protocols alone, with plain msgpack, and so are independent
-of those of the clients. `test_real_servers.py` has the two projects' own servers.
+Its codec is written here from the protocol alone, with plain msgpack, and so is independent of
+that of the client. `test_real_servers.py` has openpi's own.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ if TYPE_CHECKING:
     from websockets.sync.server import ServerConnection
 
 
-def packed(value: Any, *, as_bytes: bool) -> bytes:
+def packed(value: Any) -> bytes:
     def mapped(array: Any) -> Any:
-        fields = {
-            "__ndarray__": True, "data": array.tobytes(), "dtype": array.dtype.str,
-            "shape": list(array.shape),
+        return {
+            b"__ndarray__": True, b"data": array.tobytes(), b"dtype": array.dtype.str,
+            b"shape": list(array.shape),
         }  # fmt: skip
-        return {key.encode() if as_bytes else key: inner for key, inner in fields.items()}
 
     return msgspec.msgpack.encode(value, enc_hook=mapped)
 
@@ -72,7 +71,7 @@ class OpenPiServer:
 
     def __call__(self, connection: ServerConnection) -> None:
         self.connections += 1
-        connection.send(packed({"name": "stand-in"}, as_bytes=True))
+        connection.send(packed({"name": "stand-in"}))
         for frame in connection:
             observation = unpacked(frame)
             self.seen.append(observation)
@@ -81,45 +80,4 @@ class OpenPiServer:
     def answer(self, connection: ServerConnection, observation: dict[str, Any]) -> None:
         actions = chunk_of(observation["observation/state"])
         timing = {"infer_ms": 0.5}
-        connection.send(packed({"actions": actions, "server_timing": timing}, as_bytes=True))
-
-
-class VlaEvalServer:
-    """Answers an observation with the chunk of its session, or its next action."""
-
-    def __init__(self, *, chunks: bool = True) -> None:
-        self.chunks = chunks
-        self.tasks: list[Any] = []
-        self.ended = 0
-
-    def __call__(self, connection: ServerConnection) -> None:
-        steps, in_episode = 0, False
-        for frame in connection:
-            message = unpacked(frame)
-            kind, payload, seq = message["type"], message["payload"], message["seq"]
-            assert isinstance(message["timestamp"], float)
-            if kind == "hello":
-                self.send(connection, "hello", {"protocol_version": 1}, seq)
-            elif kind == "episode_start":
-                assert not in_episode
-                in_episode, steps = True, 0
-                self.tasks.append(payload["task"])
-            elif kind == "episode_end":
-                assert in_episode
-                in_episode = False
-                self.ended += 1
-            elif kind == "observation":
-                assert in_episode
-                self.answer(connection, payload, seq, steps)
-                steps += 1
-
-    def answer(self, connection: ServerConnection, payload: Any, seq: int, steps: int) -> None:
-        seed = payload["state"][0]
-        actions = chunk_of(payload["state"])
-        if not self.chunks:
-            actions = np.array([seed, steps - steps % 3, steps % 3])
-        self.send(connection, "action", {"actions": actions}, seq)
-
-    def send(self, connection: ServerConnection, kind: str, payload: Any, seq: int) -> None:
-        message = {"type": kind, "payload": payload, "seq": seq, "timestamp": 0.5}
-        connection.send(packed(message, as_bytes=False))
+        connection.send(packed({"actions": actions, "server_timing": timing}))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cli.command import invoke, invoke_json, write_config
 from policies.counting import chunk_of
-from policies.servers import OpenPiServer, VlaEvalServer, serving
+from policies.servers import OpenPiServer, serving
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,19 +28,6 @@ def check(document: Any) -> None:
         *range(4)
     ]
     assert all(row["reward"] == row["length"] == row["seed"] + 4 for row in document["attempts"])
-
-
-@pytest.mark.parametrize("server", [OpenPiServer(), VlaEvalServer()], ids=["openpi", "vla-eval"])
-def test_a_policy_server_is_named_by_its_address(
-    server: Any, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    """Actions of its chunks are played open loop."""
-    config = write_config(tmp_path, ENTRY)
-    with serving(server) as url:
-        policy = url.replace("ws", request.node.callspec.id, 1)
-        check(
-            invoke_json("eval", config, "--policy", policy, "--action-steps", 3, "--seeds", "0:4")
-        )
 
 
 def test_all_actions_of_openpi_s_chunks_are_played_by_default(tmp_path: Path) -> None:
@@ -64,7 +51,7 @@ def test_a_policy_of_a_module_may_return_chunks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["--policy", "http://localhost:1"], 2, "should begin with openpi:// or vla-eval://"),
+        (["--policy", "http://localhost:1"], 2, "should begin with openpi://"),
         (["--policy", "openpi://localhost:x"], 2, "should look like ws://localhost:8000"),
         (["--policy", "openpi://"], 2, "should look like ws://localhost:8000"),
         (["--action-steps", 2], 2, "is for policies that return chunks, not 'random'"),

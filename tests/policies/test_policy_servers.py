@@ -1,9 +1,8 @@
-"""Clients of policy servers: answers, lost connections, errors, and servers that misbehave."""
+"""The client of openpi's policy server: answers, errors, and servers that misbehave."""
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
 import logging
 import socket
 import threading
@@ -13,13 +12,14 @@ import numpy as np
 import pytest
 from patience import HANG
 from policies.counting import QUEUE, Counting, check, group_of
-from policies.servers import OpenPiServer, VlaEvalServer, packed, serving
+from policies.servers import OpenPiServer, packed, serving
+from websockets.sync.client import connect
 
 import rlightning_aio as rl
 from rlightning_aio.errors import PolicyServerError
 from rlightning_aio.evaluation import evaluate
-from rlightning_aio.plugins.policy_servers import OpenPiPolicy, VlaEvalPolicy, client
-from rlightning_aio.plugins.policy_servers.connection import Address, connected
+from rlightning_aio.plugins import openpi
+from rlightning_aio.plugins.openpi import OpenPiPolicy
 from rlightning_aio.policies import ActionChunks
 
 
@@ -39,64 +39,36 @@ def test_chunks_of_an_openpi_server_are_played() -> None:
     seen = {(one["prompt"], *one["observation/state"].tolist()) for one in server.seen}
     asked = {(one.seed, step) for one in QUEUE for step in range(0, one.seed + 4, 3)}
     assert seen == {(f"lift {seed}", seed, step) for seed, step in asked}
-    assert server.connections == 2
+    assert server.connections == 1
 
 
-@pytest.mark.parametrize("chunks", [True, False])
-def test_actions_of_a_vla_eval_server_are_played(chunks: bool) -> None:
-    """Each env is a session, in which the server is told where episodes begin and end."""
-    server = VlaEvalServer(chunks=chunks)
-    with serving(server) as url, VlaEvalPolicy(url) as policy:
-        found = evaluated(
-            ActionChunks(policy, 3) if chunks else policy, 3, env_kwargs={"breaks": True}
-        )
-    check(found)
-    texts = sorted(task["task_description"] for task in server.tasks)
-    assert texts == sorted(
-        f"lift {one.spec.seed}" for one in found.attempts for _ in range(len(one.failures) + 1)
-    )
-    assert all(task["name"] == task["task_description"] for task in server.tasks)
-    assert server.ended == len(server.tasks) - 3
-
-
-async def test_they_are_awaited_over_an_asynchronous_group() -> None:
-    """The loop of the group goes on while a server computes."""
+async def test_an_asynchronous_group_may_ask_it_in_a_thread() -> None:
+    """Called as it is, it would hold the event loop until the server has answered."""
     entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": 2}
     with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
+
+        async def asked(batch: rl.BatchedData) -> Any:
+            return await asyncio.to_thread(policy, batch)
+
         async with rl.build_env_group(entry) as group:
             with group.auto_reset(100):
-                check(await evaluate(group, ActionChunks(policy, 3), QUEUE))
+                check(await evaluate(group, ActionChunks(asked, 3), QUEUE))
 
 
-async def test_a_synchronous_group_waits_for_them_in_a_running_loop() -> None:
-    """As in a notebook, where whoever steps such a group can await nothing."""
-    with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
-        check(evaluated(ActionChunks(policy, 3)))
-        with group_of(env_kwargs={"period": 1}) as group:
-            batch, _ = group.reset(seed=0)
-            for number in range(3):
-                chunks = policy(batch)
-                assert chunks.shape == (2, 5, 3)
-                batch, _ = group.step(batch.respond(action=chunks[:, 0]))
-                assert batch.reward.tolist() == [1, 1]
-                assert (batch.observation[:, 1] == number + 1).all()
+def test_a_lost_connection_is_an_error_and_the_next_call_connects_again() -> None:
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            if len(self.seen) == 1:
+                connection.close()
+            else:
+                super().answer(connection, observation)
 
-
-async def test_an_answer_that_nobody_awaits_was_not_asked_for() -> None:
-    """The client can be used on; while an answer is awaited, a second one is refused."""
-    entry = {"name": "env", "task": Counting, "placement": "inline"}
-    server = OpenPiServer()
+    server = Server()
     with serving(server) as url, OpenPiPolicy(url) as policy:
-        async with rl.build_env_group(entry) as group:
-            batch, _ = await group.reset(seed=0)
-            policy(batch).close()
-            assert not server.connections
-            first = asyncio.create_task(policy(batch))
-            await asyncio.sleep(0)
-            with pytest.raises(RuntimeError, match="is waiting for answers"):
-                await policy(batch)
-            assert (await first).shape == (1, 5, 3)
-            assert (await policy(batch)).shape == (1, 5, 3)
+        with pytest.raises(PolicyServerError, match="has closed the connection in place of an"):
+            evaluated(ActionChunks(policy, 3))
+        check(evaluated(ActionChunks(policy, 3)))
+    assert server.connections == 2
 
 
 def test_what_is_sent_can_be_chosen(caplog: pytest.LogCaptureFixture) -> None:
@@ -128,23 +100,7 @@ def test_what_is_sent_can_be_chosen(caplog: pytest.LogCaptureFixture) -> None:
     assert [server.seen[0][key] for key in ("gripper", "n", "ok")] == [0.5, 3, True]
 
 
-# -- lost connections ---------------------------------------------------------------------
-
-
-def test_an_openpi_server_is_asked_again_over_another_connection() -> None:
-    """It keeps nothing about episodes, so its answer is the same."""
-
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            if len(self.seen) % 3:
-                super().answer(connection, observation)
-            else:
-                connection.close()
-
-    server = Server()
-    with serving(server) as url, OpenPiPolicy(url) as policy:
-        check(evaluated(ActionChunks(policy, 3)))
-    assert server.connections > 2
+# -- servers that are wrong ---------------------------------------------------------------
 
 
 def test_a_server_that_starts_late_is_waited_for() -> None:
@@ -165,27 +121,6 @@ def test_a_server_that_starts_late_is_waited_for() -> None:
         with serving(OpenPiServer(), port):
             thread.join()
     check(found[0])
-
-
-def test_a_session_that_is_lost_within_an_episode_is_an_error() -> None:
-    """The server has forgotten the episode."""
-
-    class Server(VlaEvalServer):
-        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
-            if steps == 2:
-                connection.close()
-            super().answer(connection, payload, seq, steps)
-
-    message = r"has closed the connection of env-\d in place of an answer: .*what it knew"
-    with (
-        serving(Server(chunks=False)) as url,
-        VlaEvalPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match=message),
-    ):
-        evaluated(policy)
-
-
-# -- servers that are wrong ---------------------------------------------------------------
 
 
 def test_a_missing_server_is_named() -> None:
@@ -209,24 +144,25 @@ def test_a_server_that_opens_no_connection_is_named() -> None:
         evaluated(policy)
 
 
-@pytest.mark.parametrize("kind", [OpenPiPolicy, VlaEvalPolicy])
-def test_a_silent_server_is_an_error(kind: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the time for an answer; before or after the first frames."""
+@pytest.mark.parametrize("greets", [True, False])
+def test_a_silent_server_is_an_error(greets: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the time for an answer; before or after the first frame."""
 
-    def patiently(address: Address) -> Any:
+    def patiently(url: str, **options: Any) -> Any:
         """Connect; on a busy machine, that takes longer than the answer may take here."""
-        return connected(dataclasses.replace(address, timeout=HANG))
-
-    monkeypatch.setattr(client, "connected", patiently)
+        return connect(url, **{**options, "open_timeout": HANG})
 
     def handler(connection: Any) -> None:
+        if greets:
+            connection.send(packed({}))
         for _ in connection:
             pass
 
+    monkeypatch.setattr(openpi, "connect", patiently)
     with (
         serving(handler) as url,
-        kind(url, timeout=0.2) as policy,
-        pytest.raises(PolicyServerError, match=r"has not answered env-\d in 0.2 s"),
+        OpenPiPolicy(url, timeout=0.2) as policy,
+        pytest.raises(PolicyServerError, match=r"has not answered in 0.2 s"),
     ):
         evaluated(policy)
 
@@ -247,26 +183,9 @@ def test_the_error_of_an_openpi_server_is_shown() -> None:
         evaluated(policy)
 
 
-def test_the_error_of_a_vla_eval_server_is_shown() -> None:
-    """It is a frame of its own."""
-
-    class Server(VlaEvalServer):
-        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
-            self.send(connection, "error", {"error": "observation_failed: no image"}, seq)
-
-    with (
-        serving(Server()) as url,
-        VlaEvalPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match="observation_failed: no image"),
-    ):
-        evaluated(policy)
-
-
 def array_of(**fields: Any) -> bytes:
     good = {"__ndarray__": True, "data": bytes(24), "dtype": "<f8", "shape": [3]}
-    return packed(
-        {"actions": {k.encode(): v for k, v in {**good, **fields}.items()}}, as_bytes=True
-    )
+    return packed({"actions": {k.encode(): v for k, v in {**good, **fields}.items()}})
 
 
 @pytest.mark.parametrize(
@@ -277,11 +196,11 @@ def array_of(**fields: Any) -> bytes:
         (b"\x91" * 100_000, "can't be read"),
         (b"\xdd\xff\xff\xff\xff", "can't be read"),
         (b"\xa1\xff", "can't be read"),
-        (b"\xc4\x00", "not a map with 'actions'"),
-        (packed({"action": 1}, as_bytes=True), r"a map with \['action'\], not"),
-        (packed({"actions": "up"}, as_bytes=True), "no numbers"),
-        (packed({"actions": [[1, 2], [3]]}, as_bytes=True), "no numbers"),
-        (packed({"actions": []}, as_bytes=True), "no numbers"),
+        (b"\xc4\x00", "not a map with"),
+        (packed({"action": 1}), r"a map with \['action'\], not one"),
+        (packed({"actions": "up"}), "no numbers"),
+        (packed({"actions": [[1, 2], [3]]}), "no numbers"),
+        (packed({"actions": []}), "no numbers"),
         (array_of(dtype="|O"), "dtype '|O', which is none of numbers"),
         (array_of(dtype="<f8,<f8"), "none of numbers"),
         (array_of(dtype=["<f8"]), "none of numbers"),
@@ -308,7 +227,7 @@ def test_a_frame_that_is_no_answer_is_refused(frame: bytes, message: str) -> Non
 
 def test_a_frame_above_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The connection is closed before it is read."""
-    monkeypatch.setattr("rlightning_aio.plugins.policy_servers.connection.MAX_BYTES", 1000)
+    monkeypatch.setattr("rlightning_aio.plugins.openpi._MAX_BYTES", 1000)
 
     class Server(OpenPiServer):
         def answer(self, connection: Any, observation: dict[str, Any]) -> None:
@@ -322,40 +241,6 @@ def test_a_frame_above_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     ):
         evaluated(policy, 1)
     assert server.connections == 1
-
-
-@pytest.mark.parametrize(
-    "change", [{"seq": 7}, {"type": "hello"}, {"payload": 3}, {"type": ["action"]}]
-)
-def test_a_frame_that_answers_nothing_is_refused(change: dict[str, Any]) -> None:
-    """An answer repeats the number of its request."""
-
-    class Server(VlaEvalServer):
-        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
-            good = {"type": "action", "payload": {}, "seq": seq, "timestamp": 0.0}
-            connection.send(packed({**good, **change}, as_bytes=False))
-
-    with (
-        serving(Server()) as url,
-        VlaEvalPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match=r"in place of the answer|is none of vla-eval's"),
-    ):
-        evaluated(policy)
-
-
-def test_another_version_of_the_protocol_is_refused() -> None:
-    """The server names it in its first frame."""
-
-    class Server(VlaEvalServer):
-        def send(self, connection: Any, kind: str, payload: Any, seq: int) -> None:
-            super().send(connection, kind, {"protocol_version": 2}, seq)
-
-    with (
-        serving(Server()) as url,
-        VlaEvalPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match="speaks version 2 of vla-eval's protocol"),
-    ):
-        evaluated(policy)
 
 
 @pytest.mark.parametrize("url", ["localhost:8000", "http://localhost", "ws://", "ws://a:b", ""])

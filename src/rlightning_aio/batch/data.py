@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final, Protocol, overload
+from typing import TYPE_CHECKING, Any, Final, overload
 
 import msgspec
 import numpy as np
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BatchedData",
-    "Issuer",
     "Origin",
     "answer_of",
     "batch_of_results",
@@ -63,17 +62,6 @@ _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
 """The end of an env's id: its number in the entry, and the name of a client."""
 
 
-class Issuer(Protocol):
-    """What a batch knows of the group that has returned it.
-
-    Attributes:
-        shares_thread: its calls are awaited.
-    """
-
-    @property
-    def shares_thread(self) -> bool: ...
-
-
 class Origin(msgspec.Struct):
     """Group and slots of a batch, so that the answer to it needs no look-up.
 
@@ -82,7 +70,7 @@ class Origin(msgspec.Struct):
         repeats: True if `slots` may have an env twice; the group then looks the envs up.
     """
 
-    issuer: Issuer | None
+    issuer: object | None
     slots: NDArray[np.intp]
     names: EnvNames
     repeats: bool = False
@@ -464,7 +452,7 @@ def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
     )
 
 
-def slots_of(batch: BatchedData, issuer: Issuer) -> NDArray[np.intp] | None:
+def slots_of(batch: BatchedData, issuer: object) -> NDArray[np.intp] | None:
     """Slots of the envs, each once, if the batch is from the group of `issuer`."""
     origin = batch._origin
     if origin is None or origin.issuer is not issuer or origin.repeats:
@@ -493,7 +481,7 @@ def _entry_of(env_id: str) -> str:
 
 def batch_of_results(
     parts: Sequence[ResultColumns],
-    issuer: Issuer | None,
+    issuer: object | None,
     slots: NDArray[np.intp],
     names: EnvNames,
     sources: Sources | None = None,
@@ -523,7 +511,7 @@ def with_repeats(batch: BatchedData) -> BatchedData:
     return batch
 
 
-def answer_of(batch: BatchedData, issuer: Issuer) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
+def answer_of(batch: BatchedData, issuer: object) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
     """Distinct slots, and columns of responses, to results of `issuer`; None for other batches."""
     if type(batch) is not BatchedData or batch._columns is None:
         return None

@@ -8,12 +8,10 @@ whoever calls it awaits it.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.data import origin_of
 from rlightning_aio.errors import BadAction
 from rlightning_aio.trees import is_dict
 
@@ -22,21 +20,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["answers_of", "can_await"]
-
-
-def can_await(batch: BatchedData) -> bool:
-    """Return True if a policy's answer to `batch` may be awaitable.
-
-    Else no event loop is running, or the group is synchronous.
-    """
-    try:
-        asyncio.get_running_loop()
-    except RuntimeError:
-        return False
-    origin = origin_of(batch)
-    issuer = None if origin is None else origin.issuer
-    return issuer is None or issuer.shares_thread
+__all__ = ["answers_of"]
 
 
 def answers_of(
