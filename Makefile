@@ -86,7 +86,7 @@ test-simulators: environments ## the tests of every backend, on the real simulat
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
-	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py tests/envs/test_rendering.py tests/policies/test_real_servers.py
+	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_simulators_page.py tests/envs/test_rendering.py tests/policies/test_real_servers.py
 
 # With -rs, each test that is skipped says what it lacks.
 test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
@@ -206,7 +206,7 @@ $(OPENENV)/installed: | $(OPENENV)/bin/python
 
 $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	grep -vE '^(mujoco|numpy|opencv|pygame-ce)' constraints.txt > $(ROBOTS)/constraints.txt
-	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable '.[metaworld,pusht,aloha]' \
+	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable . metaworld==3.0.0 'mujoco<3.17' 'gym-pusht<0.2' 'gym-aloha<0.2' \
 	    anyio hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
 	$(PIP_INSTALL) --no-deps openpi-client==0.1.2
 	@touch $@

@@ -27,6 +27,7 @@ ELSEWHERE = {
     "metrics": "test_metrics.py",
     "rlightning": "test_docs.py",
     "scaling": "on_ray/test_pages.py",
+    "simulators": "cli/test_simulators_page.py",
     "stable_baselines3": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
     "trainers": "vector/test_pages.py",
@@ -49,7 +50,7 @@ def by_program(written: str) -> dict[str, str]:
 
 # Those of migrating.md are run by vector/test_pages.py.
 NEEDS_MORE = (
-    r"^(import (torch|aiohttp)$|from (libero|metaworld|stable_baselines3)|net = "
+    r"^(import (torch|aiohttp)$|from stable_baselines3|net = "
     r"|from (ray|rl_zoo3|skrl|tianshou|torchrl)\b)"
 )
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)

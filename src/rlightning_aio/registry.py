@@ -139,15 +139,6 @@ BACKENDS: dict[str, Backend] = {
                 "isaaclab", vectorized=True, install=ISAAC_LAB),
         Backend("isaac_marl", f"{_SIMULATORS}.isaac:IsaacMarlEnv",
                 "isaaclab", vectorized=True, install=ISAAC_LAB),
-        Backend("metaworld", f"{_SIMULATORS}.metaworld:MetaworldEnv", "metaworld",
-                install=_of_extra("metaworld"), cpu_bound=True,
-                preload=(f"{_SIMULATORS}.metaworld",)),
-        Backend("pusht", f"{_SIMULATORS}.lerobot_tasks:PushTEnv", "gym_pusht",
-                install=_of_extra("pusht"), cpu_bound=True,
-                preload=(f"{_SIMULATORS}.lerobot_tasks",)),
-        Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha",
-                install=_of_extra("aloha"), cpu_bound=True,
-                preload=(f"{_SIMULATORS}.lerobot_tasks",)),
     )
 }
 # fmt: on

@@ -11,16 +11,14 @@ import pytest
 import rlightning_aio as rl
 from rlightning_aio import sync
 
-pytest.importorskip("metaworld")
+pytest.importorskip("gym_pusht")
+pytest.importorskip("gym_aloha")
 pytestmark = pytest.mark.simulators
 
 PLACE = os.environ.get("MUJOCO_GL", "")
-METAWORLD = {
-    "backend": "metaworld", "task": "reach-v3",
-    "env_kwargs": {"observations": "pixels", "width": 64, "height": 64},
-}  # fmt: skip
-ALOHA = {"backend": "aloha", "task": "AlohaTransferCube-v0", "env_kwargs": {"obs_type": "pixels"}}
-PUSHT = {"backend": "pusht", "task": "PushT-v0", "env_kwargs": {"obs_type": "pixels"}}
+PIXELS = {"backend": "gymnasium", "env_kwargs": {"obs_type": "pixels"}}
+ALOHA = {"task": "gym_aloha:gym_aloha/AlohaTransferCube-v0", **PIXELS}
+PUSHT = {"task": "gym_pusht:gym_pusht/PushT-v0", **PIXELS}
 
 
 def frames(entry: dict[str, Any], **fields: Any) -> Any:
@@ -44,7 +42,7 @@ def frame_of(observation: Any) -> Any:
 
 
 @pytest.mark.skipif(PLACE not in ("egl", "osmesa"), reason="MUJOCO_GL is neither egl nor osmesa")
-@pytest.mark.parametrize("entry", [METAWORLD, ALOHA, PUSHT], ids=lambda entry: entry["backend"])
+@pytest.mark.parametrize("entry", [ALOHA, PUSHT], ids=["aloha", "pusht"])
 def test_workers_render_what_an_env_in_this_process_does(entry: dict[str, Any]) -> None:
     """Each worker with a context of its own; the frames are pictures, and they change."""
     (inline,) = np.moveaxis(frames(entry, placement="inline"), 1, 0)
@@ -62,7 +60,7 @@ def test_workers_render_what_an_env_in_this_process_does(entry: dict[str, Any]) 
 def test_a_worker_renders_on_the_device_of_its_number() -> None:
     """A device that is not there is an error, and named by its variable."""
     devices = {"MUJOCO_GL": "egl", "MUJOCO_EGL_DEVICE_ID": "{process_index}"}
-    assert frames(METAWORLD, env_vars=devices).std() > 10
+    assert frames(ALOHA, env_vars=devices).std() > 10
     devices["MUJOCO_EGL_DEVICE_ID"] = "9{process_index}"
     with pytest.raises(rl.EnvFault, match=r"MUJOCO_EGL_DEVICE_ID.*got 90"):
-        frames(METAWORLD, env_vars=devices)
+        frames(ALOHA, env_vars=devices)

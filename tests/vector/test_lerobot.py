@@ -99,8 +99,9 @@ def test_a_policy_plays_as_in_lerobots_rollout(
     ]
     envs.close()
     entry = {
-        "name": "pusht", "backend": "pusht", "task": "PushT-v0", "num_workers": 3,
-        "max_episode_steps": STEPS, "env_kwargs": {"obs_type": "pixels_agent_pos", **SIZE},
+        "name": "pusht", "backend": "gymnasium", "task": "gym_pusht:gym_pusht/PushT-v0",
+        "num_workers": 3, "max_episode_steps": STEPS,
+        "env_kwargs": {"obs_type": "pixels_agent_pos", **SIZE},
     }  # fmt: skip
     with sync.build_env_group(entry) as group, group.auto_reset():
         loaded = LeRobotPolicy.from_pretrained(tmp_path)

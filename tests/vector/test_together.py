@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import math
 import multiprocessing
 import pickle
 from typing import TYPE_CHECKING, Any
@@ -317,31 +316,11 @@ def test_results_after_a_timeout_are_dropped(tmp_path: Path) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-def test_an_entry_of_vector_environments_of_one_has_results_of_single_envs(
-    mode: AutoresetMode,
-) -> None:
-    """Results have no axis for the only sub-environment; a snapshot holds its state."""
-    makers: dict[str, Any] = {
-        "wrapped": lambda: SyncVectorEnv([lambda: gym.make("CartPole-v1")], autoreset_mode=mode),
-        "plain": lambda: gym.make("CartPole-v1"),
-    }
-    found: list[Any] = []
-    for make in makers.values():
-        config: Any = {"name": "e", "task": make}
-        with sync.build_env_group(config) as group, group.auto_reset(math.inf):
-            batch, _ = group.reset(seed=1)
-            rewards = 0
-            for _ in range(40):
-                batch, _ = group.step(batch.respond(action=np.ones(1, np.int64)))
-                rewards += batch.reward[0]
-            saved = group.snapshot()
-            group.step(batch.respond(action=np.zeros(1, np.int64)))
-            batch, _ = group.restore(saved)
-            found.append((batch.observation, rewards, group.get_env_stats()["e-0"]["episodes"]))
-    if mode == AutoresetMode.SAME_STEP:  # Its resets take no steps.
-        found = [one[2] > 3 for one in found]
-    assert_alike(found[0], found[1])
+def test_an_entry_of_vector_environments_of_one_is_refused() -> None:
+    """They would have an axis that no single env has."""
+    config: Any = {"name": "e", "task": functools.partial(SyncVectorEnv, [Toy]), **INLINE}
+    with pytest.raises(ConfigError, match="a SyncVectorEnv of one env; return that env itself"):
+        sync.build_env_group(config).init()
 
 
 @pytest.mark.parametrize(

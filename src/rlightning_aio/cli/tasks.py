@@ -42,17 +42,12 @@ def _of_maniskill() -> Iterable[str]:
     return importlib.import_module("mani_skill.utils.registration").REGISTERED_ENVS
 
 
-def _of_metaworld() -> Iterable[str]:
-    return importlib.import_module("metaworld.env_dict").ALL_V3_ENVIRONMENTS
-
-
 _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "gymnasium": _of_gymnasium,
     "mujoco": _of_mujoco,
     "ale": _of_ale,
     "pettingzoo": _of_pettingzoo,
     "maniskill": _of_maniskill,
-    "metaworld": _of_metaworld,
 }
 
 

@@ -158,7 +158,7 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         return self._last.copy(), {}
 
     def _identity(self) -> dict[str, str]:
-        """What the envs of a snapshot must share, by name."""
+        """Return what the envs of a snapshot must share, by name."""
         task = "" if self.spec is None else self.spec.id
         kind = {name: str(value) for name, value in self._kind.items()}
         versions = {"version of mujoco": version("mujoco")}

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rlightning_aio.envs.adapted.only_sub_env import OnlySubEnv
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.fast_path import FastPath
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, outdated_assets_accepted
@@ -91,8 +90,14 @@ class _GivenEnv(GymnasiumEnv):
                 f"{f'{made.num_envs} of them' if is_vector else 'a single env'}; leave "
                 "num_envs out"
             )
+        if is_vector and made.num_envs == 1:
+            kind = type(made.unwrapped).__name__
+            raise ConfigError(
+                f"entry {config.name!r}: its callable returned a {kind} of one env; return that "
+                "env itself"
+            )
         if config.max_episode_steps is None:
-            return OnlySubEnv(made) if is_vector and made.num_envs == 1 else made
+            return made
         if is_vector:
             raise ConfigError(
                 f"entry {config.name!r}, max_episode_steps: a vector env keeps its own limits; set "

@@ -98,7 +98,7 @@ class ManiskillEnv(BaseEnv):
         if given.get("obs_mode") not in MODES_WITHOUT_RENDERING or given.get("render_mode"):
             raise ConfigError(
                 f"env {self.env_id!r}: env_kwargs ask for images, but no Vulkan device is usable "
-                "here; install a GPU's driver or a recent Mesa (see docs/maniskill.md), or use "
+                "here; install a GPU's driver or a recent Mesa (see docs/simulators.md), or use "
                 "obs_mode: state without a render_mode"
             )
         return {"render_backend": "none"}

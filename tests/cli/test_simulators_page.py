@@ -1,0 +1,80 @@
+"""The page about simulators, followed in the environments where they are installed."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from typing import TYPE_CHECKING
+
+import pytest
+from cli.command import TESTS, run
+from run_python import output_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.simulators
+
+PAGE = (TESTS.parent / "docs" / "simulators.md").read_text()
+
+
+def blocks(language: str, section: str) -> list[str]:
+    part = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    return re.findall(rf"^```{language}\n(.*?)^```", part, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize(
+    ("section", "modules"),
+    [("EnvPool", ["envpool"]), ("PushT and ALOHA", ["gym_pusht", "gym_aloha"])],
+)
+def test_the_programs_run(section: str, modules: list[str], tmp_path: Path) -> None:
+    """Each runs unchanged."""
+    for module in modules:
+        pytest.importorskip(module)
+    for block in blocks("python", section):
+        (tmp_path / "program.py").write_text(block)
+        output_of(tmp_path / "program.py", folder=tmp_path, asyncio_debug=False)
+
+
+def test_metaworld_ends_in_a_table_of_success(tmp_path: Path) -> None:
+    """With the page's env, policies and command, on fewer seeds, and without the plot."""
+    pytest.importorskip("metaworld")
+    env, policies = blocks("python", "MetaWorld")
+    (tmp_path / "my_metaworld.py").write_text(env)
+    (tmp_path / "my_policies.py").write_text(policies)
+    (tmp_path / "arm.yaml").write_text(*blocks("yaml", "MetaWorld"))
+    (command,) = blocks("console", "MetaWorld")
+    line = command.replace("\\\n", "").strip().replace(" --plot success.png", "")
+    words = shlex.split(line.removeprefix("$ rlightning-aio "))
+    done = run(*words, "--seeds", "0:2", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = {words[0]: words[1:3] for words in map(str.split, done.stdout.splitlines()) if words}
+    for task in ("reach-v3", "push-v3", "door-open-v3"):
+        assert table[task] == ["2", "100.0%"]
+    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 1 + 6
+
+
+def test_a_seed_of_metaworld_decides_an_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the env has played before."""
+    pytest.importorskip("metaworld")
+    (tmp_path / "my_metaworld.py").write_text(blocks("python", "MetaWorld")[0])
+    monkeypatch.syspath_prepend(tmp_path)
+    from my_metaworld import MetaWorld  # type: ignore[import-not-found]
+
+    one, other = MetaWorld(), MetaWorld()
+    other.reset(seed=9, options={"task": "push-v3"})
+    first = [env.reset(seed=4, options={"task": "reach-v3"})[0] for env in (one, other)]
+    then = [env.step(env.action_space.low)[0] for env in (one, other)]
+    assert (first[0] == first[1]).all()
+    assert (then[0] == then[1]).all()
+    assert (one.reset(seed=5)[0] != first[0]).any()
+    one.close()
+    other.close()
+
+
+def test_the_env_of_libero_is_a_program() -> None:
+    """It is not run: LIBERO's packages go with no others."""
+    (program,) = blocks("python", "LIBERO")
+    compile(program, "my_libero.py", "exec")
