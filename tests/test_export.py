@@ -90,14 +90,9 @@ class Dying(Counting):
         return super().step(action)
 
 
-@pytest.mark.parametrize("snapshot_every", [None, 1])
-def test_an_episode_that_lost_its_begin_is_left_out(
-    tmp_path: Path, snapshot_every: int | None
-) -> None:
-    """With its worker, which was replaced by one that begins anew, or in the middle."""
+def test_an_episode_that_was_lost_is_left_out(tmp_path: Path) -> None:
+    """With its worker, which was replaced by one that begins anew."""
     entry: dict[str, Any] = {"name": "env", "task": lambda: Dying(tmp_path / "marker")}
-    if snapshot_every is not None:
-        entry |= {"on_worker_death": "resume", "snapshot_every": snapshot_every}
     with sync.build_env_group(entry) as group, group.auto_reset(9):
         rollout = Collector(group, halves, num_transitions=9, wait_all=True).collect()
     episodes = list(whole_episodes([rollout]))

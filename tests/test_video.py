@@ -329,8 +329,7 @@ def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
 
 async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
     """With `await`. Here, one sub-environment of an env is filmed."""
-    both = {"on_worker_death": "resume", "snapshot_every": 2, "placement": "process"}
-    config = entry(lambda: SyncVectorEnv([Odd, Brighter]), **both)
+    config = entry(lambda: SyncVectorEnv([Odd, Brighter]), placement="process")
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset()
         await group.record_video(tmp_path, ["env-0"], sub_env=1, episodes=[1])

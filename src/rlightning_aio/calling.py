@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.sync import EnvGroup
 
-__all__ = ["await_cancelled", "collect_calls", "in_one_call", "send_calls", "snapshot_as_shown"]
+__all__ = ["await_cancelled", "collect_calls", "in_one_call", "send_calls"]
 
 T = TypeVar("T")
 
@@ -60,13 +60,3 @@ def collect_calls(group: Any, deadline: float | None = None) -> Any:
 def await_cancelled(group: EnvGroup) -> None:
     """Wait until no call runs that was cancelled; `EnvBusy` is raised for its envs until then."""
     group._driver.run(group._core.calls.await_cancelled(time.monotonic()))  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-
-
-def snapshot_as_shown(group: EnvGroup) -> bytes:
-    """Take a snapshot of all envs, for a caller that keeps their last observations beside it.
-
-    As `EnvGroup.snapshot`, but where a replaced worker is to resume an episode, and no result has
-    said so yet, it raises `SnapshotError`.
-    """
-    core, driver = group._core, group._driver  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-    return driver.run(core.snapshot(time.monotonic(), None, as_shown=True))

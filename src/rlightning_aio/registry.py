@@ -221,8 +221,6 @@ PLACEMENTS: dict[str, Placement] = {
         "rlightning_aio._core.hosts.here.loop:LoopHost",
         spreads=False,
         refuses={
-            "snapshot_every": "an env whose step takes too long is rebuilt and reset; "
-            "group.snapshot() keeps the state of idle envs",
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
@@ -239,7 +237,6 @@ PLACEMENTS: dict[str, Placement] = {
             "start_timeout": _NO_LIMIT,
             "close_timeout": _NO_LIMIT,
             "on_worker_death": _NO_WORKER,
-            "snapshot_every": _NO_WORKER,
             "max_restarts": _NO_WORKER,
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
@@ -284,7 +281,6 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "on_worker_death": "it has no workers; a request to a client that is lost gives a "
             "truncated result, and the client may come back",
             "max_restarts": "it has no workers; a client that is lost may come back",
-            "snapshot_every": "it has no workers; a client that comes back begins a new session",
         },
     ),
 }

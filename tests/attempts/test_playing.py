@@ -618,7 +618,6 @@ def test_bad_rules(wrong: dict[str, Any]) -> None:
         ({"envs_per_process": 1}, {"zero_copy": True}),
         ({"envs_per_process": 2}, {"zero_copy": True}),
         ({"placement": "inline"}, {"zero_copy": True}),
-        ({"snapshot_every": 1, "on_worker_death": "resume"}, {}),
         ({"max_episode_steps": 3}, {}),
     ],
     ids=str,

@@ -24,7 +24,7 @@ MOST = {
     "VectorEnv.step": {"calls": 71 + TWINS},
     # It steps twice. A round may wait once more in the second, if a worker is late: 294 to 309.
     "Collector.collect, 16 transitions": {"calls": 309 + 2 * TWINS},
-    "death with resume: files": {"files of src": 24},
+    "death: files": {"files of src": 24},
 }
 
 

@@ -108,24 +108,3 @@ def test_losses_are_counted_by_cause(num_envs: int) -> None:
     ((cause, results),) = figures.losses.items()
     assert "SIGKILL" in cause
     assert results == 4
-
-
-def test_steps_that_a_resumed_env_repeats_are_lost() -> None:
-    """With the one in flight."""
-    config = EnvConfig(
-        name="a", backend="stub", task="any", on_worker_death="resume", snapshot_every=100
-    )
-    statistics = RolloutStatistics([config])
-    with sync.build_env_group(config) as group:
-        metas = {meta.env_id: meta for meta in group.init()}
-        batch, _ = group.reset()
-        statistics.begin(metas.__getitem__)
-        for step in range(6):
-            if step == 5:
-                os.kill(group.get_workers()[0]["pid"], signal.SIGKILL)
-            batch, _ = group.step(act(batch))
-            statistics.add(batch)
-        assert batch.info()[0]["worker_resumed"] == 5
-        statistics.note_workers(group.get_workers())
-        (figures,) = statistics.by_entry(group.get_env_stats())
-    assert (figures.steps, figures.lost_steps) == (5, 6)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-import os
-import signal
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -137,38 +133,6 @@ def blocks(use: Use, folder: Path) -> None:
     lists = stored(use, found)
     assert {len(own) for own in lists} == {15}
     assert_as_played(use, lists)
-
-
-def resumption(use: Use) -> None:
-    """Where workers die, chains go on from the last checkpoint, and nothing else changes."""
-    assert use.options.snapshot_every is not None
-    found = rollouts(
-        use, use.group, lambda: kill_a_worker(use), num_transitions=30, min_results=NUM_ENVS
-    )
-    lists = stored(use, found)
-    model = use.model(90)
-    for own, expected in zip(lists, model, strict=True):
-        at = 0
-        for transition in own:
-            if transition != expected[at]:
-                again = [replace(other, first=True) for other in expected[: at + 1]]
-                at = again.index(transition)
-            at += 1
-        # Each death costs no more than the steps since the checkpoint.
-        assert len(own) - at <= 2 * use.options.snapshot_every
-    use.drain()
-    if use.kind.mode == "disabled" and not use.kind.width:
-        evaluation(use, on_episode=lambda episode: episode.index or kill_a_worker(use))
-    # Every worker answers, so none is found dead while the group closes.
-    use.done(use.group.reset())
-
-
-def kill_a_worker(use: Use) -> None:
-    """End the first process that has envs."""
-    pid = next(worker["pid"] for worker in use.group.get_workers() if worker["pid"] != os.getpid())
-    if pid is not None:
-        with contextlib.suppress(ProcessLookupError):  # It died just now, which nobody has noticed.
-            os.kill(pid, signal.SIGKILL)
 
 
 # -- the rest

@@ -36,7 +36,6 @@ FACTORS: dict[str, tuple[Any, ...]] = {
     "zero_copy": (True, False),
     "task": tuple(TASKS),
     "limit": (math.inf, 4),
-    "snapshot_every": (None, 3),
     "results": ((1, None), (2, 2), (2, None)),
     "is_async": (False, True),
 }
@@ -55,7 +54,6 @@ class Options:
     zero_copy: bool
     task: str
     limit: float
-    snapshot_every: int | None
     results: tuple[int, int | None]
     is_async: bool
 
@@ -63,17 +61,15 @@ class Options:
         """An id for a test."""
         copies = "views" if self.zero_copy else "copies"
         limit = "" if self.limit == math.inf else f"-limit {self.limit}"
-        kept = f"-every {self.snapshot_every}" if self.snapshot_every else ""
         least, most = self.results
         awaited = "-async" if self.is_async else ""
         words = f"{self.task}-{self.kind}-{self.placement}-{copies}-{least} to {most or 'all'}"
-        return f"{words}{limit}{kept}{awaited}"
+        return f"{words}{limit}{awaited}"
 
     @property
     def fits(self) -> bool:
-        """CartPole warns of steps after its end, and there is nothing to resume in one process."""
-        steps_on = self.task == "CartPole" and self.kind == "three together"
-        return not steps_on and not (self.snapshot_every and self.placement == "inline")
+        """CartPole warns of steps after its end."""
+        return not (self.task == "CartPole" and self.kind == "three together")
 
 
 class Choice(Protocol):
@@ -111,8 +107,6 @@ class Use(Driven):
         task = partial(self.kind.make, options.task)
         placement = "process" if options.placement == BOTH else options.placement
         entry = {"name": "env", "task": task, "num_workers": NUM_ENVS, **PLACEMENTS[placement]}
-        if options.snapshot_every is not None:
-            entry |= {"snapshot_every": options.snapshot_every, "on_worker_death": "resume"}
         entries = [entry]
         if options.placement == BOTH:
             entry["num_workers"] = NUM_ENVS - 1

@@ -25,7 +25,6 @@ FACTORS: dict[str, tuple[Any, ...]] = {
     "copy": (True, False),
     "task": tuple(TASKS),
     "limit": (math.inf, 4),
-    "snapshot_every": (None, 3),
 }
 
 
@@ -38,12 +37,11 @@ class Row:
     copy: bool
     task: str
     limit: float
-    snapshot_every: int | None
 
     @property
     def fits(self) -> bool:
-        """In one process nothing can be resumed."""
-        return not (self.snapshot_every and self.placement == "inline")
+        """All go together."""
+        return True
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
@@ -56,8 +54,6 @@ class Row:
     def entry(self) -> dict[str, Any]:
         """The fields of the group's entry."""
         fields: dict[str, Any] = {**PLACEMENTS[self.placement]}
-        if self.snapshot_every is not None:
-            fields |= {"snapshot_every": self.snapshot_every, "on_worker_death": "resume"}
         if self.limit != math.inf:
             fields["max_episode_steps"] = self.limit
         return fields

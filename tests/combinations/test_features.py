@@ -5,14 +5,11 @@ Each is compared with plain envs that are stepped in a loop, one list for each.
 
 from __future__ import annotations
 
-import itertools
-import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from combinations.features import FEATURES, resumption
+from combinations.features import FEATURES
 from combinations.options import FACTORS, Options, Use, pairwise
-from combinations.played import KINDS
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -39,24 +36,8 @@ def test_each_pair_of_options(
         use.drain()
 
 
-_PLACES = itertools.cycle(
-    [("process", True, False), ("both", True, True), ("process", False, True)]
-)
-_MORTAL = [
-    Options(kind, placement, zero_copy, "uneven", math.inf, 3, (1, None), is_async)
-    for kind, (placement, zero_copy, is_async) in zip(KINDS, _PLACES, strict=False)
-]
-
-
-@pytest.mark.parametrize("options", _MORTAL, ids=str)
-def test_deaths_of_workers(options: Options) -> None:
-    """Whose envs resume from their last checkpoints."""
-    with Use(options) as use:
-        resumption(use)
-
-
 # Workers take seconds to start on a busy machine.
-_INLINE = {**FACTORS, "placement": ["inline"], "snapshot_every": [None]}
+_INLINE = {**FACTORS, "placement": ["inline"]}
 _OPTIONS = st.builds(Options, **{name: st.sampled_from(values) for name, values in _INLINE.items()})
 
 

@@ -6,14 +6,10 @@ import asyncio
 import logging
 import os
 import signal
-import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from faults.test_resume import ENTRY as RESUMING
-from faults.test_resume import Walk
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
 from kit.processes import kill, pid_of
 from kit.tokens import Tokens, entry, marked, two_workers
@@ -137,38 +133,6 @@ def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_p
     assert all(marked(ret) for ret in batch.values())
     batch, _ = group.step(tokens.steps(ids))
     assert batch.restarted.tolist() == [True, False, False]
-
-
-class Hanging(Walk):
-    """A random walk in which a step with the action 2 never ends."""
-
-    action_space = gym.spaces.Discrete(3)
-
-    def step(self, action: Any) -> Any:
-        if action == 2:
-            time.sleep(3600)
-        return super().step(action)
-
-
-@on_one_driver
-def test_an_aborted_episode_is_not_resumed(start: Start) -> None:
-    """Those of other envs in its worker continue from their checkpoints."""
-    group = start({**RESUMING, "task": Hanging, "snapshot_every": 1})
-    batch, _ = group.reset(seed=1)
-    for _ in range(3):
-        batch, _ = group.step(batch.respond(action=[0] * 4))
-    group.step_async(batch.respond(action=[2, 0, 0, 0]))
-    group.abort(["e-0"])
-    found: dict[str, Any] = {}
-    while len(found) < 3:
-        found.update(group.collect_async(wait_all=True)[0].items())
-    assert found["e-1"].info["worker_resumed"] == 0
-    assert found["e-1"].observation.tolist() == batch.observation[1].tolist()
-    batch, _ = group.step(rl.BatchedData(["e-0"], [rl.PolicyResponse("e-0", 0)]))
-    (result,) = batch.values()
-    assert result.observation[0] == 0
-    assert result.info["worker_restarted"] == "was aborted"
-    assert "worker_resumed" not in result.info
 
 
 async def test_an_agent_that_is_cancelled_gives_its_env_back() -> None:

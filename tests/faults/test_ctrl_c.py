@@ -194,7 +194,8 @@ class Waiting(Counts):
             self.wait(*self.waits_for)
         return 0
 
-    def load_state(self, state: Any) -> None: ...
+    def load_state(self, state: Any) -> None:
+        self.save_state()
 
 
 @pytest.mark.parametrize("use", ["step", "step_async", "reset", "call"])

@@ -234,8 +234,7 @@ class FakeHost(Host):
     def _reset(self, entry: int, given: Any) -> None:
         index = slot_of(entry) - self.first_slot
         at = self.row_of[index]
-        if not self.slab.take_as_restored(at):
-            self.envs[index].reset()
+        self.envs[index].reset()
         seed = None if given is not None else self.slab.take_seed(at)
         info = {} if seed is None else {"seed": [seed]}
         self._write(index, 0.0, False, False, info)
@@ -273,11 +272,15 @@ class FakeHost(Host):
     def _snapshot(self, entry: int, given: Any) -> None:
         del given
         steps = self.envs[slot_of(entry) - self.first_slot].steps
-        self.answer(Value(self.host_id, entry, ({}, steps >= 0, bytes([steps + 1]))))
+        self.answer(Value(self.host_id, entry, ({}, bytes([steps]) if steps >= 0 else None)))
 
     def _restore(self, entry: int, given: Any) -> None:
-        self.envs[slot_of(entry) - self.first_slot].steps = given[0][0] - 1
-        self.answer(Value(self.host_id, entry, None))
+        index = slot_of(entry) - self.first_slot
+        _, (self.envs[index].steps,) = given
+        self._write(index, 0.0, False, False, {})
+        self.slab.is_reset[self.row_of[index]] = True
+        self.slab.over[self.row_of[index]] = False
+        self._reply(entry, {}, out_of_band=False)
 
     def report(self, entry: int) -> None:
         """Report a result that is in the row."""

@@ -265,75 +265,51 @@ def test_an_error_that_could_not_be_raised_keeps_its_env_busy(new_group: NewGrou
 
 
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
-@pytest.mark.parametrize("fails", ["at its own", "after another's", "in the undo"])
-def test_a_worker_that_dies_at_any_moment_of_a_restore_leaves_the_others_as_they_were(
-    new_group: NewGroup, on_worker_death: str, fails: str
+@pytest.mark.parametrize("moment", ["before its reply", "after its reply"])
+def test_an_env_whose_worker_dies_in_a_restore_is_lost_and_the_others_are_restored(
+    new_group: NewGroup, on_worker_death: str, moment: str
 ) -> None:
-    """Also if its envs had been restored, so that nobody waited for it."""
-    group = new_group(1, 1, 1, on_worker_death=on_worker_death)
+    """One that has replied before is restored, too, until its worker dies."""
+    group = new_group(1, 2, on_worker_death=on_worker_death)
     core = group.core
     run(group, core.reset(group.now, None, None, None))
     snapshot = run(group, core.snapshot(group.now, None))
     for _ in range(3):
         run(group, group.steps.step(steps(0, 1, 2), group.now))
-    restoring = group.begin(core.restore(group.now, snapshot, None))
-    for slot in range(3):
-        group.finish(slot)
-    if fails != "at its own":
-        group.finish(0)
-    if fails == "in the undo":
+    restoring = group.begin(core.restore(group.now, snapshot, None, None))
+    group.finish(0)
+    if moment == "after its reply":
         group.finish(1)
-        die(group, 2)
-    die(group, 0)
-    while not restoring.done:
-        group.finish(next(k for k in range(3) if group.hosts[k].waiting))
+    die(group, 1)
     with pytest.raises(WorkerDied) as caught:
         restoring.result()
-    dead = [0, 2] if fails == "in the undo" else [0]
-    assert caught.value.env_ids == (f"fake-{dead[-1]}",)
-    assert caught.value.__notes__[0].startswith("nothing was restored: the other envs are where")
-    for slot in range(3):
-        if slot in dead and on_worker_death == "raise":
+    dead = [1, 2] if moment == "before its reply" else [2]
+    assert caught.value.env_ids == tuple(f"fake-{slot}" for slot in dead)
+    shown = caught.value.results
+    assert shown is not None
+    assert shown.observation[:, 3].tolist() == [0] * (3 - len(dead))
+    assert shown.is_reset.all()
+    (batch, _) = run(group, group.steps.step(steps(0), group.now))
+    assert (batch.restarted.tolist(), batch.observation[:, 3].tolist()) == ([False], [1])
+    for slot in (1, 2):
+        if on_worker_death == "raise":
             with pytest.raises(WorkerDied, match="nothing was sent"):
                 group.steps.step_async(steps(slot), group.now)
-            continue
-        (batch, _) = run(group, group.steps.step(steps(slot), group.now))
-        assert batch.restarted.tolist() == [slot in dead]
-        assert batch.observation[:, 3].tolist() == [0 if slot in dead else 4]
+        else:
+            (batch, _) = run(group, group.steps.step(steps(slot), group.now))
+            assert (batch.restarted.tolist(), batch.observation[:, 3].tolist()) == ([True], [0])
 
 
-def test_nothing_is_loaded_into_the_replacement_of_a_worker_that_died_before(
-    new_group: NewGroup,
-) -> None:
-    """Its env would go on in the state of the snapshot, though nothing was restored."""
-    group = new_group(1, 1)
-    run(group, group.core.reset(group.now, None, None, None))
-    snapshot = run(group, group.core.snapshot(group.now, None))
-    restoring = group.begin(group.core.restore(group.now, snapshot, None))
-    group.finish(0)
-    die(group, 0)
-    group.finish(1)
-    group.pass_time(1.0)
-    assert not group.hosts[0].waiting
-    while not restoring.done:
-        group.finish(1)
-    with pytest.raises(WorkerDied) as caught:
-        restoring.result()
-    assert caught.value.env_ids == ("fake-0",)
-
-
-def test_requests_that_show_a_restored_state_are_as_old_as_they_are(new_group: NewGroup) -> None:
-    """Not as old as the call, which has waited for two replies of each env before."""
+def test_a_restore_is_one_request(new_group: NewGroup) -> None:
     group = new_group(2)
     run(group, group.core.reset(group.now, None, None, None))
     snapshot = run(group, group.core.snapshot(group.now, None))
-    restoring = group.begin(group.core.restore(group.now, snapshot, None))
-    for _ in ("snapshot", "restore", "show"):
-        assert group.core.requests.sent_ns.tolist() == [int(group.now * 1e9)] * 2
-        group.pass_time(1.0)
-        group.finish(0)
-        group.finish(1)
+    num_asked = len(group.hosts[0].asked)
+    restoring = group.begin(group.core.restore(group.now, snapshot, None, None))
+    group.finish(0)
+    group.finish(1)
     restoring.result()
+    assert len(group.hosts[0].asked) == num_asked + 2
 
 
 @pytest.mark.parametrize("kind", [Faulted, Withdrawn])

@@ -278,9 +278,7 @@ def test_another_version_of_the_simulator_is_refused(monkeypatch: pytest.MonkeyP
         group.reset(seed=0)
         snapshot = group.snapshot()
         monkeypatch.setattr("mujoco.__version__", "2.0")
-        with pytest.raises(
-            SnapshotError, match=r"its version of mujoco is .*, and here it is 2\.0"
-        ):
+        with pytest.raises(EnvRaised, match=r"with version .* of mujoco, and here it is 2\.0"):
             group.restore(snapshot)
 
 
@@ -320,9 +318,9 @@ class Fragile(Saved):
             raise OSError("the disk is gone")
 
 
-def test_all_envs_are_restored_or_none() -> None:
-    """If one fails, all of them keep their previous state."""
-    entry = {"name": "e", "task": Fragile, "num_workers": 3, "envs_per_process": 1}
+def test_an_env_that_cannot_be_restored_is_lost_and_the_others_are_restored() -> None:
+    """The error names it and has their results; its next request is a reset."""
+    entry = {"name": "e", "task": Fragile, "num_workers": 3, "placement": "inline"}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
         batch, _ = group.step(batch.respond(action=[0, 0, 0]))
@@ -331,61 +329,59 @@ def test_all_envs_are_restored_or_none() -> None:
             batch, _ = group.step(batch.respond(action=[0, 1, 0]))
         with pytest.raises(EnvRaised, match=r"env 'e-1'.*restore.*the disk is gone") as caught:
             group.restore(snapshot)
-        assert "the other envs are where they were" in caught.value.__notes__[0]
+        shown = caught.value.results
+        assert shown is not None
+        assert (shown.ids(), shown.observation.tolist()) == (["e-0", "e-2"], [[1], [1]])
+        with pytest.raises(SnapshotError, match=r"'e-1' has lost its.*could not be restored"):
+            group.snapshot()
         batch, _ = group.step(batch.respond(action=[0, 0, 0]))
-        assert batch.observation.tolist() == [[5], [5], [5]]
-        assert not batch.is_reset.any()
-
-
-class Lost(Fragile):
-    """Can't even return to its previous state."""
-
-    def load_state(self, state: int) -> None:
-        if self.fails:
-            raise OSError("the disk is gone")
-        self.steps = state
-
-
-def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
-    """The other envs keep their state."""
-    entry = {"name": "e", "task": Lost, "num_workers": 2, "placement": "inline"}
-    with sync.build_env_group(entry) as group:
-        batch, _ = group.reset()
-        snapshot = group.snapshot()
-        batch, _ = group.step(batch.respond(action=[0, 1]))
-        with pytest.raises(EnvRaised, match=r"env 'e-1'.*restore.*the disk is gone"):
-            group.restore(snapshot)
-        with pytest.raises(SnapshotError, match=r"env 'e-1' .*lost \(could not be put back\)"):
-            group.snapshot()  # Of its state nobody knows how many steps led there.
-        batch, _ = group.step(batch.respond(action=[0, 0]))
-        assert batch.observation.tolist() == [[2], [0]]
-        assert batch.restarted.tolist() == [False, True]
-        assert batch.info()[1]["worker_restarted"] == "could not be put back"
+        assert batch.observation.tolist() == [[2], [0], [2]]
+        assert batch.restarted.tolist() == [False, True, False]
+        (info,) = batch.take([1]).info()
+        assert info["worker_restarted"] == "could not be restored"
+        assert (info["outcome"].kind, info["outcome"].blame) == ("not_started", "env")
         group.snapshot()
 
 
-def test_an_env_that_was_never_reset_has_no_state_after_a_restore_that_failed() -> None:
-    entry = {"name": "e", "task": Lost, "num_workers": 2, "placement": "inline"}
-    with sync.build_env_group(entry) as one, sync.build_env_group(entry) as other:
-        one.reset()
-        batch, _ = other.reset(env_ids=["e-1"])
-        other.step(batch.respond(action=[1]))
-        with pytest.raises(EnvRaised, match=r"env 'e-1'.*the disk is gone"):
-            other.restore(one.snapshot())
-        with pytest.raises(SnapshotError, match="env 'e-0' has no state yet"):
-            other.snapshot(["e-0"])
+def test_an_env_that_was_never_reset_has_no_state() -> None:
+    entry = {"name": "e", "task": Fragile, "placement": "inline"}
+    no_state = pytest.raises(SnapshotError, match="env 'e-0' has no state yet")
+    with sync.build_env_group(entry) as group, no_state:
+        group.snapshot()
 
 
-def test_an_env_without_parts_has_no_versions_to_compare() -> None:
-    """It holds no object of a library yet; that is not a different version."""
+def test_a_state_is_branched_into_many_envs() -> None:
+    """Into all envs of the entry, or some of any equal entry; they go on alike."""
+    entry = entry_of("of its own", num_workers=4, placement="inline")
+    with sync.build_env_group(entry) as group:
+        batch, _ = group.reset(seed=3)
+        with group.auto_reset(9):
+            batch, _ = Run(group, 0).proceed(batch, 5, 0)
+            snapshot = group.snapshot(["e-2", "e-0"])
+            shown, flags = group.restore(snapshot, source="e-2")
+            assert (shown.ids(), flags) == (group.env_ids, [False] * 4)
+            for observation in shown.values():
+                np.testing.assert_equal(observation.observation, batch["e-2"].observation)
+            for _ in range(20):
+                shown, flags = group.step(shown.respond(action=[1] * 4))
+                rows = list(shown.values())
+                for row in rows[1:]:
+                    np.testing.assert_equal(row.observation, rows[0].observation)
+                assert len(set(flags)) == 1
+            some, _ = group.restore(snapshot, ["e-3", "e-1"], source="e-0")
+            assert some.ids() == ["e-3", "e-1"]
+            np.testing.assert_equal(some["e-3"].observation, batch["e-0"].observation)
+        with pytest.raises(SnapshotError, match="no state of 'e-1', only of e-2, e-0; nothing"):
+            group.restore(snapshot, source="e-1")
+
+
+def test_a_restore_creates_what_the_first_reset_would() -> None:
+    """Parts of an env that was never reset."""
     with (
         sync.build_env_group(entry_of("of its own", placement="inline")) as one,
         sync.build_env_group(entry_of("of its own", placement="inline")) as other,
     ):
         batch, _ = one.reset(seed=0)
-        with pytest.raises(EnvRaised, match=r"own_space is a Box.*has not been reset yet"):
-            other.restore(one.snapshot())
-        other.reset()
         shown, _ = other.restore(one.snapshot())
         np.testing.assert_equal(shown.observation, batch.observation)
 

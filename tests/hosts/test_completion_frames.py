@@ -19,7 +19,6 @@ from rlightning_aio._core.hosts.messages import (
     NotBuilt,
     Raised,
     Result,
-    Saved,
     Value,
 )
 from rlightning_aio.errors import EnvHung
@@ -53,8 +52,6 @@ def sent(completion: Completion, host_id: int = 5) -> Completion:
         NotBuilt(5, 2, ERROR),
         Attached(5),
         NewSchema(5, 4, SCHEMA),
-        Saved(5, 2, b"state", before=True),
-        Saved(5, 0, b"", before=False),
         Value(5, CALL, {"x": 1}),
         Raised(5, STEP, ERROR),
         Lost(5, 2, Loss("hung in a step", "env_hung", "either", "one-0")),

@@ -915,7 +915,6 @@ async def test_an_env_that_does_not_suit_its_place_is_refused(
         ({"placement": "process", "max_concurrency": 3}, "max_concurrency: has no meaning"),
         ({"max_concurrency": 0}, "max_concurrency: should be greater"),
         ({"interpreter": "python3"}, "interpreter: has no meaning"),
-        ({"on_worker_death": "resume"}, "snapshot_every: has no meaning here"),
     ],
     ids=str,
 )

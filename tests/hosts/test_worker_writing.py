@@ -10,7 +10,7 @@ import time
 from patience import HANG
 from protocol.memory_of_rings import both_sides
 
-from rlightning_aio._core.hosts.messages import Saved
+from rlightning_aio._core.hosts.messages import Result
 from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import FrameReader
@@ -24,9 +24,9 @@ def test_the_time_of_a_request_excludes_the_wait_for_the_trainer() -> None:
         worker = Worker(theirs, -1, rings, 0)
         request, began = entry(1, 0, Operation.STEP), time.monotonic_ns()
         rings.begin(request, began)
-        worker._post(Saved(0, 0, b"small", before=False))
+        worker._post(Result(0, request, b"small"))
         assert trainer.current() == (request, began)
-        large = Saved(0, 0, bytes(1 << 23), before=False)
+        large = Result(0, request, bytes(1 << 23))
         writing = threading.Thread(target=worker._post, args=[large])
         writing.start()
         until = time.monotonic() + HANG

@@ -2,8 +2,8 @@
 
 Written from the contract and docs/, not from the code. A request is played when its result has
 come, on a copy of what is known of its env, and the two are compared. Only deaths leave a choice:
-an env whose worker may have died may also answer as one that was built anew (or was put back to
-a state that it saved), and the model then adopts what it shows.
+an env whose worker may have died may also answer as one that was built anew, and the model then
+adopts what it shows.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from simulator.scripted import (
     DYING,
-    NOT_SHOWN,
     RAISING,
     TIMEOUT,
+    UNLOADABLE,
     Act,
     Outcome,
     Scripts,
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
 
 MARKS = {"worker_restarted", "client_lost"}
-UNSHOWN = "unshown"
-"""What an env does that can't show the state to which it was put back after a death."""
 AGAIN = " (in the reset after its env "
 """So goes on what is raised in the reset of an awaitable env that hung before."""
 COLLECTOR = "collector"
@@ -73,7 +71,6 @@ class Entry:
     mode: str
     limit: int | None
     on_death: str
-    every: int | None
     max_restarts: int
     on_error: str
 
@@ -119,8 +116,9 @@ class Request:
     """What an env was asked, and by whom.
 
     Attributes:
-        kind: ``step``, ``reset``, ``show`` (a state that was restored), ``call``, or ``join``: of
+        kind: ``step``, ``reset``, ``restore`` (a reset to a saved state), ``call``, or ``join``: of
             a client that was not asked.
+        saved: the state to which it is restored: one of these.
         acts: of a step, one for each sub-environment.
         due: `auto_reset` resets the env in place of its step.
         sent: the policy's columns, one value of each; None if it was no response.
@@ -143,6 +141,7 @@ class Request:
     deaths: int = 0
     before: tuple[bool, bool] = (False, False)
     seeds: Sequence[int] = ()
+    saved: Sequence[State] = ()
 
     @property
     def resets(self) -> bool:
@@ -217,7 +216,7 @@ class State:
 
     def faults(self, request: Request) -> list[Act]:
         """What the request does to the process of the env."""
-        if request.kind in ("show", "call"):
+        if request.kind in ("restore", "call"):
             return []
         if request.resets:
             return self.scripts.faults_of_reset(request.options)
@@ -228,7 +227,7 @@ class State:
         subs, mode = self.scripts.subs, self.scripts.mode
         many = range(len(subs))
         nothing = [0.0 for _ in many], [False for _ in many], [False for _ in many]
-        if request.kind == "show":
+        if request.kind == "restore":
             outcome = Outcome(
                 self.scripts.words, *nothing, [True for _ in many], self.finals, self.infos
             )
@@ -276,15 +275,6 @@ class State:
             self.counted[k] = self.counted[k] and not ends[k]
 
 
-def distinct(states: Iterable[State]) -> list[State]:
-    """The same without those that are like an earlier one."""
-    by_content: dict[str, State] = {}
-    for state in states:
-        subs = [vars(sub) for sub in state.scripts.subs]
-        by_content.setdefault(repr((subs, vars(state) | {"scripts": None})), state)
-    return list(by_content.values())
-
-
 @dataclass
 class Env:
     """An env of the group, as far as its results are known.
@@ -302,10 +292,9 @@ class Env:
         errors: of these since it last completed a step: at least and at most as many.
         put_away: it has raised, and is rebuilt before it does anything else.
         seen: `deaths` that its results have shown.
-        saves: states to which it may be put back after a death; before_reset: those of them that
-            were saved as the reset was sent that is in flight.
         loose: states of which it may have one, because a call was given up; torn: the same of a
-            restore, after which only a marked result, or one of a reset, may come from them.
+            restore that failed, after which only a marked result, or one of a reset or a restore,
+            may come from them.
         episodes: return and length of each that has ended.
         client: that lends it, if one does.
     """
@@ -327,9 +316,6 @@ class Env:
     errors: tuple[int, int] = (0, 0)
     put_away: bool = False
     seen: int = 0
-    since_save: int = 0
-    before_reset: list[State] = field(default_factory=list)
-    saves: list[State] = field(default_factory=list)
     loose: list[State] = field(default_factory=list)
     torn: list[State] = field(default_factory=list)
     episodes: list[tuple[float, int]] = field(default_factory=list)
@@ -371,19 +357,11 @@ class Env:
         return State(self.codes, self.entry)
 
     def after_loss(self) -> list[State]:
-        """The states in which a replacement may be: as saved, or newly built."""
-        states = [state.copy() for state in (*self.loose, *self.torn)]
-        states += [save.copy() for save in self.saves] or [self.fresh()]
+        """The states in which a replacement may be."""
+        states = [state.copy() for state in (*self.loose, *self.torn)] + [self.fresh()]
         # Its mark may have been set since then.
         marks = {one.scripts.subs[0].mark for one in (self.state, *self.loose)}
         return states + [state.marked(mark) for state in states for mark in sorted(marks)]
-
-    def put_back(self, states: Sequence[State]) -> None:
-        """Note a state that was restored: one of these."""
-        self.adopt(states[0].copy())
-        self.loose = [state.copy() for state in states[1:]]
-        self.saves = [state.copy() for state in states] if self.entry.every is not None else []
-        self.since_save = 0
 
     def adopt(self, state: State, *others: State) -> None:
         """Note the state that it has shown, and others that show the same but for their mark."""
@@ -477,9 +455,6 @@ class Model:
                 env.state.cut = False
             else:
                 request.due = env.state.cut or (context.on_done and env.state.ended)
-        if request.resets and env.saves and env.since_save:  # That is saved before a reset.
-            env.before_reset = [state.copy() for state in env.possible()]
-            env.saves = distinct([*env.saves, *env.before_reset])
         acts = env.state.copy().faults(request)
         effects = [effect for effect, _ in acts]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
@@ -558,6 +533,10 @@ class Model:
             require(restarted[0] == ("client_lost" in row.info), "marked, or not", row)
             env.client.judge(self, request, row)
             return
+        if request.kind == "restore":
+            require(not restarted[0], "a restore is marked")
+            self._judge_restored(env, request, row)
+            return
         if restarted[0] and row.info.get("worker_restarted", "")[:7] == "raised ":
             self._judge_restarted(env, request, row)
             return
@@ -585,26 +564,23 @@ class Model:
         env.put_away = False
         expected = played[found[0]]
         env.episodes += [episode for episode in expected.episodes if episode is not None]
-        self._save(env, request)
+
+    def _judge_restored(self, env: Env, request: Request, row: Row) -> None:
+        """Check the result of an env that was put into a saved state."""
+        states = [state.copy() for state in request.saved]
+        played = [state.play(request) for state in states]
+        found = [k for k, expected in enumerate(played) if expected.outcome.words == row.words]
+        require(found, "another state than was saved", [state.scripts.words for state in states])
+        compare(env, played[found[0]], row)
+        env.adopt(*[states[k] for k in found])
+        env.put_away = False
+        self.counts["restored"] += 1
 
     def limit_of(self, env: Env) -> float:
         return math.inf if self.context is None else self.context.limit_of(env)
 
     def _played(self, env: Env, request: Request) -> list[Words]:
         return env.state.copy().play(request).outcome.words
-
-    def _save(self, env: Env, request: Request) -> None:
-        """Note a state that the worker has saved."""
-        if env.entry.every is None:
-            return
-        env.since_save = 0 if request.kind != "step" or request.due else env.since_save + 1
-        ended = all(
-            sub.over or final is not None
-            for sub, final in zip(env.state.scripts.subs, env.state.finals, strict=True)
-        )
-        if not env.since_save or env.since_save >= env.entry.every or ended:
-            env.saves = [state.copy() for state in (env.state, *env.loose)]
-            env.since_save = 0
 
     def _raising(self, env: Env, request: Request) -> list[Act]:
         """What of a request an env may raise."""
@@ -617,11 +593,7 @@ class Model:
                 acts += state.copy().faults(request)
         if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
             acts += env.fresh().faults(self._begun_again(env, request))
-        found = [act for act in acts if act[0] in (*RAISING, "rubbish")]
-        shows = request.kind == "step" and not request.due and env.may_be_lost
-        if shows and any("bound" in info for state in env.saves for info in state.infos):
-            found.append((UNSHOWN, 0))
-        return found
+        return [act for act in acts if act[0] in (*RAISING, "rubbish")]
 
     def _executed(self, env: Env, request: Request) -> Request:
         """What an env does for a request: one that was put away begins again."""
@@ -648,9 +620,8 @@ class Model:
         state.play(self._begun_again(env, request))
         require(state.scripts.words == row.words, "not as rebuilt", state.scripts.words)
         env.adopt(state)
-        env.put_away, env.saves = False, []
+        env.put_away = False
         self.counts["restarted after an exception"] += 1
-        self._save(env, Request("reset"))
 
     def _put_away(self, env: Env, request: Request) -> None:
         """Check an exception that no restart follows at once."""
@@ -662,7 +633,7 @@ class Model:
         begun = self._begun_again(env, request)
         env.state = env.fresh()
         env.state.begun = begun.seed, begun.options
-        env.loose, env.torn, env.saves, env.since_save = [], [], [], 0
+        env.loose, env.torn = [], []
         env.put_away = True
         self.counts["exceptions past max_restarts"] += 1
 
@@ -683,9 +654,7 @@ class Model:
             require(is_replaced, "marked, where a death is to be raised")
         self.judge_heads(row)
         self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
-        shows = "worker_resumed" in row.info
-        require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
-        again = [Request("show") if shows else Request("reset")]
+        again = [Request("reset")]
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
@@ -698,14 +667,6 @@ class Model:
             if state.play(one).outcome.words == row.words
         ]
         require(found, "marked, in no state that it may have")
-        state = found[0]
-        if shows:
-            lost = {max(before.count - state.count, 0) for before in (env.state, *env.loose)}
-            require(row.info["worker_resumed"] in lost, "a wrong number of lost steps", lost)
-            state.cut = False
-        elif request.kind == "step" and not request.due:
-            kept = env.saves and not (env.torn or raised)
-            require(not kept, "a new episode, and the old one was saved")
         was_idle = request.deaths > env.seen
         env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
         env.adopt(*found)
@@ -713,7 +674,6 @@ class Model:
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
         self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
-        self._save(env, again[0])
 
     def _judge_blame(self, env: Env, at_fault: str | None, suspects: Sequence[str]) -> None:
         """Check who is said to have ended the worker of an env."""
@@ -765,7 +725,10 @@ class Model:
     def _judge_fault(self, env: Env, request: Request, fault: EnvFault) -> None:
         if isinstance(fault, WorkerDied):
             self.gone(env, fault)
-            env.seen = max(env.seen + 1, request.deaths)
+            if request.kind == "restore":  # Its next result says so.
+                self.counts["died in a restore"] += 1
+            else:
+                env.seen = max(env.seen + 1, request.deaths)
             return
         if env.client is not None:
             if isinstance(fault, EnvAway):
@@ -774,8 +737,19 @@ class Model:
             env.client.note_raised(request)
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
-        if request.kind != "call":
+        if request.kind == "restore":
+            self._judge_not_restored(env, request, fault)
+        elif request.kind != "call":
             self._judge_raised(env, request, fault)
+
+    def _judge_not_restored(self, env: Env, request: Request, fault: EnvRaised) -> None:
+        """Check an env that could not be restored: it has lost its episode."""
+        interrupted = request.interrupted and fault.exception_type == "KeyboardInterrupt"
+        marks = [state.scripts.subs[0].mark for state in request.saved]
+        require(interrupted or UNLOADABLE in marks, "an error of nobody", repr(fault))
+        states = (env.state, *env.loose, *env.torn, *request.saved)
+        env.torn = [*map(State.copy, states), env.fresh()]
+        self.counts["not restored"] += 1
 
     def _judge_raised(self, env: Env, request: Request, fault: EnvRaised) -> None:
         if request.interrupted and fault.exception_type == "KeyboardInterrupt":
@@ -790,8 +764,6 @@ class Model:
             env.loose += after
             env.dirty = True
             return
-        if request.resets and env.since_save:
-            env.saves, env.since_save = env.before_reset, 0
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = [*env.after_loss(), env.fresh()]
         acts = self._raising(env, request)
@@ -799,8 +771,7 @@ class Model:
             state.faults(self._executed(env, request))
         for state in env.torn:
             state.faults(Request("reset"))
-        kinds = (*RAISING, UNSHOWN) if NOT_SHOWN in str(fault) else RAISING
-        raising = [act for act in acts if act[0] in kinds]
+        raising = [act for act in acts if act[0] in RAISING]
         is_rubbish = not raising and any(effect == "rubbish" for effect, _ in acts)
         if env.entry.on_error == "restart" and fault.exception_type != "KeyboardInterrupt":
             require(raising or is_rubbish, "an error of nobody", repr(fault), request)
@@ -819,12 +790,8 @@ class Model:
         """Check an exception that is one of those that an env was to raise."""
         found = fault.exception_text.partition(AGAIN)[0]
         likely = [act for act in raising if raised_text(*act) == found]
-        effect, token = raising[-1] if NOT_SHOWN in str(fault) else (likely or raising)[0]
+        effect, token = (likely or raising)[0]
         check_raised(fault, effect, token)
-        if effect == UNSHOWN:
-            env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
-            env.torn = [*env.after_loss(), env.fresh()]
-            self.counts["resumed, and not shown"] += 1
         if not (env.may_be_lost or env.put_away):  # Its outcome would be that loss.
             check_outcome(fault, request, effect, token)
         if request.resets:  # An awaitable env that hangs after that is reset like this again.
@@ -857,7 +824,7 @@ class Model:
             self._judge_blame(env, None, fault.suspects)
         hung = isinstance(fault, EnvHung)
         require(fault.exit_code != 0, "dead, and left in order", hung)
-        in_call = env.request is not None and env.request.kind == "call"
+        in_call = env.request is not None and env.request.kind in ("call", "restore")
         if not env.gone and (entry.on_death == "raise" or not in_call):  # Judged once for all.
             errors = [self._most_errors(one) for one in self.envs.values() if one.host is host]
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
@@ -872,7 +839,6 @@ def raised_text(effect: str, token: int) -> str:
     texts = {
         "raise": f"as asked for: {token}",
         "raise oddly": f"odd {token}",
-        UNSHOWN: f"the result can't be pickled: {NOT_SHOWN}",
     }
     return texts.get(effect, "")
 
@@ -883,7 +849,6 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
         "raise": _raised_class(token),
         "raise oddly": ("Odd", EnvRaised),
         "ctrl-c": ("KeyboardInterrupt", EnvRaised),
-        UNSHOWN: ("TypeError", TypeError),
     }[effect]
     text = raised_text(effect, token)
     found = fault.exception_text.partition(AGAIN)[0]

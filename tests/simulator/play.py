@@ -39,7 +39,6 @@ from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
     EnvFault,
-    EnvRaised,
     EpisodeLost,
     NothingPending,
     RLightningError,
@@ -805,8 +804,6 @@ class Play(Session):
 
     def marks(self, env: Env) -> list[int]:
         """Those that matter when its state is loaded."""
-        if env.entry.every is not None:  # Its replacements do that, too.
-            return [SLOW]
         return [SLOW, UNLOADABLE] + [DEADLY] * ("die" in self.features and self.is_killable(env))
 
     async def mark(self, env: Env, mark: int) -> None:
@@ -938,7 +935,7 @@ class Play(Session):
         if (envs := self.local(self.ready())) and rng.random() < 0.5:
             env = rng.choice(envs)
             await self.mark(env, rng.choice(self.marks(env)))
-        if "die" in self.features and rng.random() < (0.6 if "resume" in self.features else 0.3):
+        if "die" in self.features and rng.random() < 0.3:
             env = self.kill_soon(rng, self.ready())
             await self.notice(rng, env)
 
@@ -958,24 +955,38 @@ class Play(Session):
         if not self.snapshots:
             return
         data, states = self.snapshots[-1] if rng.random() < 0.5 else rng.choice(self.snapshots)
+        source = None
+        if rng.random() < 0.3:
+            source, states = self.branched(rng, states)
         envs = self.targets(rng, [env for env, _ in states])
         if not all(env.idle for env in envs):
             await self.op_collect(rng)
             return
-        if len(states) < len(self.local(self.envs)) and rng.random() < 0.1:
+        if source is None and len(states) < len(self.local(self.envs)) and rng.random() < 0.1:
             with self.expected(SnapshotError, "a snapshot of fewer envs"):
                 await self.done(self.group.restore(data))
             return
         await self.prepare_restore(rng, envs)
-        pairs = [(env, env.possible(), saved) for env, (_, saved) in zip(envs, states, strict=True)]
-        for env, _, saved in pairs:
+        requests: dict[str, Request] = {}
+        for env, (_, saved) in zip(envs, states, strict=True):
+            requests[env.env_id] = Request("restore", saved=saved)
             if saved[0].scripts.subs[0].mark == DEADLY:
                 env.host.ask()
-        await self.restore(data, pairs)
+                env.deadly = True
+        await self.restore(data, requests, source)
         # Up to a limit, of which a restored env may have reached a part.
         for _ in range(rng.randint(0, 4)):
             if ready := [env for env in self.ready() if env in envs]:
                 await self.step_on(ready)
+
+    def branched(
+        self, rng: Random, states: list[tuple[Env, list[State]]]
+    ) -> tuple[str, list[tuple[Env, list[State]]]]:
+        """The id of an env, and its state for some envs of its entry."""
+        source, saved = rng.choice(states)
+        same = [env for env in self.model.envs.values() if env.entry is source.entry]
+        chosen = same if rng.random() < 0.5 else rng.sample(same, rng.randint(1, len(same)))
+        return source.env_id, [(env, saved) for env in chosen]
 
     async def prepare_restore(self, rng: Random, envs: list[Env]) -> None:
         """Do what matters to the envs of a snapshot, and to their limits."""
@@ -984,76 +995,21 @@ class Play(Session):
         if "die" in self.features and rng.random() < 0.3:
             self.kill_soon(rng, envs)
 
-    async def restore(
-        self, data: bytes, pairs: Sequence[tuple[Env, list[State], list[State]]]
-    ) -> None:
-        """Put envs, which are in one of some states, into that of a snapshot: one of others.
-
-        Until it returns, it is a call: it answers with the states or changes nothing.
-        """
-        requests = {env.env_id: Request("call") for env, _, _ in pairs}
-
-        async def restore() -> Any:
-            try:
-                return await self.done(self.group.restore(data, [*requests]))
-            except EnvFault as fault:
-                if fault.results is None:
-                    self.undone(fault, pairs)
-                else:  # All were restored, and one could not show it.
-                    self.show(pairs)
-                raise
+    async def restore(self, data: bytes, requests: dict[str, Request], source: str | None) -> None:
+        """Put envs into the states of a snapshot, or all of them into that of `source`."""
+        ids: list[str] | None = [*requests]
+        if source is not None:
+            entry = self.model.envs[source].entry
+            if ids == [env.env_id for env in self.envs if env.entry is entry]:
+                ids = None
 
         def take(found: Any) -> None:
             batch, flags = found
-            require(flags == [False] * len(pairs), "flags", flags)
+            require(flags == [False] * len(requests), "flags", flags)
             require(batch.env_ids() == [*requests], "another order", batch.env_ids())
-            self.show(pairs)
             self.take(batch, flags, self.owner_of(requests))
 
-        try:
-            await self.answer(requests, restore, take)
-        except (asyncio.CancelledError, KeyboardInterrupt):
-            for env, before, saved in pairs:
-                if env.env_id in self.group.pending:  # It shows the state to a collect.
-                    env.put_back(saved)
-                    env.request, env.limbo = Request("show"), False
-                else:
-                    # Built anew after a death: what it has saved is not used.
-                    env.torn = [*map(State.copy, (*before, *saved)), env.fresh()]
-            raise
-        for env, _, _ in pairs:
-            env.state.refuses = False
-
-    def show(self, pairs: Sequence[tuple[Env, list[State], list[State]]]) -> None:
-        """Note that envs are in states that were restored, which their results show."""
-        for env, _, saved in pairs:
-            assert env.request is not None
-            env.request.kind = "show"
-            env.put_back(saved)
-
-    def undone(
-        self, fault: EnvFault, pairs: Sequence[tuple[Env, list[State], list[State]]]
-    ) -> None:
-        """Check an error of a restore, after which all are where they were before.
-
-        Those that can't be put back, or whose worker has died, begin a new episode.
-        """
-        faults = [fault, *fault.others]
-        note = "; ".join(getattr(fault, "__notes__", ()))
-        if not note:  # Nothing was changed yet.
-            return
-        require("nothing was restored" in note, "a restore that failed, and does not say so", note)
-        for env, before, saved in pairs:
-            own, others = [[s.scripts.subs[0].mark for s in states] for states in (saved, before)]
-            raised = any(one.env_id == env.env_id for one in faults if isinstance(one, EnvRaised))
-            require(not raised or UNLOADABLE in own, "an error of nobody", repr(fault))
-            if env.env_id in note:
-                require(UNLOADABLE in others, "a state that can't be put back", note)
-            if env.saves:  # The worker has saved again what it was put back to.
-                env.saves = [*(env.saves if env.may_be_lost else ()), *map(State.copy, before)]
-                env.since_save = 0
-            if env.may_be_lost or env.env_id in note:
-                env.torn = [*map(State.copy, (*before, *saved)), env.fresh()]
+        await self.answer(requests, lambda: self.group.restore(data, ids, source=source), take)
 
     def targets(self, rng: Random, envs: list[Env]) -> list[Env]:
         """Where the states of these envs may go: there, or to others of the same entries."""

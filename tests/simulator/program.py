@@ -24,19 +24,19 @@ FEATURES = (
     "processes", "ray",
     "auto_reset", "partial steps", "plain values", "extras", "calls", "handles", "snapshots",
     "cancel", "timeouts", "tasks", "raise", "rubbish", "infos", "ends", "slow", "die", "hang",
-    "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
+    "raise deaths", "misuse", "zero_copy", "timeline", "faults",
     "interrupts",
 )  # fmt: skip
 CLIENTS: Final = "clients"
 """A feature of few groups, beside those of `FEATURES`; see `_with_clients`."""
-_OF_OTHERS = (("resume", "die", "processes", "ends", "stacked"), ("processes", "hang", "faults"))
+_OF_OTHERS = (("die", "processes", "ends", "stacked"), ("processes", "hang", "faults"))
 THEMES: dict[str, tuple[tuple[str, ...], ...]] = {
     "group": (
-        ("snapshots", "resume", "die", "processes", "auto_reset"),
+        ("snapshots", "die", "processes", "auto_reset"),
         ("snapshots", "die", "processes", "several envs"),
         ("async", "snapshots", "cancel", "timeouts"),
         ("snapshots", "calls", "several envs", "faults", "interrupts"),
-        ("resume", "processes", "faults", "several envs", "calls"),
+        ("processes", "faults", "several envs", "calls"),
         ("auto_reset", "stacked", "ends"),
         ("several envs", "extras", "infos", "partial steps"),
         *_OF_OTHERS,
@@ -81,7 +81,6 @@ class Plan:
     share: int = 1
     limit: int | None = None
     on_death: str = "restart"
-    every: int | None = None
     max_restarts: int = 3
     on_error: str = "raise"
     timeout: float | None = None
@@ -105,8 +104,6 @@ class Plan:
             found["envs_per_process"] = self.share
         if self.timeout is None:
             del found["step_timeout"], found["reset_timeout"]
-        if self.every is not None:
-            found["snapshot_every"] = self.every
         if self.limit is not None and self.form != "stacked":  # Those have their own.
             found["max_episode_steps"] = self.limit
         if self.form == "base":
@@ -145,7 +142,7 @@ class Plan:
         """What the model must know."""
         return Entry(
             self.name, self.form, self.layout, self.controls, self.num_envs, self.mode,
-            self.limit, self.on_death, self.every, self.max_restarts, self.on_error,
+            self.limit, self.on_death, self.max_restarts, self.on_error,
         )  # fmt: skip
 
 
@@ -274,7 +271,6 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     apart = Random(~seed)  # Of a later feature: the draws of the others stay what they were.
     if {"raise", "rubbish"} & features and apart.random() < 0.8:
         plans = [_restarted(apart, plan) for plan in plans]
-    features = _with_bound(seed, kind, features, plans)
     has_clients = kind in ("group", "training", "attempts") and apart.random() < _CLIENTS
     has_clients = has_clients and CLIENTS not in without
     if has_clients:
@@ -308,16 +304,6 @@ def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozense
         features -= {"out of band"}
     plan = _plan(rng, features, "env")
     return features, [plan]
-
-
-def _with_bound(
-    seed: int, kind: str, features: frozenset[str], plans: list[Plan]
-) -> frozenset[str]:
-    """The same, perhaps so that envs resume from what they can't show."""
-    resumes = kind == "group" and any(plan.every for plan in plans)
-    if not resumes or Random(seed ^ 0xB0).random() < 0.6:
-        return features
-    return features - {"snapshots"} | {"raise", "die"}
 
 
 def _with_clients(
@@ -367,6 +353,4 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
         plan = replace(plan, timeout=TIMEOUT)
     if "raise deaths" in features and rng.random() < 0.3:
         return replace(plan, on_death="raise")
-    if "resume" in features and form != "awaitable" and rng.random() < 0.5:
-        return replace(plan, on_death="resume", every=rng.choice([1, 2, 3, 4, 4]))
     return plan

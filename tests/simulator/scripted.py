@@ -51,10 +51,6 @@ class Machine:
         while True:
             time.sleep(3600)
 
-    def place(self) -> int:
-        """Which worker of a world this is; 0 in a trainer and outside of worlds."""
-        return 0
-
     async def await_for(self, seconds: float) -> None:
         """Like `spend`, in an awaitable env, while others continue."""
         await asyncio.sleep(seconds / 100)
@@ -69,10 +65,10 @@ machine = Machine()
 EFFECTS = (
     "plain", "end", "cut", "both", "info", "nested", "slow", "raise", "raise oddly", "rubbish",
     "killed", "exit", "hang", "raise next", "die next", "hang next", "keep state",
-    "ctrl-c", "bound",
+    "ctrl-c",
 )  # fmt: skip
 """What a step does, by number. ``… next`` does it in the next reset; after ``keep state`` the env
-refuses one snapshot; ``bound`` gives a result that no other worker can show."""
+refuses one snapshot."""
 TIMEOUT = 2.0
 """Of a step or a reset, in seconds, where an entry has one."""
 TOKENS = 64
@@ -95,27 +91,6 @@ class Odd(BaseException):
 def blame_of(token: int) -> Blame | None:
     """Whom an env that is to raise something blames, if it says so."""
     return get_args(Blame)[token // 3 % 5] if token % 3 == 1 else None
-
-
-class Bound:
-    """A value that no other worker than the one that made it can send; any trainer can copy it."""
-
-    def __init__(self, token: int) -> None:
-        self.token, self._place = token, machine.place()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Bound) and self.token == other.token
-
-    def __hash__(self) -> int:
-        return hash(self.token)
-
-    def __reduce__(self) -> Any:
-        if machine.place() not in (0, self._place):
-            raise RuntimeError(NOT_SHOWN)
-        return super().__reduce__()
-
-
-NOT_SHOWN = "it belongs to another worker"
 
 
 def slow_seconds(token: int) -> float:
@@ -253,8 +228,6 @@ class Script:
         info: dict[str, Any] = {"mix": self.mix, "step": self.steps}
         if effect == "info":
             info |= _changing(token)
-        elif effect == "bound":
-            info["bound"] = Bound(token)
         elif effect == "nested":
             info["nested"] = {"token": token, "array": np.arange(3) + token, "words": ["a", {}]}
         ended = effect in ("end", "both")

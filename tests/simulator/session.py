@@ -286,8 +286,6 @@ class Session:
         effects += ["end", "cut", "both"] * ("ends" in features)
         effects += ["info", "info", "info", "nested"] * ("infos" in features)
         effects += ["slow"] * ("slow" in features)
-        if env.entry.every is not None and "raise" in features and "snapshots" not in features:
-            effects += ["bound"] * 4
         effect = rng.choice(effects)
         if plain or rng.random() > 0.15:
             return effect, token
@@ -307,18 +305,17 @@ class Session:
             faults += ["rubbish"] * ("rubbish" in features and entry.layout in (*FIXED, "number"))
             faults += [*DYING, "raise oddly"] * ("die" in features)
             return faults + ["hang"] * (self.plan(env).timeout is not None)
-        faults = ["keep state"] * ("snapshots" in features and entry.every is None)
+        faults = ["keep state"] * ("snapshots" in features)
         if "raise" in features:
-            # What resumes has a grudge again, or never had it.
-            faults += ["raise", "raise oddly"] + ["raise next"] * (entry.every is None)
+            faults += ["raise", "raise oddly", "raise next"]
             if not self.is_async and self.plan(env).placement == "inline":
                 faults.append("ctrl-c")
         if "rubbish" in features and entry.layout in (*FIXED, "number"):
             faults.append("rubbish")
         if "die" in features and self.is_killable(env):
-            faults += [*DYING] + ["die next"] * (entry.every is None)
+            faults += [*DYING, "die next"]
         if env.host.mortal and self.plan(env).timeout is not None:
-            faults += ["hang"] + ["hang next"] * (entry.every is None)
+            faults += ["hang", "hang next"]
         return faults
 
 

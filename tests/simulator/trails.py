@@ -57,7 +57,6 @@ class Trail:
     Attributes:
         losses: how often its episode may still have been lost, or abandoned after an error; seen:
             how many of these were added.
-        resumes: it may then continue from an earlier state of the episode.
         ended: return and length of each episode that ended.
     """
 
@@ -73,7 +72,7 @@ class Trail:
         self.code, self.cut_together, self.cut_or_ended = code, cut_together, cut_or_ended
         self.own_limit, self.cut_after = own_limit, cut_after
         self.last: Transition | None = None
-        self.losses, self.seen, self.resumes = 0, 0, False
+        self.losses = self.seen = 0
         # Return and length up to each state of the episode.
         self._sums: dict[Words, tuple[float, int]] = {}
         self.ended: list[tuple[float, int]] = []
@@ -86,10 +85,6 @@ class Trail:
     @property
     def is_over(self) -> bool:
         return self.last is None or self.last.terminated or self.last.truncated
-
-    def has_shown(self, words: Words) -> bool:
-        """Return True if the episode was in this state."""
-        return words in self._sums
 
     def add(self, made: Transition, *, goes_on: bool = False) -> None:
         """Check one more; one that `goes_on` after an end belongs to no episode."""
@@ -107,11 +102,9 @@ class Trail:
             self.losses -= not self.is_over
             require(self.losses >= 0, "an episode that is not over is cut", last, made)
             require(made.first is not False, "it continues nothing, and is not first", made)
-            if before.step > 0 or not is_begun(before):
-                require(self.resumes and before in self._sums, "an invented state", last, made)
-            elif before not in self._sums:
-                # It may resume from before an end that others of its env have not seen.
-                self._sums = {**(self._sums if self.resumes else {}), before: (0.0, 0)}
+            require(before.step == 0 and is_begun(before), "an invented state", last, made)
+            if before not in self._sums:
+                self._sums = {before: (0.0, 0)}
         total, length = self._sums[before]
         total, length = total + made.reward, length + 1
         self._sums[made.after] = total, length

@@ -295,7 +295,6 @@ class Training(InContext):
         trail = self.trails[index, code]
         troubles = 0 if env.client is None else env.client.troubles
         trail.allow(env.losses + self.raised[env.env_id] + troubles)
-        trail.resumes = env.entry.every is not None
         return trail
 
 

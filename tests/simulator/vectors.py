@@ -216,15 +216,12 @@ class Vectors(Session):
         with self.perhaps_none():
             try:
                 self.rows.load_state(state)
-            except EnvFault as fault:
-                is_whole &= fault.results is None  # Else others show what was restored.
+            except EnvFault:
+                is_whole = False
                 raise
             except KeyboardInterrupt:
                 self.shown = []  # As in a reset.
                 raise
-            except ResetNeeded:
-                require(any(env.losses for env in self.envs), "none has died")
-                return
             is_restored = True
         if not is_restored:
             self.is_whole = is_whole
@@ -296,14 +293,12 @@ class Vectors(Session):
             self.counts["died"] += 1
             may_be = env.exceptions > 0 or (env.host.mortal and env.deaths > 0)
             require(may_be, "marked, and nothing is lost", info)
-        trail.resumes = env.entry.every is not None
         was_over, stays = self.over[k], self.mode == "disabled" and not died
         self.over[k] = any(ends) or (was_over and stays)
         self.shown[k] = now
         if self.mode == "next_step" and was_over:
             require((reward, ends) == (0.0, (False, False)), "a reset", k, reward, ends)
-            begun = is_begun(now) or (trail.resumes and trail.has_shown(now))
-            require(begun or died, "no reset", k, now)
+            require(is_begun(now) or died, "no reset", k, now)
             return
         after = now
         if self.mode == "same_step" and any(ends):

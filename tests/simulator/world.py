@@ -436,10 +436,6 @@ class SimulatedMachine:
         else:
             end()
 
-    def place(self) -> int:
-        running = self._world.running
-        return running.pid if isinstance(running, Process) else 0
-
     def hang(self) -> None:
         self._process().wait_for(lambda: False, None)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from gymnasium.wrappers import vector as wrappers
 from kit.processes import kill, stop
 from vector.toys import Counted, Mortal, assert_alike
 
-from rlightning_aio.errors import SnapshotError, WorkerDied
+from rlightning_aio.errors import WorkerDied
 from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
@@ -243,27 +242,6 @@ def test_a_state_between_a_death_and_the_step_that_resets_is_restored() -> None:
     envs.close()
 
 
-def test_no_state_is_saved_before_a_resumed_episode_is_shown() -> None:
-    """It would be that of another moment than the observations that the user has."""
-    resume = {"on_worker_death": "resume", "snapshot_every": 9}
-    envs = VectorEnv([Counted] * 4, envs_per_process=2, **resume)
-    actions = np.zeros(4, np.int64)
-    envs.reset(seed=0)
-    envs.step(actions)
-    kill(envs.group.get_workers()[0]["pid"])
-    while not envs.group.num_restarts:
-        with suppress(SnapshotError, WorkerDied):
-            envs.save_state()
-    with pytest.raises(SnapshotError, match="whose episode was lost"):
-        envs.save_state()
-    assert envs.step(actions)[3].tolist() == LOST
-    state = envs.save_state()
-    expected = envs.step(actions)
-    envs.load_state(state)
-    assert_alike([envs.step(actions)], [expected])
-    envs.close()
-
-
 def test_a_second_death_during_resets() -> None:
     """The env that was stepped loses its new episode in this step, the other one in the next."""
     envs = made(max_restarts=5)
@@ -381,14 +359,12 @@ def test_a_rollout_buffer_begins_an_episode_after_a_death(sb3_mortals: Any) -> N
     assert len(episodes) == ends
 
 
-@pytest.mark.parametrize("on_worker_death", ["restart", "resume"])
 @pytest.mark.parametrize("mode", MODES)
 def test_a_masked_reset_leaves_it_to_the_next_step_to_tell_of_other_lost_episodes(
-    mode: AutoresetMode, on_worker_death: str
+    mode: AutoresetMode,
 ) -> None:
     """Three envs of one worker, which dies between two calls; one of them is to be reset."""
-    entry = fields_of(on_worker_death) | {"envs_per_process": 3, "autoreset_mode": mode}
-    envs = VectorEnv([Counted] * 3, **entry)
+    envs = VectorEnv([Counted] * 3, envs_per_process=3, autoreset_mode=mode)
     nothing = np.zeros(3, np.int64)
     envs.reset(seed=0)
     envs.step(nothing)
@@ -402,31 +378,11 @@ def test_a_masked_reset_leaves_it_to_the_next_step_to_tell_of_other_lost_episode
     envs.close()
 
 
-SAVED = {
-    "a reset": ([0], 0),
-    "a step": ([0, 0, 0], 2),
-    "an end": ([0, 1], 2),
-    "an end before the last step": ([1, 0], 1),
-}
-"""Actions before a death, and the position of the result that was saved last, from the reset."""
-
-
-CASES = [
-    (mode, on_worker_death, saved)
-    for mode, on_worker_death, saved in product(MODES, ["restart", "resume"], SAVED)
-    if on_worker_death == "resume" or saved in ("a reset", "an end")
-]
-
-
-def fields_of(on_worker_death: str) -> dict[str, Any]:
-    fields: dict[str, Any] = {"on_worker_death": on_worker_death, "envs_per_process": 1}
-    return fields | ({"snapshot_every": 2} if on_worker_death == "resume" else {})
-
-
-def causes_of(on_worker_death: str) -> set[str]:
-    """Keys of an info that tell of a death."""
-    resumed = ["worker_resumed"] if on_worker_death == "resume" else []
-    return {"worker_restarted", "env_at_fault", "outcome", *resumed}
+BEFORE = {"a reset": [0], "an end": [0, 1]}
+"""Actions before a death, from the reset."""
+CASES = list(product(MODES, BEFORE))
+CAUSES = {"worker_restarted", "env_at_fault", "outcome"}
+"""Keys of an info that tell of a death."""
 
 
 def observed(envs: VectorEnv, actions: list[int], ends: Any) -> tuple[list[Any], Any]:
@@ -456,15 +412,15 @@ def closed_after() -> Iterator[list[Any]]:
         envs.close()
 
 
-@pytest.mark.parametrize(("mode", "on_worker_death", "saved"), CASES)
+@pytest.mark.parametrize(("mode", "before"), CASES)
 def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
-    mode: AutoresetMode, on_worker_death: str, saved: str, closed_after: list[Any]
+    mode: AutoresetMode, before: str, closed_after: list[Any]
 ) -> None:
-    """Whatever the result was that was saved last."""
-    resumes, at_once = on_worker_death == "resume", mode == AutoresetMode.SAME_STEP
-    envs = VectorEnv([Counted] * 2, autoreset_mode=mode, **fields_of(on_worker_death))
+    """Whatever the last result was."""
+    at_once = mode == AutoresetMode.SAME_STEP
+    envs = VectorEnv([Counted] * 2, autoreset_mode=mode, envs_per_process=1)
     closed_after.append(envs)
-    actions, place = SAVED[saved]
+    actions = BEFORE[before]
     lost, nothing = np.array([True, False]), np.zeros(2, int)
     shown, due = observed(envs, actions, lost)
     if due.any():
@@ -477,18 +433,14 @@ def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
         assert (reward.tolist(), terminated.any()) == ((~lost).tolist(), False)
     assert infos["_worker_restarted"].tolist() == lost.tolist()
     assert all("was killed by SIGKILL" in cause for cause in infos["worker_restarted"][lost])
-    if saved == "an end" and not at_once:  # It was about to be reset, and has lost nothing.
+    first = [[1, 0]]
+    if before == "an end" and not at_once:  # It was about to be reset, and has lost nothing.
         assert (truncated.any(), "final_obs" in infos) == (False, False)
-        assert observation[lost].tolist() == [[2, 0] if resumes else [1, 0]]
+        assert observation[lost].tolist() == first
         return
-    if saved == "an end before the last step" and not at_once:
-        place = 2  # The last step was a reset, after which the state was saved.
-    first = shown[place][lost].tolist() if resumes else [[1, 0]]
-    last, causes = shown[-1][lost].tolist(), causes_of(on_worker_death)
-    causes |= {f"_{cause}" for cause in causes}
+    last = shown[-1][lost].tolist()
+    causes = CAUSES | {f"_{cause}" for cause in CAUSES}
     assert truncated.tolist() == lost.tolist()
-    if resumes:
-        assert infos["worker_resumed"][lost].tolist() == [len(actions) - place]
     if at_once:
         assert observation[lost].tolist() == first
         assert infos["_final_obs"].tolist() == infos["_final_info"].tolist() == lost.tolist()
@@ -505,28 +457,22 @@ def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
 
 
 @pytest.mark.simulators
-@pytest.mark.parametrize(
-    ("on_worker_death", "saved"),
-    [own for mode, *own in CASES if mode == AutoresetMode.SAME_STEP],
-)
+@pytest.mark.parametrize("before", BEFORE)
 def test_what_a_lost_step_reports_to_stable_baselines3(
-    on_worker_death: str, saved: str, closed_after: list[Any]
+    before: str, closed_after: list[Any]
 ) -> None:
     pytest.importorskip("stable_baselines3")
     from rlightning_aio.sb3 import VecEnv
 
-    resumes, (actions, place) = on_worker_death == "resume", SAVED[saved]
-    envs = VecEnv([Counted] * 2, **fields_of(on_worker_death))
+    envs = VecEnv([Counted] * 2, envs_per_process=1)
     closed_after.append(envs)
     lost = np.array([True, False])
-    shown = [envs.reset(), *(envs.step(action * lost)[0] for action in actions)]
+    shown = [envs.reset(), *(envs.step(action * lost)[0] for action in BEFORE[before])]
     killed(envs.group, lambda: envs.step_async(np.zeros(2, int)))
     observation, reward, done, infos = envs.step_wait()
     assert (done.tolist(), reward.tolist()) == (lost.tolist(), (~lost).tolist())
-    first = shown[place].tolist() if resumes else [[1, 0]]
-    causes = causes_of(on_worker_death)
-    assert infos[0].keys() == causes | {"terminal_observation", "TimeLimit.truncated"}
+    assert infos[0].keys() == CAUSES | {"terminal_observation", "TimeLimit.truncated"}
     assert infos[0]["TimeLimit.truncated"]
     assert infos[0]["terminal_observation"].tolist() == shown[-1][0].tolist()
-    assert observation[0].tolist() == first[0]
-    assert not envs.reset_infos[0].keys() & {"final_obs", "final_info", *causes}
+    assert observation[0].tolist() == [1, 0]
+    assert not envs.reset_infos[0].keys() & {"final_obs", "final_info", *CAUSES}

@@ -43,8 +43,7 @@ class EntryFigures:
 
     Attributes:
         restarts: number of workers that were replaced.
-        lost_steps: steps whose results were lost with a worker or client, and, of envs that
-            continue from a saved state, steps that they repeat.
+        lost_steps: steps whose results were lost with a worker or client.
         losses: number of results that report a loss, by its cause.
         step_us: time in the env's own step in microseconds, p50 and p99.
     """
@@ -167,8 +166,7 @@ class RolloutStatistics:
         for row in np.flatnonzero(part.restarted).tolist():
             info, slot = part.reported_info_of(row), part.slots[row : row + 1]
             (entry,) = part.names.names(slot)
-            repeated = info.get("worker_resumed", 0)
-            self._lost_steps[entry] += (repeated + (not self._over[slot])) * sub_envs
+            self._lost_steps[entry] += int(not self._over[slot]) * sub_envs
             cause = info.get("worker_restarted", info.get("client_lost", "unknown"))
             self._losses.setdefault(entry, Counter())[cause] += 1
 

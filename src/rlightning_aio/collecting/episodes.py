@@ -71,7 +71,7 @@ def whole_episodes(rollouts: Iterable[Rollout]) -> Iterator[WholeEpisode]:
                 end = ends[int(rows[-1])]
                 last = mapped(lambda leaf, k=end: leaf[k : k + 1].copy(), rollout.end_observation)
                 episode = _joined(begun.pop(index), last)
-                # Shorter if its begin is in no rollout, or a replaced worker resumed it.
+                # Shorter if its begin is in no rollout.
                 if len(episode) == lengths[index].pop(0):
                     yield episode
 

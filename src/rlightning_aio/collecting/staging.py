@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio.batch.data import has_ended
 from rlightning_aio.collecting.trees import allocated, check_alike, grown, scattered
 from rlightning_aio.protocol.columns import gather
 from rlightning_aio.trees import mapped
@@ -189,10 +188,6 @@ class Staging:
         ending = self._place[index] >= 0
         if len(resets.nonzero()[0]):
             self._begin_chains(index[resets], ending[resets])
-            if len(results.batch.restarted.nonzero()[0]):
-                # A resumed sub-environment may already have ended, and wait for others.
-                over = has_ended(results.batch).reshape(-1)[rows] & resets
-                self._over[index] |= over & ~self._resets_in_same_step[index]
             ending &= ~resets
         ending &= ~self._over[index]
         chosen = ending.nonzero()[0]

@@ -141,19 +141,6 @@ def _check_interpreter(config: EnvConfig) -> str | None:
     return f"{path!r} {reason}"
 
 
-def _check_snapshot_every(config: EnvConfig) -> str | None:
-    resumes = config.on_worker_death == "resume"
-    if "snapshot_every" in placement_of(config.backend, config.placement).refuses:
-        return "has no meaning here, and on_worker_death: resume needs it" if resumes else None
-    if resumes and ENVS.is_hardware(config.backend):
-        return f"on_worker_death: resume can't restore what backend {config.backend!r} moves"
-    if resumes and config.snapshot_every is None:
-        return "is required with on_worker_death: resume; at most this many steps are lost"
-    if config.snapshot_every is not None and not resumes:
-        return "has no meaning without on_worker_death: resume"
-    return None
-
-
 def _check_on_env_error(config: EnvConfig) -> str | None:
     if config.on_env_error == "restart" and ENVS.is_hardware(config.backend):
         return f"restart would move what backend {config.backend!r} moves; only your resets may"
@@ -162,7 +149,6 @@ def _check_on_env_error(config: EnvConfig) -> str | None:
 
 _COMPARED_WITH = {
     "task": ("num_workers",),
-    "snapshot_every": ("on_worker_death",),
 }
 """Other fields that a check reads; it is left out if one of them is wrong."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
@@ -170,7 +156,6 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "task": _check_task,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
-    "snapshot_every": _check_snapshot_every,
     "on_env_error": _check_on_env_error,
 }
 

@@ -95,10 +95,8 @@ class EnvConfig(_Fields):
     close_timeout: float | None = Field(default=None, gt=0)
     """Seconds that all envs of the entry may take to close; None gives awaitable envs 0.6 seconds
     and others 1.5."""
-    on_worker_death: Literal["restart", "raise", "resume"] = "restart"
+    on_worker_death: Literal["restart", "raise"] = "restart"
     """Reaction to a worker that dies or hangs; ``raise`` by default for hardware."""
-    snapshot_every: int | None = Field(default=None, ge=1)
-    """Number of steps after which an env's state is saved, for ``on_worker_death: resume``."""
     on_env_error: Literal["raise", "restart"] = "raise"
     """Reaction to an exception of an env's `reset` or `step`: raise it, or close and rebuild the
     env and begin another episode, whose first result is marked like that of a replaced worker."""

@@ -49,10 +49,10 @@ class Operation(IntEnum):
     SNAPSHOT = 5
     """The reply is the state of the env."""
     RESTORE = 6
-    """Restores a state without a result; a reset `AS_RESTORED` returns one."""
+    """A reset to a saved state; the reply is the last result of that time."""
 
 
-_WITH_VALUE: Final = (Operation.CALL, Operation.SNAPSHOT, Operation.RESTORE)
+_WITH_VALUE: Final = (Operation.CALL, Operation.SNAPSHOT)
 ANSWERS_WITH_VALUE: Final = np.isin(np.arange(max(Operation) + 1), _WITH_VALUE)
 """By operation, True if the reply to it is a value, not a result in a row."""
 OP_BITS: Final = 8

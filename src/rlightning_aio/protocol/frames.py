@@ -34,11 +34,10 @@ class FrameKind(IntEnum):
     INFO_SCHEMA = 10  # worker; the schema's number: a new schema of infos
     CLOSE = 11  # trainer
     CLOSED = 12  # worker: errors of close(), by env
-    SAVED = 13  # worker; index of an env, and a flag for "before its request": its checkpoint
-    RESTARTED = 14  # worker; the request's entry: why its env was rebuilt, and as for RESULT
-    FAULTED = 15  # worker; the request's entry: an error of this package, and if it is for good
-    ABORT = 16  # trainer; the request's entry
-    LOST = 17  # worker; index of an env: why its episode is lost
+    RESTARTED = 13  # worker; the request's entry: why its env was rebuilt, and as for RESULT
+    FAULTED = 14  # worker; the request's entry: an error of this package, and if it is for good
+    ABORT = 15  # trainer; the request's entry
+    LOST = 16  # worker; index of an env: why its episode is lost
 
 
 class Frame(NamedTuple):

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AS_BEFORE",
-    "AS_RESTORED",
     "IS_RESET",
     "NO_SEED",
     "OVER",
@@ -40,9 +39,7 @@ __all__ = [
 ]
 
 NO_SEED: Final = -1
-AS_RESTORED: Final = -2
-"""In place of a seed: don't begin an episode; return the restored state."""
-AS_BEFORE: Final = -3
+AS_BEFORE: Final = -2
 """In place of a seed: those of the last reset, and its options, where the env knows them."""
 TERMINATED: Final = 0
 TRUNCATED: Final = 1
@@ -174,8 +171,7 @@ class Slab:
             of the episode in progress or ending here, including this step; length 0 if the step
             belongs to no episode.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, bytes]`` uint8.
-        seed: ``[rows]`` int64, seed of the reset plus 1, or 0 for none (see `AS_RESTORED` and
-            `AS_BEFORE`).
+        seed: ``[rows]`` int64, seed of the reset plus 1, or 0 for none (see `AS_BEFORE`).
         times: ``[rows, 2]`` int64; its columns are done_ns, the monotonic time at which the
             reply was ready, and busy_ns, the time that the env took.
         sent_ns: ``[rows]`` int64, ns since the epoch by the env's clock if that differs from the
@@ -207,16 +203,9 @@ class Slab:
         self.info = next(arrays)
         self.sent_ns: NDArray[np.int64] | None = None
 
-    def take_as_restored(self, row: int) -> bool:
-        """Return True if `AS_RESTORED` was sent to `row`, and clear it."""
-        return self._take(row, AS_RESTORED)
-
     def take_as_before(self, row: int) -> bool:
         """Return True if `AS_BEFORE` was sent to `row`, and clear it."""
-        return self._take(row, AS_BEFORE)
-
-    def _take(self, row: int, mark: int) -> bool:
-        asked = bool(self.seed[row] == mark + 1)
+        asked = bool(self.seed[row] == AS_BEFORE + 1)
         if asked:
             self.seed[row] = 0
         return asked

@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Deaths", "Stepped", "cause_and_rest"]
 
-_CAUSE: Final = ("worker_restarted", "env_at_fault", "suspects", "worker_resumed", "outcome")
-"""Keys of an info that say why its env was restarted, who was at fault, and how much was lost."""
-_OF_AN_END: Final = ("final_info", "final_obs")
-"""Keys of an info that a step with same-step autoreset adds where it ends an episode."""
+_CAUSE: Final = ("worker_restarted", "env_at_fault", "suspects", "outcome")
+"""Keys of an info that say why its env was restarted, and who was at fault."""
 
 
 class Stepped(NamedTuple):
@@ -154,11 +152,7 @@ class Deaths:
 
 
 def cause_and_rest(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the info of a restarted env into entries about its worker and entries of the reset.
-
-    An env that resumes shows its last saved result again. If that ended an episode, its info is
-    also about that end, which was returned long ago; those entries are left out.
-    """
+    """Split the info of a restarted env into entries about its worker and entries of the reset."""
     cause = {key: info[key] for key in _CAUSE if key in info}
-    rest = {key: value for key, value in info.items() if key not in (*cause, *_OF_AN_END)}
+    rest = {key: value for key, value in info.items() if key not in cause}
     return cause, rest

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, utils
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import reported_infos
-from rlightning_aio.calling import collect_calls, in_one_call, snapshot_as_shown
+from rlightning_aio.calling import collect_calls, in_one_call
 from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.errors import BadAction, EnvFault, SnapshotError
 from rlightning_aio.protocol.columns import leaves
@@ -429,15 +429,14 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Return the state of all envs, as a copy that can be pickled; see `EnvGroup.snapshot`.
 
         Raises:
-            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`; also if a worker
-                has died and its envs are to resume earlier states, which the next step shows.
+            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`.
             ResetNeeded: the results of the last step or reset were lost.
             AlreadyPendingCallError: another call is pending.
         """
         self._begin("save_state")
         self._check_whole()
         self._has_leftovers = True
-        snapshot = snapshot_as_shown(self.group)
+        snapshot = self.group.snapshot()
         self._has_leftovers = False
         return {
             "kind": self._kind,
@@ -453,7 +452,6 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             ValueError: it is the state of envs that are stepped together, or with another mode or
                 step limit; nothing was changed.
             SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.restore`.
-            ResetNeeded: a worker died in the end of it, with the state of its envs.
             AlreadyPendingCallError: another call is pending.
         """
         self._begin("load_state")
@@ -464,16 +462,10 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         had_lost, self._has_lost, self._has_leftovers = self._has_lost, True, True
         try:
             self._answerable, _ = self.group.restore(state["group"])
-        except (SnapshotError, EnvFault) as error:
-            if getattr(error, "results", None) is None:  # All envs are as they were.
-                self._has_lost, self._has_leftovers = had_lost, False
+        except SnapshotError:  # All envs are as they were.
+            self._has_lost, self._has_leftovers = had_lost, False
             raise
         self._has_leftovers = False
-        if self._answerable.restarted.any():
-            raise ResetNeeded(
-                "a worker died before its envs showed what was restored; load the state again, or "
-                "call reset() without a mask"
-            )
         self._observations = copying.deepcopy(state["observations"])
         self._deaths.load_state(state["deaths"], self._answerable)
         self._has_lost = False

@@ -22,7 +22,6 @@ from rlightning_aio._core.hosts.messages import (
     NotBuilt,
     Raised,
     Result,
-    Saved,
     Value,
 )
 from rlightning_aio.protocol.frames import Frame, FrameKind
@@ -86,7 +85,6 @@ _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
     NotBuilt: lambda it: (FrameKind.START_ERROR, it.env_index, pickle.dumps(it.error)),
     Attached: lambda _: (FrameKind.ATTACHED, 0, b""),
     NewSchema: lambda it: (FrameKind.INFO_SCHEMA, it.number, pickle.dumps(it.schema)),
-    Saved: lambda it: (FrameKind.SAVED, it.env_index << 1 | it.before, it.checkpoint),
     Result: _encoded_result,
     Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
     Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
@@ -104,9 +102,6 @@ _DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
     FrameKind.ATTACHED: lambda host, _, __: Attached(host),
     FrameKind.INFO_SCHEMA: lambda host, number, payload: NewSchema(
         host, number, pickle.loads(payload)
-    ),
-    FrameKind.SAVED: lambda host, number, payload: Saved(
-        host, number >> 1, payload, bool(number & 1)
     ),
     FrameKind.RESULT: Result,
     FrameKind.RESTARTED: _decoded_restart,

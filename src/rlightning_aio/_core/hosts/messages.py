@@ -56,9 +56,7 @@ __all__ = [
     "OutOfBand",
     "Raised",
     "Reported",
-    "RestoreOrder",
     "Result",
-    "Saved",
     "StartOrder",
     "Value",
     "Withdrawn",
@@ -93,24 +91,11 @@ class EnvState(NamedTuple):
 
     Attributes:
         versions: of the libraries that the state is of.
-        has_result: the env has been reset, so a restore can show a result.
-        checkpoint: the state.
+        state: of the env with its last result; None if it was never reset.
     """
 
     versions: dict[str, str]
-    has_result: bool
-    checkpoint: bytes
-
-
-class RestoreOrder(NamedTuple):
-    """The arguments of a request to go back to a state.
-
-    Attributes:
-        checkpoint: the state; show: the next reset `AS_RESTORED` shows it.
-    """
-
-    checkpoint: bytes
-    show: bool
+    state: bytes | None
 
 
 @dataclass(frozen=True)
@@ -167,8 +152,6 @@ class AttachOrder:
     Attributes:
         slabs: offset in the arena and number of rows of each slab of the group.
         rows: index of the slab, and the row in it, for each env.
-        checkpoints: of the envs of a replacement (see `Saved`); None for an env that begins a new
-            episode. Empty if all do.
         films: what each env of a replacement goes on filming, if anything. Empty if none does.
         restarts: how many workers had these envs before; seed: of the last reset of the first env
             that had one. They seed the global generators of a replacement.
@@ -176,7 +159,6 @@ class AttachOrder:
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
-    checkpoints: tuple[bytes | None, ...] = ()
     films: tuple[FilmOrder | None, ...] = ()
     restarts: int = 0
     seed: int | None = None
@@ -282,20 +264,6 @@ class NewSchema(NamedTuple):
     schema: InfoSchema
 
 
-class Saved(NamedTuple):
-    """An env sent a checkpoint: its state and its last result.
-
-    Attributes:
-        checkpoint: a pickle that only workers read.
-        before: it is from before the current request, not from after it.
-    """
-
-    host_id: int
-    env_index: int
-    checkpoint: bytes
-    before: bool
-
-
 class Reported(NamedTuple):
     """Requests to one host are done, and the rows hold their whole results."""
 
@@ -383,7 +351,7 @@ class Joined(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Saved | Reported | Result | Value | Raised | Faulted | Lost | Withdrawn | Joined
+    | Reported | Result | Value | Raised | Faulted | Lost | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

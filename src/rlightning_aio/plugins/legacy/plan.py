@@ -20,7 +20,7 @@ __all__ = ["Plan", "define_env_instance_cfgs", "listed_configs", "repeated"]
 _SERVER: Final = "env_server"
 _PASSED_ON: Final = (
     "placement", "envs_per_process", "step_timeout", "reset_timeout", "start_timeout",
-    "close_timeout", "on_worker_death", "snapshot_every", "on_env_error", "max_restarts", "imports",
+    "close_timeout", "on_worker_death", "on_env_error", "max_restarts", "imports",
     "interpreter", "env_vars",
 )  # fmt: skip
 """Fields of our entries that RLightning lacks and that its entries may have here, too."""

@@ -114,9 +114,11 @@ class EnvGroup(GroupInterface):
         return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
 
     async def restore(
-        self, snapshot: bytes, env_ids: Sequence[str] | None = None
+        self, snapshot: bytes, env_ids: Sequence[str] | None = None, source: str | None = None
     ) -> tuple[BatchedData, list[bool]]:
-        return await self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
+        return await self._driver.run(
+            self._core.restore(time.monotonic(), snapshot, env_ids, source)
+        )
 
     async def record_video(
         self,

@@ -222,7 +222,7 @@ class GroupInterface(Facade):
         Raises:
             EnvBusy: an env has a reply outstanding; nothing was sent.
             UnknownEnv: no env of this group has that id.
-            SnapshotError: an env is a robot's, or was never reset, or has lost its episode.
+            SnapshotError: an env moves something real, was never reset, or has lost its episode.
             NotImplementedError: an env is a client's.
             EnvRaised: an env can't give its state; the message says why.
             WorkerDied, EnvHung: a worker ended meanwhile.
@@ -230,28 +230,33 @@ class GroupInterface(Facade):
         """
         raise NotImplementedError
 
-    def restore(self, snapshot: bytes, env_ids: Sequence[str] | None = None) -> Any:
-        """Restore envs to the state of a snapshot: all of them, or none.
+    def restore(
+        self, snapshot: bytes, env_ids: Sequence[str] | None = None, source: str | None = None
+    ) -> Any:
+        """Reset envs to the states of a snapshot.
 
         Args:
             snapshot: bytes that `snapshot` returned. They hold pickles, which can make a worker
                 execute anything: use only what you have written yourself.
             env_ids: the envs to restore, all idle, in the order of the snapshot's. Any env of an
-                equal entry will do. None: all envs, whose ids must be the snapshot's.
+                equal entry will do. None: all envs, whose ids must be the snapshot's; with
+                `source`, all envs of its entry.
+            source: the id of one env of the snapshot, whose state all of `env_ids` get. So one
+                state is branched into many, which go on alike until their actions differ.
 
         Returns the envs' last observations at the time of the snapshot, and flags that are all
         False, as `reset` does: with `is_reset`, because no transition ends here, and without
-        reward. Cancelled, the envs start a new episode with their next step, marked as after a
-        restart; once all are restored, it leaves these results to `collect_async`.
+        reward. Cancelled, it leaves these results to `collect_async`.
 
         Raises:
-            SnapshotError: the bytes are damaged, or of another number of envs, another task,
-                other options or another version of a library; nothing was changed.
+            SnapshotError: the bytes are damaged, or of another number of envs, another task or
+                other options, or an env moves something real; nothing was changed.
             EnvBusy: an env has a reply outstanding; nothing was sent.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: an env is a client's.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others keep their states. After all
-                were restored, the results of the others are in the error's ``results``.
+            EnvRaised, WorkerDied, EnvHung: an env could not be restored, perhaps because it has
+                another version of a library. It has lost its episode, so its next request is a
+                reset. The others are restored: their results are in the error's ``results``.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError

@@ -113,9 +113,9 @@ class EnvGroup(GroupInterface):
         return self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
 
     def restore(
-        self, snapshot: bytes, env_ids: Sequence[str] | None = None
+        self, snapshot: bytes, env_ids: Sequence[str] | None = None, source: str | None = None
     ) -> tuple[BatchedData, list[bool]]:
-        return self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
+        return self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids, source))
 
     def record_video(
         self,

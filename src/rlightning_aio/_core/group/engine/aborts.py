@@ -16,7 +16,6 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR, State
 from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import AS_BEFORE
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -121,4 +120,4 @@ class Aborts:
         for slot in chosen:
             backend = self._envs.configs[slot].backend
             if slot < len(self._envs.all) and not ENVS.is_hardware(backend):
-                self._continuity.lose([slot], _WHY, seed=AS_BEFORE)
+                self._continuity.lose([slot], _WHY)

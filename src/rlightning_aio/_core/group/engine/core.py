@@ -77,7 +77,7 @@ class Core:
         self.steps = Steps(tables, supervisor, results, arrivals, dispatch, waiting)
         self.newest = self.steps.newest
         self.calls = Calls(tables, dispatch, waiting)
-        self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, waiting)
+        self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, results, waiting)
         self._resets = Resets(tables, supervisor, dispatch, results, waiting)
         self.agent_steps = AgentSteps(tables, self.steps, self._resets, waiting)
         self._aborts = Aborts(tables, supervisor, results, arrivals, waiting)
@@ -195,20 +195,17 @@ class Core:
 
     # -- states of envs ---------------------------------------------------------------
 
-    def snapshot(
-        self, now: float, env_ids: Sequence[str] | None, *, as_shown: bool = False
-    ) -> Procedure[bytes]:
-        """Take a snapshot of envs; for `as_shown` see `Snapshots.take`."""
+    def snapshot(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
+        """Take a snapshot of envs."""
         with self.observed.call("snapshot", now):
-            return (yield from self._snapshots.take(now, env_ids, as_shown=as_shown))
+            return (yield from self._snapshots.take(now, env_ids))
 
     def restore(
-        self, now: float, data: bytes, env_ids: Sequence[str] | None
+        self, now: float, data: bytes, env_ids: Sequence[str] | None, source: str | None
     ) -> Procedure[tuple[BatchedData, Flags]]:
         """Restore envs, and return their last results as first observations."""
         with self.observed.call("restore", now):
-            slots, positions, now = yield from self._snapshots.restore(now, data, env_ids)
-            replied = yield from self._resets.show_restored(now, slots, positions)
+            replied = yield from self._snapshots.restore(now, data, env_ids, source)
             return self.steps.settled(*replied)
 
     def pending(self, *, unasked: bool = True) -> list[str]:

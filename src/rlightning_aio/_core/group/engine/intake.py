@@ -8,7 +8,7 @@ replacement.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from rlightning_aio._core.hosts.messages import (
     Raised,
     Reported,
     Result,
-    Saved,
     Value,
     Withdrawn,
 )
@@ -51,6 +50,8 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Blame
 
 __all__ = ["Intake"]
+
+_ASKED_AGAIN: Final = (int(Operation.STEP), int(Operation.RESET))
 
 
 class Intake:
@@ -89,7 +90,6 @@ class Intake:
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Joined: self._on_joined,
-            Saved: self._on_saved,
             Died: self._on_died,
             **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
         }
@@ -118,7 +118,7 @@ class Intake:
             self._results.mark_away(slot)
         if completion.restarted is not None:
             self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
-            self._results.mark_restarted(Report(slot, completion.restarted, None))
+            self._results.mark_restarted(Report(slot, completion.restarted))
         if self._conditions.unusual:
             self._note_answered(
                 self._requests.alone(slot), by_reset=completion.restarted is not None
@@ -148,11 +148,14 @@ class Intake:
         """
         lost = self._continuity.ended_without_result(slot)
         fault = self._fault_of(slot, error, lost)
+        if self._requests.numbering.op(slot) == Operation.RESTORE:  # It is in no known state.
+            self._continuity.lose([slot], _not_restored(fault))
+            return fault
         if not self._supervisor.env_errors.ends_env(slot, error):
             return fault
         kind, blame = fault.outcome.kind, fault.outcome.blame
         why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
-        self._continuity.lose([slot], why, seed=AS_BEFORE)
+        self._continuity.lose([slot], why)
         return None if self._supervisor.env_errors.count_restart(slot, error, fault) else fault
 
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
@@ -201,7 +204,7 @@ class Intake:
         slot = self._supervisor.records[completion.host_id].slots[completion.env_index]
         if self._continuity.why_lost(slot) is None:  # Else that is known, as after an abort.
             self._supervisor.note_rebuilt(completion.host_id, slot, completion.why)
-            self._continuity.lose([slot], completion.why, seed=AS_BEFORE)
+            self._continuity.lose([slot], completion.why)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
@@ -225,16 +228,6 @@ class Intake:
     def _on_joined(self, completion: Joined) -> None:
         slots = self._supervisor.records[completion.host_id].slots
         self._arrivals.join(completion, slots.start, self.now)
-
-    def _on_saved(self, completion: Saved) -> None:
-        slot = self._supervisor.records[completion.host_id].slots[completion.env_index]
-        if slot in self._requests.aborted.faults:
-            return  # Of an episode that the caller has ended.
-        numbering = self._requests.numbering
-        entry, is_step = numbering.entry.item(slot), numbering.op(slot) == Operation.STEP
-        self._continuity.save(
-            slot, completion.checkpoint, entry, before=completion.before, is_step=is_step
-        )
 
     def _fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
@@ -260,12 +253,10 @@ class Intake:
             self._fail(owed, loss.error)
             return
         self._keep_ready(loss.slots)
-        unanswered = set(requests.numbering.entry[loss.owed].tolist())
-        continuity.drop_unfinished(loss.slots, unanswered)
         if loss.resets:
-            continuity.lose(lost, loss.why, from_checkpoint=True)
-        # A replacement answers steps and resets, but not calls.
-        again = ~requests.numbering.awaits_value(owed) & loss.resets
+            continuity.lose(lost, loss.why)
+        # A replacement answers steps and resets only.
+        again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN) & loss.resets
         self._fail(owed[~again], loss.error)
         self._supervisor.replace(loss.host_id)
         self._send_again(loss.host_id, owed[again])
@@ -280,10 +271,9 @@ class Intake:
         """Send the steps and resets that a dead worker owed, as resets."""
         if not len(slots):
             return
-        is_step = self._requests.numbering.ops(slots) == int(Operation.STEP)
-        _, seeds = self._continuity.report_losses(slots, is_step)
+        self._continuity.report_losses(slots)
         entries = self._requests.ask_again(host_id, slots)
-        self._layout.write_seeds(slots, seeds)
+        self._layout.write_seeds(slots, np.full(len(slots), AS_BEFORE))
         self._supervisor.submit(host_id, entries, None)
 
     def _note_answered(self, slots: NDArray[np.intp], *, by_reset: bool = False) -> None:
@@ -300,3 +290,8 @@ class Intake:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:
                     self._supervisor.note_step(slot)
+
+
+def _not_restored(fault: EnvRaised) -> Loss:
+    outcome = fault.outcome
+    return Loss("could not be restored", outcome.kind, outcome.blame, fault.env_id)

@@ -14,7 +14,7 @@ from rlightning_aio._core.group.drivers.wait import Procedure, Wait
 from rlightning_aio._core.group.episodes.seeds import checked_seed, seeds_for
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import AS_RESTORED
+from rlightning_aio.protocol.slab import AS_BEFORE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
-    from rlightning_aio._core.group.episodes.continuity import Position
     from rlightning_aio._core.group.episodes.seeds import Seeds
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
@@ -107,19 +106,6 @@ class Resets:
         packed = self._packed_resets(slots, seeds, options)
         self._send(slots, seeds, options, packed, COLLECTOR, now)
 
-    def show_restored(
-        self, now: float, slots: NDArray[np.intp], positions: Sequence[Position]
-    ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
-        """Have restored envs show their states at `positions`, and wait for all of them."""
-        self._continuity.note_shows(slots.tolist(), positions)
-        seeds = np.full(len(slots), AS_RESTORED)
-
-        def send(ticket: Ticket) -> None:
-            self._submit_resets(slots, seeds, None, ticket.owner, now)
-
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return ticket, slots
-
     def _await_members(self, now: float) -> Procedure[float]:
         """Wait until each host that envs join has enough."""
         began = now
@@ -182,12 +168,11 @@ class Resets:
         reset as a whole, and its result reports the loss.
         """
         if packed and "reset_mask" in (options or {}) and self._continuity.exceptional:
-            within_episode = np.zeros(len(slots), np.bool_)
-            lost, as_lost = self._continuity.report_losses(slots, within_episode)
-            self._submit_resets(slots[lost], as_lost[lost], None, owner, now)
+            lost = self._continuity.report_losses(slots)
+            as_before = np.full(np.count_nonzero(lost), AS_BEFORE)
+            self._submit_resets(slots[lost], as_before, None, owner, now)
             slots, seeds = slots[~lost], seeds[~lost]
             packed = [one for one, gone in zip(packed, lost.tolist(), strict=True) if not gone]
-        self._continuity.note_resets(slots.tolist())
         self._submit_resets(slots, seeds, packed, owner, now)
 
     def _submit_resets(

@@ -129,8 +129,6 @@ class Results:
                 info["env_at_fault"] = why.at_fault
             if why.suspects:
                 info["suspects"] = why.suspects
-            if report.steps_lost is not None:
-                info["worker_resumed"] = report.steps_lost
             info["outcome"] = why.outcome(self._envs.env_ids[report.slot])
         self._mark(report.slot)
 

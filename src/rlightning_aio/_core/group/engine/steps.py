@@ -32,7 +32,7 @@ from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
 from rlightning_aio.errors import BadAction, EnvAway, NothingPending, RLightningError
 from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import TRUNCATED
+from rlightning_aio.protocol.slab import AS_BEFORE, TRUNCATED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -322,8 +322,8 @@ class Steps:
             return
         resets = self._continuity.begin_steps(slots)
         if self._continuity.exceptional:
-            reports, seeds = self._continuity.report_losses(slots, ~resets)
-            self._layout.write_seeds(slots[reports], seeds[reports])
+            reports = self._continuity.report_losses(slots)
+            self._layout.write_seeds(slots[reports], np.full(np.count_nonzero(reports), AS_BEFORE))
             resets = resets | reports
         entries = requests.issue(slots, _STEP, owner, now)
         if b"\1" in resets.tobytes():

@@ -2,8 +2,7 @@
 
 For every env it counts steps, up to the limits of `auto_reset`, and remembers whether the last
 returned result ended the episode; these are arrays, updated when a batch is returned. For the few
-envs that lost an episode, or show a state that was put back, it runs the transition table `LEGAL`.
-It also keeps the checkpoints from which a replaced worker resumes. Left out: hosts, time and I/O;
+envs that lost an episode it runs the transition table `LEGAL`. Left out: hosts, time and I/O;
 callers say what was sent, answered and returned.
 """
 
@@ -28,15 +27,14 @@ from rlightning_aio._core.group.state.conditions import (
     PAST_END,
     Conditions,
 )
-from rlightning_aio.outcomes import Loss
-from rlightning_aio.protocol.entries import Operation, op_of
-from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
+from rlightning_aio.protocol.slab import IS_RESET, OVER
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable
+    from collections.abc import Iterable
 
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.outcomes import Loss
 
 __all__ = [
     "LEGAL",
@@ -61,49 +59,29 @@ class LossPhase(Enum):
     """The episode is lost, and no request that reports it is in flight."""
     REPORTING = auto()
     """A request is in flight whose result begins a new episode and reports the loss."""
-    RESUMING = auto()
-    """A request is in flight whose result shows the last checkpoint and reports the loss."""
-    RESETTING = auto()
-    """A reset that the caller asked for is in flight; if it succeeds, the loss is moot."""
-    SHOWING = auto()
-    """A request is in flight whose result shows the state that `restore` put back."""
 
 
 class LossEvent(Enum):
-    """What can happen to an env that lost its episode or was put back."""
+    """What can happen to an env that lost its episode."""
 
     EPISODE_LOST = auto()
     REPORT_SENT = auto()
-    RESUME_SENT = auto()
-    RESET_SENT = auto()
-    SHOW_SENT = auto()
     ANSWERED = auto()
+    """A result has come: of an env that is LOST, that of a reset which the caller asked for."""
     RAISED = auto()
     GIVEN_UP = auto()
 
 
-_IN_FLIGHT: Final = (
-    LossPhase.REPORTING,
-    LossPhase.RESUMING,
-    LossPhase.RESETTING,
-    LossPhase.SHOWING,
-)
+_INTACT, _LOST, _REPORTING = LossPhase
 
 LEGAL: Final[dict[tuple[LossPhase, LossEvent], LossPhase]] = {
-    (LossPhase.LOST, LossEvent.REPORT_SENT): LossPhase.REPORTING,
-    (LossPhase.LOST, LossEvent.RESUME_SENT): LossPhase.RESUMING,
-    (LossPhase.LOST, LossEvent.RESET_SENT): LossPhase.RESETTING,
-    (LossPhase.LOST, LossEvent.SHOW_SENT): LossPhase.SHOWING,
-    (LossPhase.INTACT, LossEvent.SHOW_SENT): LossPhase.SHOWING,
-    **{(phase, LossEvent.EPISODE_LOST): LossPhase.LOST for phase in LossPhase},
-    **{(phase, LossEvent.ANSWERED): LossPhase.INTACT for phase in _IN_FLIGHT},
-    **{(phase, LossEvent.RAISED): LossPhase.LOST for phase in _IN_FLIGHT},
-    **{(phase, LossEvent.GIVEN_UP): LossPhase.INTACT for phase in LossPhase},
+    (_LOST, LossEvent.REPORT_SENT): _REPORTING,
+    **{(phase, LossEvent.EPISODE_LOST): _LOST for phase in LossPhase},
+    **{(phase, LossEvent.ANSWERED): _INTACT for phase in (_LOST, _REPORTING)},
+    **{(phase, LossEvent.RAISED): _LOST for phase in (_LOST, _REPORTING)},
+    **{(phase, LossEvent.GIVEN_UP): _INTACT for phase in LossPhase},
 }
 """The phase after each event. A pair that is missing is a bug, and raises."""
-
-
-_NOT_SHOWN: Final = Loss("could not show the state that was restored", "not_started", "env")
 
 
 class Position(NamedTuple):
@@ -114,16 +92,10 @@ class Position(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A loss that the result of a slot reports.
-
-    Attributes:
-        why: it was lost.
-        steps_lost: steps to repeat where the env resumes; None where it begins a new episode.
-    """
+    """A loss that the result of a slot reports."""
 
     slot: int
     why: Loss
-    steps_lost: int | None
 
 
 class Judged(msgspec.Struct):
@@ -144,32 +116,10 @@ class Judged(msgspec.Struct):
 
 @dataclass(slots=True)
 class _Loss:
-    """The phase of one env that is not intact.
-
-    Attributes:
-        from_checkpoint: it was built anew from its last checkpoint, which it can show.
-        resumes: the request that was lost with the worker was to show a state.
-        seed: of the reset that reports it; `AS_BEFORE` where its env may know that.
-        position, steps_lost: of this phase only: the position of the state that the reply in flight
-            will show; see `Report`.
-    """
+    """The phase of one env that is not intact, and why its episode was lost."""
 
     phase: LossPhase
-    why: Loss = _NOT_SHOWN
-    from_checkpoint: bool = False
-    resumes: bool = False
-    seed: int = NO_SEED
-    position: Position | None = None
-    steps_lost: int | None = None
-
-
-@dataclass(slots=True)
-class _Checkpoint:
-    """A saved state, the request during which it was saved, and its place in the episode."""
-
-    content: bytes
-    entry: int
-    num_steps: int
+    why: Loss
 
 
 class Continuity:
@@ -198,10 +148,8 @@ class Continuity:
         # No env can reach its limit within this number of batches.
         self._margin = 0
         self._losses: dict[int, _Loss] = {}
+        # What results that are still to be returned show, by slot.
         self._restored: dict[int, Position] = {}
-        # Checkpoints by slot; pending ones count once the request that made them is answered.
-        self._checkpoints: dict[int, _Checkpoint] = {}
-        self._pending: dict[int, _Checkpoint] = {}
         self.exceptional = False
         self.auto_reset_is_open = False
 
@@ -306,80 +254,41 @@ class Continuity:
         else:
             self.due[:] = self._cut
 
-    def report_losses(
-        self, slots: NDArray[np.intp], is_step: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    def report_losses(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Report lost episodes with the requests that are about to be sent to `slots`.
 
-        Args:
-            slots: idle, or asked again after a restart.
-            is_step: of each, whether the caller asked for a step within an episode. Such an env
-                resumes from its checkpoint, if it has one; others begin a new episode.
-
-        Returns which requests must be resets that report a loss, and the seeds for all slots.
+        Returns which requests must be resets that report a loss.
         """
         reports = np.zeros(len(slots), np.bool_)
-        seeds = np.full(len(slots), NO_SEED)
         for k, slot in enumerate(slots.tolist()):
             loss = self._losses.get(slot)
-            if loss is None or loss.phase is not LossPhase.LOST:
-                continue
-            reports[k] = True
-            checkpoint = self._checkpoint(slot) if loss.from_checkpoint else None
-            if checkpoint is None or not (is_step[k] or loss.resumes):
-                seeds[k] = loss.seed
+            if loss is not None and loss.phase is LossPhase.LOST:
+                reports[k] = True
                 self._move(slot, LossEvent.REPORT_SENT)
-                continue
-            seeds[k] = AS_RESTORED
-            self._move(slot, LossEvent.RESUME_SENT)
-            loss.position = Position(checkpoint.num_steps, is_cut=False)
-            loss.steps_lost = max(self._num_steps.item(slot) - checkpoint.num_steps, 0)
-        return reports, seeds
+        return reports
 
-    def note_resets(self, slots: Iterable[int]) -> None:
-        """Record that resets which the caller asked for are about to be sent."""
-        for slot in slots if self._losses else ():
-            if slot in self._losses:
-                self._move(slot, LossEvent.RESET_SENT)
-
-    def note_shows(self, slots: Iterable[int], positions: Sequence[Position]) -> None:
-        """Record that resets which show restored states at `positions` are about to be sent."""
-        for slot, position in zip(slots, positions, strict=True):
-            self._move(slot, LossEvent.SHOW_SENT).position = position
-            self._num_steps[slot] = position.num_steps  # That is what a death loses from now on.
-            checkpoint = self._pending.pop(slot, None)
-            if checkpoint is not None:  # Of the state that was put back.
-                checkpoint.num_steps = position.num_steps
-                self._checkpoints[slot] = checkpoint
+    def note_restores(self, slots: NDArray[np.intp], positions: Iterable[Position]) -> None:
+        """Record that requests are about to be sent whose results show states at `positions`."""
+        self._restored.update(zip(slots.tolist(), positions, strict=True))
         self._margin = 0
 
     # -- replies ----------------------------------------------------------------------
 
-    def lose(
-        self, slots: Iterable[int], why: Loss, *, from_checkpoint: bool = False, seed: int = NO_SEED
-    ) -> None:
-        """Record that the episodes of `slots` are lost; no request that reports it is in flight.
-
-        `from_checkpoint`: the envs are built anew, from their checkpoints where they have any. Else
-        no checkpoint of theirs is used, whatever happens before they are reset. `seed`: of `_Loss`.
-        """
+    def lose(self, slots: Iterable[int], why: Loss) -> None:
+        """Record that the episodes of `slots` are lost; no request that reports it is in flight."""
         for slot in slots:
-            loss = self._move(slot, LossEvent.EPISODE_LOST)
-            loss.why, loss.from_checkpoint, loss.seed = why, from_checkpoint, seed
-            if not from_checkpoint:
-                self._forget(slot)
+            self._move(slot, LossEvent.EPISODE_LOST, why)
+            self._restored.pop(slot, None)
 
     def take_answers(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
         reports: list[Report] = []
         for slot in slots.tolist():
             loss = self._losses.get(slot)
-            if loss is None or loss.phase is LossPhase.LOST:
+            if loss is None:
                 continue
-            if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING):
-                reports.append(Report(slot, loss.why, loss.steps_lost))
-            if loss.position is not None:
-                self._restored[slot] = loss.position
+            if loss.phase is LossPhase.REPORTING:
+                reports.append(Report(slot, loss.why))
             self._move(slot, LossEvent.ANSWERED)
         return reports
 
@@ -387,46 +296,35 @@ class Continuity:
         """Record that the request of `slot` ended without a result; return the loss that it would
         have reported.
         """
+        self._restored.pop(slot, None)
         loss = self._losses.get(slot)
-        if loss is None or loss.phase is LossPhase.LOST:
+        if loss is None:
             return None
-        reports = loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING)
-        why = loss.why if reports else None
-        self._move(slot, LossEvent.RAISED).from_checkpoint = False
-        self._forget(slot)
-        return why
-
-    def _forget(self, slot: int) -> None:
-        """Forget from where the episode before would go on."""
-        for kept in (self._pending, self._checkpoints, self._restored):
-            kept.pop(slot, None)
+        reports = loss.phase is LossPhase.REPORTING
+        self._move(slot, LossEvent.RAISED)
+        return loss.why if reports else None
 
     def give_up(self, slots: Iterable[int]) -> None:
-        """Forget losses and checkpoints of `slots`, whose host will not be replaced."""
+        """Forget losses of `slots`, whose host will not be replaced."""
         for slot in slots:
             if slot in self._losses:
                 self._move(slot, LossEvent.GIVEN_UP)
-            self._forget(slot)
+            self._restored.pop(slot, None)
 
-    def _move(self, slot: int, event: LossEvent) -> _Loss:
-        """Apply an event of one slot by the table."""
+    def _move(self, slot: int, event: LossEvent, why: Loss | None = None) -> None:
+        """Apply an event of one slot by the table; `why` is given where the episode is lost."""
         loss = self._losses.get(slot)
         phase = LossPhase.INTACT if loss is None else loss.phase
         after = LEGAL.get((phase, event))
         if after is None:
             raise RuntimeError(f"slot {slot} is {phase.name}, where {event.name} can't happen")
-        if loss is None:
-            loss = _Loss(after)
-        loss.phase = after
-        loss.resumes = phase in (LossPhase.RESUMING, LossPhase.SHOWING)
-        loss.position = loss.steps_lost = None
-        if after is LossPhase.INTACT:
+        known = why if loss is None or why is not None else loss.why
+        if known is None or after is LossPhase.INTACT:
             self._losses.pop(slot, None)
         else:
-            self._losses[slot] = loss
+            self._losses[slot] = _Loss(after, known)
         self.exceptional = bool(self._losses)
         self._conditions.note(LOST_EPISODE, self.exceptional)
-        return loss
 
     # -- results ----------------------------------------------------------------------
 
@@ -497,8 +395,6 @@ class Continuity:
             self._cut[slots[judged.is_cut]] = True
         if flagged or judged.is_cut is not None:
             self._update_due()
-        if self._pending:
-            self._accept_checkpoints(slots)
 
     def _note_flags(self, part: ResultColumns, begun: NDArray[np.intp]) -> None:
         self._cut[begun] = self._ended[begun] = False
@@ -508,77 +404,14 @@ class Continuity:
         self._ended[part.slots[ended]] = True
 
     def positions(self, slots: NDArray[np.intp]) -> list[Position]:
-        """Return the positions at the last results of `slots`, or of checkpoints after a loss."""
-        found: list[Position] = []
-        for slot in slots.tolist():
-            loss = self._losses.get(slot)
-            from_checkpoint = loss is not None and loss.from_checkpoint
-            checkpoint = self._checkpoint(slot) if from_checkpoint else None
-            if checkpoint is not None:
-                found.append(Position(checkpoint.num_steps, is_cut=False))
-            else:
-                found.append(Position(self._num_steps.item(slot), self._cut.item(slot)))
-        return found
+        """Return the positions at the last results of `slots`."""
+        steps, cut = self._num_steps[slots].tolist(), self._cut[slots].tolist()
+        return [Position(*each) for each in zip(steps, cut, strict=True)]
 
-    def why_lost(self, slot: int, *, unless_saved: bool = False) -> Loss | None:
-        """Return why an env lost its episode; None if not, or if it goes on, `unless_saved`."""
+    def why_lost(self, slot: int) -> Loss | None:
+        """Return why an env lost its episode; None if it has not."""
         loss = self._losses.get(slot)
-        if loss is None or (unless_saved and loss.from_checkpoint and self._checkpoint(slot)):
-            return None
-        return loss.why
-
-    # -- checkpoints ------------------------------------------------------------------
-
-    def save(self, slot: int, content: bytes, entry: int, *, before: bool, is_step: bool) -> None:
-        """Keep a checkpoint that an env sent during its current request.
-
-        Args:
-            slot: of the env.
-            content: its state, opaque here.
-            entry: of the current request.
-            before: the state is from before the request, so it is valid at once. Otherwise it
-                is valid once the request is answered, and that of a restore once it is complete.
-            is_step: the request is a step.
-        """
-        answered = self._pending.pop(slot, None)
-        if before:
-            loss = self._losses.get(slot)
-            if loss is not None and not loss.from_checkpoint:
-                return  # It is in a state of no known episode.
-            num_steps = self.positions(np.array([slot]))[0].num_steps
-            self._checkpoints[slot] = _Checkpoint(content, entry, num_steps)
-            return
-        if answered is not None and op_of(answered.entry) != Operation.RESTORE:
-            self._checkpoints[slot] = answered
-        num_steps = self._num_steps.item(slot) + 1 if is_step else 0
-        self._pending[slot] = _Checkpoint(content, entry, num_steps)
-
-    def _accept_checkpoints(self, slots: NDArray[np.intp]) -> None:
-        for slot in slots.tolist():
-            checkpoint = self._pending.pop(slot, None)
-            if checkpoint is not None:
-                checkpoint.num_steps = self._num_steps.item(slot)
-                self._checkpoints[slot] = checkpoint
-
-    def drop_unfinished(self, slots: Iterable[int], unanswered: Container[int]) -> None:
-        """Drop checkpoints that a replacement of the host of `slots` must not start from.
-
-        They are of requests in `unanswered`, or of a restore that is not complete: `note_shows`.
-        """
-        for slot in slots:
-            pending = self._pending.get(slot)
-            if pending is not None and (
-                pending.entry in unanswered or op_of(pending.entry) == Operation.RESTORE
-            ):
-                del self._pending[slot]
-
-    def checkpoints(self, slots: Iterable[int]) -> tuple[bytes | None, ...]:
-        """Return the states that a replacement's envs start from; None for a new episode."""
-        found = (self._checkpoint(slot) for slot in slots)
-        return tuple(None if one is None else one.content for one in found)
-
-    def _checkpoint(self, slot: int) -> _Checkpoint | None:
-        return self._pending.get(slot) or self._checkpoints.get(slot)
+        return None if loss is None else loss.why
 
 
 def _all_reset(part: ResultColumns) -> NDArray[np.bool_]:

@@ -29,7 +29,6 @@ _BEGINNING: Final = b"rlightning-aio snapshot 1\n"
 _DIGEST: Final = hashlib.sha256
 _START: Final = len(_BEGINNING) + _DIGEST().digest_size
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
-_VERSION: Final = "version of "
 
 
 class EnvSnapshot(msgspec.Struct, array_like=True):
@@ -38,24 +37,25 @@ class EnvSnapshot(msgspec.Struct, array_like=True):
     Attributes:
         env_id: of the env when the snapshot was taken.
         identity: must be the same for the env that is restored, see `identity_of`.
+        versions: of the libraries that it uses, which its worker compares.
         num_steps, is_cut: its `Position` in the episode.
         state: the pickled state of the env and its last result.
     """
 
     env_id: str
     identity: dict[str, str]
+    versions: dict[str, str]
     num_steps: int
     is_cut: bool
     state: bytes
 
 
-def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -> dict[str, str]:
+def identity_of(config: EnvConfig, meta: EnvMeta) -> dict[str, str]:
     """The properties, by name, that an env must share with one that it is restored from.
 
     Args:
         config: its entry.
         meta: of the env.
-        versions: of the libraries that it uses, in its worker.
     """
     makers = makers_of(config)
     return {
@@ -66,7 +66,6 @@ def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -
         "max_episode_steps": str(config.max_episode_steps),
         "observation space": _ADDRESS.sub("", str(meta.observation_space)),
         "action space": _ADDRESS.sub("", str(meta.action_space)),
-        **{f"{_VERSION}{name}": version for name, version in versions.items()},
     }
 
 
@@ -74,8 +73,6 @@ def check_same(snapshot: EnvSnapshot, identity: Mapping[str, str], described: st
     """Raise `SnapshotError` if a snapshot's identity isn't `identity`, that of env `described`."""
     ours = snapshot.identity
     for name in {**ours, **identity}:
-        if name.startswith(_VERSION) and not (name in ours and name in identity):
-            continue  # An env may load a library only in its first reset.
         if ours.get(name) != identity.get(name):
             raise SnapshotError(
                 f"the snapshot of {snapshot.env_id!r} can't be put into {described}: its {name} is "

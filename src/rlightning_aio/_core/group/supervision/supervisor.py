@@ -104,7 +104,6 @@ class Supervisor:
         self._tables = tables
         self._envs = tables.envs
         self._requests = tables.requests
-        self._continuity = tables.continuity
         self._lifetime = tables.lifetime
         self._clock = tables.clock
         self.members = Members(tables)
@@ -294,11 +293,6 @@ class Supervisor:
                 if len(asked):
                     raise record.last_loss.refusal(asked)
 
-    def last_losses(self, slots: NDArray[np.intp]) -> NDArray[Any]:
-        """Return the last `HostLoss` of the host of each of `slots`; None before the first."""
-        losses = np.array([record.last_loss for record in self.records], object)
-        return losses[self._requests.hosts[slots]]
-
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
@@ -392,12 +386,10 @@ class Supervisor:
         record.restarts += 1
         record.lost_slots.clear()
         assert record.order is not None
-        checkpoints = self._continuity.checkpoints(record.slots)
         # What the generators of a seeded group begin with must not be by chance.
         seed = self._envs.last_seed.item(record.slots.start)
         order = replace(
             record.order,
-            checkpoints=checkpoints,
             films=tuple(record.films.get(slot) for slot in record.slots),
             restarts=record.restarts,
             seed=seed if seed >= 0 else None,

@@ -32,6 +32,7 @@ SENDING: Final = frozenset({"step", "step_async", "reset", "reset_async", "resto
 _NAMES: Final = {
     int(Operation.STEP): "step",
     int(Operation.RESET): "reset",
+    int(Operation.RESTORE): "restore",
     int(Operation.JOIN): "joined",
 }
 TRAINER: Final = 1

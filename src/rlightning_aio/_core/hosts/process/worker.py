@@ -202,7 +202,7 @@ class Worker:
         """Look at what a request has raised, if it has, before that is sent."""
         if self._is_child:
             _end_child(error)
-        if isinstance(error, TrainerGone):  # A checkpoint, say, could not be sent.
+        if isinstance(error, TrainerGone):  # A schema, say, could not be sent.
             raise error
 
     def _ring(self) -> None:

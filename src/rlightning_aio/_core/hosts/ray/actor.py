@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
-from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema, NotBuilt
+from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
-from rlightning_aio._core.hosts.running.runner import close_all, give_rows, resume_all
+from rlightning_aio._core.hosts.running.runner import close_all, give_rows, renew_all
 from rlightning_aio.protocol.entries import op_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.slab import Slab, rows_for
@@ -142,13 +142,9 @@ class EnvActor:
         except BaseException as error:
             return frame_of(not_built(SENDER, given, len(self._runners), error))
 
-    def resume(self, order: AttachOrder) -> Frame | None:
-        """Seed a replacement and restore its envs; return `NotBuilt` if that fails."""
-        try:
-            resume_all(self._runners, order)
-        except BaseException as error:
-            return frame_of(NotBuilt(SENDER, 0, ErrorText.of(error)))
-        return None
+    def renew(self, order: AttachOrder) -> None:
+        """Seed a replacement, and film those of its envs that were."""
+        renew_all(self._runners, order)
 
     def execute(self, batch: Batch) -> Reply:
         """Execute requests one after the other."""

@@ -42,7 +42,6 @@ from rlightning_aio._core.hosts.ray.cluster import (
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.runner import placed
 from rlightning_aio.protocol.entries import op_of
-from rlightning_aio.protocol.frames import Frame
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
@@ -53,6 +52,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, StartOrder
+    from rlightning_aio.protocol.frames import Frame
 
 __all__ = ["RayHost"]
 
@@ -176,7 +176,7 @@ class RayHost(Host):
             places = [(slab, row) for _, slab, row in found]
             self._table = RowTable(self.first_slot, places)
         elif self._life is not None and order.restarts:
-            self._life.call(self._life.actor.resume, self._on_resumed, order)
+            self._life.call(self._life.actor.renew, self._on_renewed, order)
         # A replacement is not built yet.
         if self._life is not None and self._life.is_built:
             self._post(Attached(self.host_id))
@@ -313,10 +313,9 @@ class RayHost(Host):
         if self._table is not None:  # A replacement has its rows already.
             self._post(Attached(self.host_id))
 
-    def _on_resumed(self, life: _Life, outcome: Frame | Exception | None) -> None:
+    def _on_renewed(self, life: _Life, outcome: Any) -> None:
         del life
-        if self._has_returned(outcome) and isinstance(outcome, Frame):
-            self._post(completion_in(self.host_id, outcome))
+        self._has_returned(outcome)
 
     def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
         if self._has_returned(outcome):

@@ -10,12 +10,13 @@ import pickle
 import time
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.protocol.entries import answers_with_value
 
 if TYPE_CHECKING:
-    from rlightning_aio._core.hosts.messages import EnvState
     from rlightning_aio._core.hosts.running.env_steps import Execute
+    from rlightning_aio._core.hosts.running.row_writer import ShownResult
 
 __all__ = ["Abandoned", "AwaitedRunner"]
 
@@ -61,13 +62,12 @@ class AwaitedRunner(EnvRunner):
         return finish(returned, time.monotonic_ns() - began)
 
     def _snapshot(self) -> EnvState:
-        state = super()._snapshot()
-        return state._replace(checkpoint=pickle.dumps((self.reset_with, state.checkpoint)))
+        versions, state = super()._snapshot()
+        return EnvState(versions, state and pickle.dumps((self.reset_with, state)))
 
-    def _restore(self, checkpoint: bytes, show: bool) -> None:
-        reset_with, state = loaded(checkpoint)
-        super()._restore(state, show)
-        self.reset_with = reset_with
+    def _restore(self, versions: dict[str, str], state: bytes) -> ShownResult:
+        self.reset_with, state = loaded(state)
+        return super()._restore(versions, state)
 
     def _seed_and_options(self, arguments: Any) -> tuple[Any, Any]:
         """Return what to reset the env with, and remember it."""

@@ -98,11 +98,6 @@ def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
             f"env {env.env_id!r} is awaitable (its step is `async def`), and placement "
             f"{config.placement!r} has no event loop for it; use placement: loop or process"
         )
-    if config.snapshot_every is not None:
-        raise TypeError(
-            f"env {env.env_id!r} is awaitable (its step is `async def`), and snapshot_every is not "
-            "available for such envs; call group.snapshot() instead"
-        )
     # Not at the top: few workers need it.
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner  # noqa: PLC0415
 

@@ -28,10 +28,8 @@ from rlightning_aio._core.hosts.messages import (
     ErrorText,
     NewSchema,
     OutOfBand,
-    Saved,
 )
 from rlightning_aio._core.hosts.running.casts import Casts
-from rlightning_aio._core.hosts.running.checkpoint import Checkpoints, Saver
 from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.env_steps import followed, step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
@@ -49,6 +47,7 @@ from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import InfoSchemas
+from rlightning_aio.protocol.pickling import dumped
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -57,8 +56,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.filming.camera import Camera
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion, FilmOrder
     from rlightning_aio._core.hosts.running.casts import Cast
-    from rlightning_aio._core.hosts.running.checkpoint import Send
     from rlightning_aio._core.hosts.running.env_steps import Execute
+    from rlightning_aio._core.hosts.running.row_writer import ShownResult
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta
@@ -71,7 +70,7 @@ __all__ = [
     "give_rows",
     "loaded",
     "placed",
-    "resume_all",
+    "renew_all",
     "seed_generators",
 ]
 
@@ -111,7 +110,6 @@ class EnvRunner:
         inline: it lives in the trainer's process.
         restarts: how many workers had this env before, and how often it was rebuilt.
         fast_path: what the env offers to save time.
-        checkpoints: of the env.
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
             that ends it. None if the env has no such step.
@@ -139,8 +137,7 @@ class EnvRunner:
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
         self._read_action: Callable[[], Any] = _no_action
-        self.checkpoints: Checkpoints
-        self._saver: Saver | None = None
+        self._has_result = False
         self._casts: Casts | None = None
         self._attach_again: Callable[[], None]
         self._adopt(env)
@@ -174,16 +171,10 @@ class EnvRunner:
         hands_over = self.inline and self._is_bare and self.fast_path.fresh_results
         return RowLayout.of(self.meta, observations_out_of_band=hands_over)
 
-    def attach(
-        self,
-        slab: Slab,
-        row: int,
-        announce: Callable[[InfoSchema], int],
-        send_checkpoint: Send | None = None,
-    ) -> None:
+    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
         """Write all results into `row` of `slab` from now on."""
         self._slab, self._row, self._announce = slab, row, announce
-        self._attach_again = partial(self.attach, slab, row, announce, send_checkpoint)
+        self._attach_again = partial(self.attach, slab, row, announce)
         self._writer = RowWriter(
             slab,
             row,
@@ -194,19 +185,14 @@ class EnvRunner:
         )
         if self._casts is not None:
             self._writer.convert_by(self._casts.fitted)
-        self.checkpoints = Checkpoints(self.env, slab, row, self._writer)
+        self._has_result = False
         if slab.action is not None:
             self._read_action = row_reader(slab.action, row)
-        every = self.env.config.snapshot_every
-        if every is not None and send_checkpoint is not None:
-            self._saver = Saver(self.checkpoints, slab.over[row, ...], every, send_checkpoint)
         self._bind()
 
     def _bind(self) -> None:
         """Choose the functions that step the env with the action in its row, and what follows."""
-        self._followers = [] if self._saver is None else [self._saver.after_step]
-        if self._camera is not None:
-            self._followers.append(self._camera.see)
+        self._followers = [] if self._camera is None else [self._camera.see]
         self.begin_step = None
         self.step = self._stepper()
         if self._followers:  # A step in halves would bypass them.
@@ -246,7 +232,7 @@ class EnvRunner:
         if op == Operation.SNAPSHOT:
             return self._snapshot, _outcome
         if op == Operation.RESTORE:
-            return partial(self._restore, *arguments), _outcome
+            return partial(self._restore, *arguments), self._finish_restore
         if arguments[0] == RECORD_VIDEO:
             return partial(self._record_video, *arguments[1]), _outcome
         if arguments[0] == CASTS:
@@ -254,14 +240,49 @@ class EnvRunner:
         return partial(call_env, self.env, *arguments), _outcome
 
     def _snapshot(self) -> EnvState:
-        checkpoints = self.checkpoints
-        return EnvState(versions_of(self.env), checkpoints.has_result, checkpoints.take())
+        if self._writer.partial_results:
+            raise NotImplementedError(
+                f"env {self.env.env_id!r} returns results of some sub-environments at a time; "
+                "there is no moment at which all of them are idle"
+            )
+        versions = versions_of(self.env)
+        if not self._has_result:
+            return EnvState(versions, None)
+        state = self.env.save_state(), self._writer.shown_result()
+        return EnvState(versions, dumped(state, "its state"))
 
-    def _restore(self, checkpoint: bytes, show: bool) -> None:
-        self.checkpoints.load(checkpoint, show=show)
-        if self._saver is not None:
-            # Where nothing is to be shown, it goes back to where the trainer knows it to be.
-            self._saver.save(before=not show)
+    def _restore(self, versions: dict[str, str], state: bytes) -> ShownResult:
+        """Go back to a state that `_snapshot` saved; return the last result at that time.
+
+        Raises:
+            ValueError: it was saved with other versions of libraries.
+        """
+        here = versions_of(self.env)
+        for name, version in versions.items():
+            # An env may load a library only in its first reset.
+            if here.get(name, version) != version:
+                raise ValueError(
+                    f"its state was saved with version {version} of {name}, and here it is "
+                    f"{here[name]}"
+                )
+        saved, shown_result = pickle.loads(state)
+        try:
+            self.env.load_state(saved)
+        except ValueError:
+            if self._has_result or self.is_awaitable:
+                raise
+            self.env.reset()  # It may create parts of the state.
+            self.env.load_state(saved)
+        return shown_result
+
+    def _finish_restore(self, shown_result: ShownResult, busy_ns: int) -> OutOfBand | None:
+        """Show a result again; frames that follow aren't of the episode being filmed."""
+        del busy_ns
+        if self._camera is not None:
+            self._camera.close()
+        out_of_band = self._writer.write_shown(shown_result)
+        self._note_reset()
+        return out_of_band
 
     def _noted_casts(self) -> list[Cast]:
         """Return what was converted since the first call, which begins to note it."""
@@ -389,12 +410,7 @@ class EnvRunner:
     # -- resets -------------------------------------------------------------------
 
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
-        """Start a new episode, or show the restored result if the reset in the row asks for it."""
-        if arguments is None and self.checkpoints.accept_show():
-            return _no_call, self._finish_shown
-        if self._saver is not None:
-            self._saver.before_reset()
-        self.checkpoints.forget_result()
+        """Start a new episode."""
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
@@ -405,15 +421,6 @@ class EnvRunner:
         seed, options = arguments or (self._slab.take_seed(self._row), None)
         self._seed_generators(seed)
         return seed, options
-
-    def _finish_shown(self, returned: None, busy_ns: int) -> OutOfBand | None:
-        """Show the restored result; frames that follow aren't of the episode being filmed."""
-        del returned, busy_ns
-        if self._camera is not None:
-            self._camera.close()
-        out_of_band = self.checkpoints.show()
-        self._note_reset()
-        return out_of_band
 
     def _seed_generators(self, seed: int | None) -> None:
         """Seed the global generators for an episode that begins with a seed.
@@ -432,8 +439,6 @@ class EnvRunner:
         else:
             out_of_band = self._write("reset", returned, busy_ns)
         self._note_reset()
-        if self._saver is not None:
-            self._saver.save()
         if self._camera is not None:
             self._camera.see()
         return out_of_band
@@ -447,8 +452,8 @@ class EnvRunner:
         return write(parts, busy_ns, result._extra, result)  # pyright: ignore[reportPrivateUsage]
 
     def _note_reset(self) -> None:
-        """Record that the row holds the first result of an episode."""
-        self.checkpoints.note_result()
+        """Record that the row holds a result that no transition has led to."""
+        self._has_result = True
         if self._writer.is_bypassed and self._writer.whole is not None:
             # The results hold tensors that stay here, so the writer is needed from now on.
             self._writer.is_bypassed = False
@@ -457,10 +462,6 @@ class EnvRunner:
 
 def _no_action() -> None:
     """Return the action of an env whose actions don't travel in its row."""
-
-
-def _no_call() -> None:
-    """Do nothing, in place of a call of the env."""
 
 
 def _outcome(returned: Any, busy_ns: int) -> Any:
@@ -502,15 +503,11 @@ def give_rows(
     Args:
         placed_runners: the host's envs, by index, each with its slab and row.
         host_id: of the host.
-        post: gets completions: new schemas of infos, and checkpoints.
+        post: gets completions: new schemas of infos.
     """
-
-    def save(index: int, checkpoint: bytes, before: bool) -> None:
-        post(Saved(host_id, index, checkpoint, before))
-
     schemas = InfoSchemas(lambda number, schema: post(NewSchema(host_id, number, schema)))
-    for index, (runner, slab, row) in enumerate(placed_runners):
-        runner.attach(slab, row, schemas.announce, partial(save, index))
+    for runner, slab, row in placed_runners:
+        runner.attach(slab, row, schemas.announce)
 
 
 def attach_all(
@@ -520,7 +517,7 @@ def attach_all(
     host_id: int,
     post: Callable[[Completion], None],
 ) -> None:
-    """Give the envs of a host their rows, restore those that have a checkpoint, and post that.
+    """Give the envs of a host their rows, and post that.
 
     Args:
         runners: of the host's envs.
@@ -530,20 +527,17 @@ def attach_all(
         post: gets completions, as of `give_rows`, and `Attached`.
     """
     give_rows(placed(runners, order, map_part), host_id, post)
-    resume_all(runners, order)
+    renew_all(runners, order)
     post(Attached(host_id))
 
 
-def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
-    """Seed a replacement, restore its envs that have a checkpoint, and film those that were."""
+def renew_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
+    """Seed a replacement, and film those of its envs that were."""
     if order.seed is not None:
         # Not the numbers of an episode that begins with that seed.
         seed_generators(order.seed, order.restarts, 1)
     for runner in runners:
         runner.restarts = order.restarts
-    for runner, checkpoint in zip(runners, order.checkpoints, strict=False):
-        if checkpoint is not None:
-            runner.checkpoints.resume(checkpoint)
     for runner, film in zip(runners, order.films, strict=False):
         runner.keep_filming(film)
 
