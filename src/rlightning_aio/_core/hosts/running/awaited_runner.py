@@ -66,8 +66,10 @@ class AwaitedRunner(EnvRunner):
         return EnvState(versions, state and pickle.dumps((self.reset_with, state)))
 
     def _restore(self, versions: dict[str, str], state: bytes) -> ShownResult:
-        self.reset_with, state = loaded(state)
-        return super()._restore(versions, state)
+        reset_with, state = loaded(state)
+        shown_result = super()._restore(versions, state)
+        self.reset_with = reset_with
+        return shown_result
 
     def _seed_and_options(self, arguments: Any) -> tuple[Any, Any]:
         """Return what to reset the env with, and remember it."""

@@ -240,11 +240,6 @@ class EnvRunner:
         return partial(call_env, self.env, *arguments), _outcome
 
     def _snapshot(self) -> EnvState:
-        if self._writer.partial_results:
-            raise NotImplementedError(
-                f"env {self.env.env_id!r} returns results of some sub-environments at a time; "
-                "there is no moment at which all of them are idle"
-            )
         versions = versions_of(self.env)
         if not self._has_result:
             return EnvState(versions, None)
