@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import pickle
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -120,3 +122,47 @@ def test_whoever_reads_finds_all_columns(name: str) -> None:
     assert READERS_OF_COLUMNS[name](infos) == COLUMNS
     list(infos)
     assert len(calls) == 1
+
+
+KINDS = {"list": (LazyInfos, INFOS), "dict": (LazyColumns, COLUMNS)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_another_thread_finds_all_while_they_are_made(kind: str) -> None:
+    """It waits until they are there; they are made only once."""
+    lazy, expected = KINDS[kind]
+    begun, go_on, calls = threading.Event(), threading.Event(), list[None]()
+
+    def make() -> Any:
+        calls.append(None)
+        begun.set()
+        assert go_on.wait(60)
+        return copy.deepcopy(expected)
+
+    infos: Any = lazy(make)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(infos.copy)
+        assert begun.wait(60)
+        second = pool.submit(infos.copy)
+        go_on.set()
+        assert first.result() == second.result() == expected
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_infos_that_could_not_be_made_are_not_empty(kind: str) -> None:
+    """Each reading says so, until it works."""
+    lazy, expected = KINDS[kind]
+    answers: list[Any] = [MemoryError(), MemoryError(), copy.deepcopy(expected)]
+
+    def make() -> Any:
+        answer = answers.pop(0)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    infos: Any = lazy(make)
+    for _ in range(2):
+        with pytest.raises(MemoryError):
+            len(infos)
+    assert infos.copy() == infos.copy() == expected

@@ -9,6 +9,7 @@ dicts.
 from __future__ import annotations
 
 import functools
+import threading
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -30,12 +31,15 @@ _OF_DICTS: Final = (
     "values",
 )  # fmt: skip
 
+_MAKING: Final = threading.RLock()
+"""Held while infos are made, so that another thread that reads them waits until they are there."""
+
 
 class LazyInfos(list[dict[str, Any]]):
     """A list that is made by the first call of any of its methods.
 
     Args:
-        make: returns the elements; called at most once.
+        make: returns the elements; called once, and again after an error.
     """
 
     __slots__ = ("_make",)
@@ -49,9 +53,12 @@ class LazyInfos(list[dict[str, Any]]):
 
     def fill(self) -> None:
         """Make the elements, unless that has been done."""
-        make, self._make = self._make, None
-        if make is not None:
-            super().extend(make())
+        if self._make is None:
+            return
+        with _MAKING:
+            if self._make is not None:
+                super().extend(self._make())
+                self._make = None
 
     def __radd__(self, other: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Concatenate; a plain list's own method would read the elements past this class."""
@@ -68,7 +75,7 @@ class LazyColumns(dict[str, Any]):
     Left out: `json.dumps`, which looks into a dict past its methods, and can't write arrays anyway.
 
     Args:
-        make: returns the entries; called at most once.
+        make: returns the entries; called once, and again after an error.
     """
 
     __slots__ = ("_make",)
@@ -82,9 +89,12 @@ class LazyColumns(dict[str, Any]):
 
     def fill(self) -> None:
         """Make the entries, unless that has been done."""
-        make, self._make = self._make, None
-        if make is not None:
-            super().update(make())
+        if self._make is None:
+            return
+        with _MAKING:
+            if self._make is not None:
+                super().update(self._make())
+                self._make = None
 
     def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
         """Pickle and copy as a plain dict."""
