@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -9,12 +10,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from kit.scripted import DIE, GO, Scripted
+from kit.scripted import DIE, GO, HANG, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, endless, evaluate
+from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, evaluate
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ SHORT, LONG = 2, 8
 class Succeeding(Scripted):
     """Succeeds soon or fails late, as ``succeeds`` says for the seed of the episode.
 
-    Action 1 ends its process.
+    Action 1 ends its process, and action 2 never ends.
     """
 
     def __init__(self, succeeds: Callable[[int], bool], key: str = "success") -> None:
@@ -37,7 +38,7 @@ class Succeeding(Scripted):
 
     def does(self, action: Any) -> None:
         self.length = SHORT if self._succeeds(self._seed) else LONG
-        super().does(DIE if action == 1 else GO)
+        super().does({1: DIE, 2: HANG}.get(int(action), GO))
 
     def observed(self) -> Any:
         self._seed = self._seed if self.seed is None else self.seed
@@ -295,6 +296,35 @@ def test_entries_may_differ() -> None:
     assert Counter(one.env_id for one in found.attempts) == {"pair-0": 4, "single-0": 2}
 
 
+def test_entries_of_different_spaces_have_a_policy_each() -> None:
+    """Each is called with the results of its entry alone; one may be a model, or random."""
+    tasks = {"cart": "CartPole-v1", "car": "MountainCar-v0", "bar": "Pendulum-v1"}
+    entries = [
+        {"name": name, "backend": "gymnasium", "task": task, "placement": "inline"}
+        for name, task in tasks.items()
+    ]
+    shapes = set[tuple[int, ...]]()
+
+    class Model:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            shapes.add(observation.shape)
+            return np.zeros(len(observation), np.int64), None
+
+    def swing(batch: rl.BatchedData) -> Any:
+        shapes.add(batch.observation.shape)
+        return np.zeros((len(batch), 1), np.float32)
+
+    policies = {"cart": Model(), "bar": swing, "car": None}
+    with sync.build_env_group(entries, mixed_actions=True) as group, group.auto_reset(5):
+        found = evaluate(group, policies, 2, seed=0)
+        assert Counter(one.env_id for one in found.attempts) == {f"{name}-0": 2 for name in tasks}
+        assert shapes == {(1, 4), (1, 3)}
+        del policies["car"]
+        with pytest.raises(ValueError, match=r"no policy was given for .* 'car'.* cart, bar"):
+            evaluate(group, policies, 2)
+        assert group.pending == []
+
+
 def test_the_policy_waits_for_half_of_the_envs_by_default() -> None:
     """So it is not called for one env after the other."""
     sizes: list[int] = []
@@ -377,6 +407,69 @@ def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
         group.collect_async()
 
 
+@pytest.mark.parametrize("placement", ["inline", "process"])
+@pytest.mark.parametrize("error", [RuntimeError("no memory"), KeyboardInterrupt()])
+def test_nothing_is_left_of_an_evaluation_that_ends_in_an_error(
+    placement: str, error: BaseException
+) -> None:
+    """The next one begins anew, with what an undisturbed one finds."""
+    calls = 0
+
+    def fails(batch: rl.BatchedData) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 5:
+            raise error
+        return nothing(batch)
+
+    with group_of(*HALF_SUCCEED, placement=placement) as group:
+        whole = evaluate(group, nothing, 2, seed=0)
+        with pytest.raises(type(error)):
+            evaluate(group, fails, 2, seed=0, min_results=1)
+        assert group.pending == []
+        again = evaluate(group, nothing, 2, seed=0)
+    assert by_number(again) == by_number(whole)
+    assert not again.failures
+
+
+def test_a_step_that_takes_too_long_for_an_evaluation_that_has_ended_is_aborted() -> None:
+    """Its episode is no loss of the next one."""
+    hanging = False
+
+    def fails(batch: rl.BatchedData) -> Any:
+        nonlocal hanging
+        if hanging:
+            raise RuntimeError("no memory")
+        hanging = "env-0" in batch.env_ids()
+        return [2 if env_id == "env-0" else 0 for env_id in batch.env_ids()]
+
+    with group_of(*HALF_SUCCEED[:2], placement="process") as group:
+        with pytest.raises(RuntimeError, match="no memory"):
+            evaluate(group, fails, 1, seed=0, min_results=1)
+        assert group.pending == []
+        found = evaluate(group, nothing, 2, seed=0)
+    assert len(found.played) == 4
+    assert not found.failures
+
+
+async def test_nothing_is_left_of_an_evaluation_that_is_cancelled() -> None:
+    """It may be cancelled where it waits for an env, or for the policy."""
+    waits = asyncio.Event()
+
+    async def never(batch: rl.BatchedData) -> Any:
+        waits.set()
+        await asyncio.Event().wait()
+
+    async with rl.build_env_group("CartPole-v1", num_workers=2, max_episode_steps=5) as group:
+        playing = asyncio.ensure_future(evaluate(group, never, 2, min_results=1))
+        await waits.wait()
+        playing.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await playing
+        assert group.pending == []
+        assert len((await evaluate(group, nothing, 2)).played) == 4
+
+
 def test_it_resets_envs_at_their_ends_by_itself() -> None:
     """At the limits of the open context, or else at their own, if they have any."""
     for limit, lengths in ((None, {SHORT, LONG}), (5, {SHORT, 5})):
@@ -388,20 +481,6 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
                 with group.auto_reset(limit or 3):  # None is open.
                     found = evaluate(group, nothing, 1)
                 assert {episode.length for episode in found.played} == {SHORT, limit or 3}
-
-
-def test_an_episode_that_may_never_end_is_named(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Once, in both forms: evaluate would wait for it for ever."""
-    monkeypatch.setattr(endless, "_LONG", 5)
-    for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
-        caplog.clear()
-        with group_of(*HALF_SUCCEED) as group:
-            evaluate(group, nothing, episodes)
-        (record,) = caplog.records
-        assert record.levelname == "WARNING"
-        assert "an episode of env 'env-2' has made 5 steps" in record.getMessage()
 
 
 def test_it_needs_its_own_envs() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import pickle
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -299,7 +299,13 @@ class Training(InContext):
 
 
 class Evaluations(InContext):
-    """A run of a program that evaluates a policy, whose actions follow from what it sees."""
+    """A run of a program that evaluates a policy, whose actions follow from what it sees.
+
+    Attributes:
+        calls_left: of the policy until it raises.
+    """
+
+    calls_left = math.inf
 
     def drawn_limit(self, rng: Random) -> float | None:
         """None is finite with envs that reset themselves, of which it cuts several at once."""
@@ -311,6 +317,9 @@ class Evaluations(InContext):
         return ("end" if kind % 6 == 0 else "cut" if kind % 11 == 0 else "plain"), kind % TOKENS
 
     def policy(self, batch: BatchedData) -> Any:
+        self.calls_left -= 1
+        if self.calls_left < 0:
+            raise PolicyFailed
         actions: list[Any] = []
         rets = batch.values()
         for ret in rets:
@@ -328,14 +337,18 @@ class Evaluations(InContext):
 
     async def op_evaluate(self, rng: Random) -> None:
         singles = all(plan.form != "stacked" for plan in self.program.plans)
-        await self.drain()
+        await self.settle()
         if self.any_gone():
             return
+        self.calls_left = rng.randint(0, 20) if rng.random() < 0.3 else math.inf
+        self.pressed = self.num_interrupts
         try:
             if singles and rng.random() < 0.6:
                 await self._queue(rng)
             else:
                 await self._number(rng)
+        except PolicyFailed:
+            self.counts["evaluations whose policy failed"] += 1
         except WorkerDied as fault:
             self.count(fault)
             self.lose(fault)
@@ -346,20 +359,33 @@ class Evaluations(InContext):
             for env_id in given_up:
                 self.by_id[env_id].gone = True
 
-    async def drain(self) -> None:
-        """Take what an evaluation has left that did not end."""
-        while self.group.pending:
-            try:
-                await self.done(self.group.collect_async())
-            except WorkerDied as fault:
-                self.lose(fault)
-            except EnvRaised as fault:  # In an env of this process.
-                require(fault.exception_type == "KeyboardInterrupt", "an error", repr(fault))
+    async def settle(self) -> None:
+        """Check that an evaluation has left nothing, unless Ctrl-C was pressed twice."""
+        if self.group.pending:
+            require(self.num_interrupts > self.pressed + 1, "left in flight", self.group.pending)
+            with suppress(EnvFault):
+                await self.done(self.group.drain(1.0))
+        for env_id in self.given_up():
+            self.by_id[env_id].gone = True
+
+    async def _found(self, rng: Random, answer: Any) -> Any:
+        """Wait for an evaluation, or cancel it: then None."""
+        if not self.is_async or "cancel" not in self.features or rng.random() < 0.6:
+            return await self.done(answer)
+        playing = asyncio.ensure_future(answer)
+        await asyncio.wait({playing}, timeout=10 ** rng.uniform(-6, 1))
+        playing.cancel()
+        try:
+            return await playing
+        except asyncio.CancelledError:
+            self.counts["evaluations cancelled"] += 1
 
     async def _number(self, rng: Random) -> None:
         """As many episodes of each env."""
         count, seed = rng.randint(1, 3), rng.randrange(1000)
-        found = await self.done(evaluate(self.group, self.policy, count, seed=seed))
+        found = await self._found(rng, evaluate(self.group, self.policy, count, seed=seed))
+        if found is None:
+            return
         width = sum(len(env.codes) for env in self.envs)
         places = {(one.env_id, one.sub_env, one.index): one for one in found.attempts}
         require(len(places) == len(found.attempts) == count * width, "as many of each", found)
@@ -375,7 +401,9 @@ class Evaluations(InContext):
     async def _queue(self, rng: Random) -> None:
         """A queue of episodes, for any env of their entries."""
         specs = self.specs(rng, 8)
-        found = await self.done(evaluate(self.group, self.policy, specs))
+        found = await self._found(rng, evaluate(self.group, self.policy, specs))
+        if found is None:
+            return
         keys = sorted(one.spec.key for one in found.attempts)
         require(keys == sorted(spec.key for spec in specs), "other episodes", keys)
         for attempt in found.attempts:
@@ -411,7 +439,7 @@ class Evaluations(InContext):
                 return total, length
 
     async def finish(self) -> None:
-        await self.drain()
+        await self.settle()
         if not self.any_gone():
             await self.op_evaluate(Random(1))
         await super().finish()

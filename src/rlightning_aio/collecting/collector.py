@@ -21,6 +21,7 @@ from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
+from rlightning_aio.policies.answers import parts_by_policy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
@@ -314,15 +315,10 @@ class Collector(Generic[G, R]):
 
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
         policies = self._policies
-        if policies is None:
-            return [(self._kind("", self._policy), batch)]
-        parts = batch.by_entry()
-        for name in parts.keys() - policies.keys():
-            raise ValueError(
-                f"no policy was given for the envs of entry {name!r}; those given are for "
-                f"{', '.join(policies)}"
-            )
-        return [(self._kind(name, policies[name]), part) for name, part in parts.items()]
+        return [
+            (self._kind(name, self._policy if policies is None else policies[name]), part)
+            for name, part in parts_by_policy(batch, policies)
+        ]
 
     def _kind(self, name: str, policy: Callable[[BatchedData], Any] | None) -> EnvKind:
         if name not in self._kinds:

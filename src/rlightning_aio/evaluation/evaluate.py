@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import closing
 from operator import index
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, cast, overload
 
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.attempts.queue import AttemptQueue
@@ -15,6 +16,7 @@ from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.evaluation.films import Films
 from rlightning_aio.evaluation.playing import Options, PolicyPlay
+from rlightning_aio.policies.answers import check_policies
 from rlightning_aio.policies.predicting import Model, PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
@@ -31,13 +33,14 @@ if TYPE_CHECKING:
 
 __all__ = ["evaluate"]
 
-Policy: TypeAlias = "Callable[[BatchedData], Any] | Model"
+Function: TypeAlias = "Callable[[BatchedData], Any]"
+Policy: TypeAlias = "Callable[[BatchedData], Any] | Model | None"
 
 
 @overload
 def evaluate(
     group: SyncEnvGroup,
-    policy: Policy | None,
+    policy: Policy | Mapping[str, Policy],
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -52,7 +55,7 @@ def evaluate(
 @overload
 def evaluate(
     group: AsyncEnvGroup,
-    policy: Policy | None,
+    policy: Policy | Mapping[str, Policy],
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -66,7 +69,7 @@ def evaluate(
 
 def evaluate(
     group: Any,
-    policy: Policy | None,
+    policy: Policy | Mapping[str, Policy],
     episodes: int | Iterable[EpisodeSpec],
     *,
     seed: int | None = None,
@@ -85,7 +88,8 @@ def evaluate(
         policy: called with a batch of results (`BatchedData`). It returns actions, or columns by
             name with ``action``, or what `BatchedData.respond` returns, or a list of such; with an
             asynchronous group, it may be awaitable. Or a model with the `predict` of
-            Stable-Baselines3, for its most probable actions. None: random actions.
+            Stable-Baselines3, for its most probable actions. None: random actions. Or a dict with
+            one of these for each config entry, for entries of different spaces.
         episodes: a number for each env, and for each sub-environment; or a queue of episodes,
             each to be played once by any free env.
         seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
@@ -105,23 +109,22 @@ def evaluate(
 
     Raises:
         EnvBusy: an env has a request in flight, or a result that was not collected.
-        ValueError: a number is out of its range, the group has an env_server, an episode is in the
-            queue twice, no entry of the group or more than one can play it, a queue has a `seed`,
-            a queue or `video` is given for an env with sub-environments, or an env to be filmed
-            was not made with the ``render_mode`` ``rgb_array``.
+        ValueError: a number is out of its range, the group has an env_server, an entry has no
+            policy, an episode is in the queue twice, no entry of the group or more than one can
+            play it, a queue has a `seed`, a queue or `video` is given for an env with
+            sub-environments, or an env to be filmed has not the ``render_mode`` ``rgb_array``.
         BadAction: the policy's actions don't fit; nothing was sent.
         WorkerDied, EnvHung: no env is left that could play an episode.
         ConfigError: `results` can't be written.
         OSError: nothing can be written into the folder `video`.
         ImportError: `video` is given, and imageio-ffmpeg isn't installed.
     """
-    is_number = isinstance(episodes, SupportsIndex)
-    _check_numbers({"min_results": min_results, "episodes": episodes if is_number else None})
-    _check(group, one_each=video is not None or not is_number)
+    number = index(episodes) if isinstance(episodes, SupportsIndex) else None
+    _check(group, min_results, number, films=video is not None)
     films = None if video is None else Films(group, video)
     queue = AttemptQueue(group, Rules(retries=retries), results)
     options = Options(min_results or default_min_results(group), films, on_episode)
-    play = PolicyPlay(group, _called(policy, group, seed), queue, Evaluation(), options)
+    play = PolicyPlay(group, _by_entry(policy, group, seed), queue, Evaluation(), options)
     play.note_known(_filled(group, queue, episodes, seed))
     return run(_resetting(play, group), group)
 
@@ -157,23 +160,34 @@ def _each(group: Any, queue: AttemptQueue, episodes: int, seed: int | None) -> l
 
 def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
     with ensure_auto_reset(group), closing(play):
-        return (yield from play.to_the_end())
+        try:
+            return (yield from play.to_the_end())
+        except GeneratorExit:  # Nobody runs it any more.
+            raise
+        except BaseException:  # Ctrl-C and a cancellation, too.
+            yield from play.abandon()
+            raise
 
 
-def _called(policy: Policy | None, group: Any, seed: int | None) -> Callable[[BatchedData], Any]:
-    """Return a policy as a function of a batch."""
+def _by_entry(policy: Any, group: Any, seed: int | None) -> dict[str, Function]:
+    """Return policies as functions of a batch, by entry; one for all envs has the name ``""``."""
+    if not isinstance(policy, Mapping):
+        return {"": _called(policy, group, seed)}
+    given = cast("Mapping[str, Policy]", policy)
+    check_policies((worker["entry"] for worker in group.get_workers()), given)
+    return {name: _called(one, group, seed) for name, one in given.items()}
+
+
+def _called(policy: Policy, group: Any, seed: int | None) -> Function:
     if policy is None:
         return RandomPolicy({meta.env_id: meta.action_space for meta in group.metas}.get, seed)
     return policy if callable(policy) else PredictPolicy(policy)
 
 
-def _check_numbers(numbers: dict[str, Any]) -> None:
-    for name, number in numbers.items():
+def _check(group: Any, min_results: int | None, episodes: int | None, *, films: bool) -> None:
+    for name, number in (("min_results", min_results), ("episodes", episodes)):
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, not {number!r}")
-
-
-def _check(group: Any, *, one_each: bool) -> None:
     for meta in group.metas:
         if meta.action_space is None:
             raise ValueError(
@@ -182,12 +196,12 @@ def _check(group: Any, *, one_each: bool) -> None:
             )
     if pending := group.pending:
         raise EnvBusy(
-            f"{pending[0]!r} has a request whose result was not collected; collect it, or close "
+            f"{pending[0]!r} has a request whose result was not collected; collect it, or drain() "
             "the group. A Collector leaves requests in flight after each rollout: to evaluate "
             "between rollouts, build a second group of the same entries"
         )
     for meta in group.metas:
-        if one_each and meta.num_envs > 1:
+        if (films or episodes is None) and meta.num_envs > 1:
             raise ValueError(
                 f"{meta.env_id} has {meta.num_envs} sub-environments, but an env plays or films "
                 "one episode of a queue at a time: num_envs: 1, and num_workers for the number of "

@@ -7,20 +7,21 @@ on with their next episodes until all are played.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.attempts.success import success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
-from rlightning_aio.errors import EnvFault, WorkerDied
-from rlightning_aio.evaluation.endless import EndlessEpisodes
+from rlightning_aio.errors import EnvFault, GroupClosed, WorkerDied
 from rlightning_aio.outcomes import Outcome, own_end
-from rlightning_aio.policies.answers import answers_of
+from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Options", "PolicyPlay"]
 
+_PATIENCE_SECONDS: Final = 1.0
+"""For results of an evaluation that ends in an error; what takes longer is aborted."""
 _log = logging.getLogger("rlightning_aio")
 
 
@@ -53,7 +56,7 @@ class PolicyPlay:
 
     Args:
         group: an initialised group.
-        policy: see `evaluate`.
+        policies: functions of a batch by entry; one for all envs has the name ``""``.
         queue: of the episodes.
         found: what comes of the episodes is added to it.
         options: see `Options`.
@@ -62,12 +65,13 @@ class PolicyPlay:
     def __init__(
         self,
         group: Any,
-        policy: Callable[[BatchedData], Any],
+        policies: dict[str, Callable[[BatchedData], Any]],
         queue: AttemptQueue,
         found: Evaluation,
         options: Options,
     ) -> None:
-        self._group, self._policy, self._queue = group, policy, queue
+        self._group, self._policies, self._queue = group, policies, queue
+        self._given = None if "" in policies else policies
         self._found, self._options = found, options
         metas: list[EnvMeta] = group.metas
         self._metas = {meta.env_id: meta for meta in metas}
@@ -89,7 +93,6 @@ class PolicyPlay:
         """Those of them that a reset begins."""
         self._ended: deque[tuple[Job, Attempt]] = deque()
         """Episodes that the last results ended, to be noted."""
-        self._endless = EndlessEpisodes()
         self._has_warned = False
         self._films = options.films
 
@@ -113,6 +116,12 @@ class PolicyPlay:
                 self._note_fault(fault)
             else:
                 yield from self._continue(batch)
+
+    def abandon(self) -> Procedure[None]:
+        """End what was sent, after an error: the group is idle then."""
+        with contextlib.suppress(EnvFault, GroupClosed):  # Those envs' episodes are lost anyway.
+            if self._group.pending:
+                yield partial(self._group.drain, _PATIENCE_SECONDS)
 
     def close(self) -> None:
         """Delete the films of episodes that have no end."""
@@ -188,10 +197,11 @@ class PolicyPlay:
         ]
         if rows:
             stepped = batch if len(rows) == len(batch) else batch.take(rows)
-            answer = yield lambda: self._policy(stepped)
-            space = self._metas[env_ids[rows[0]]].action_space
-            for part in answers_of(stepped, answer, lambda: space):
-                self._step(part)
+            for name, part in parts_by_policy(stepped, self._given):
+                answer = yield partial(self._policies[name], part)
+                space = self._metas[part.env_ids()[0]].action_space
+                for responses in answers_of(part, answer, lambda space=space: space):
+                    self._step(responses)
 
     def _film(self, films: Films, env_ids: list[str]) -> Procedure[None]:
         for env_id in env_ids:
@@ -221,7 +231,7 @@ class PolicyPlay:
 
     def _record(self, batch: BatchedData) -> None:
         """Add results to their episodes."""
-        env_ids, shape = batch.env_ids(), batch.is_reset.shape
+        env_ids = batch.env_ids()
         if batch.restarted.any():
             self._note_losses(batch)
         places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
@@ -230,7 +240,6 @@ class PolicyPlay:
         with np.errstate(over="ignore", invalid="ignore"):  # The return shows it.
             self._reward[places] += rewards
         self._length[places] += stepped
-        self._endless.look(self._length[places].reshape(shape), env_ids)
         done = all_agents(batch.done)
         ended = stepped & done.reshape(-1)
         if ended.any():

@@ -1,4 +1,4 @@
-"""`answers_of`: the one reading of what a policy returns.
+"""`parts_by_policy` and `answers_of`: what each policy is given, and the one reading of its answer.
 
 A policy is called with a batch of results. It returns actions, ``[n, *action]`` (a dict or tuple of
 such arrays for Dict and Tuple spaces, or a list with one action for each result), or a dict of
@@ -16,11 +16,46 @@ from rlightning_aio.errors import BadAction
 from rlightning_aio.trees import is_dict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     import gymnasium as gym
 
-__all__ = ["answers_of"]
+__all__ = ["answers_of", "check_policies", "parts_by_policy"]
+
+
+def check_policies(entries: Iterable[str], policies: Mapping[str, object]) -> None:
+    """Check that each of some entries has a policy.
+
+    Raises:
+        ValueError: one has none.
+    """
+    for name in entries:
+        if name not in policies:
+            raise ValueError(
+                f"no policy was given for the envs of entry {name!r}; those given are for "
+                f"{', '.join(policies)}"
+            )
+
+
+def parts_by_policy(
+    batch: BatchedData, policies: Mapping[str, object] | None
+) -> list[tuple[str, BatchedData]]:
+    """Split a batch of results by policy.
+
+    Args:
+        batch: of results.
+        policies: by the name of a config entry; None for one policy for all envs.
+
+    Returns the results of each entry; all of them for the name ``""`` if there is one policy.
+
+    Raises:
+        ValueError: an entry has no policy.
+    """
+    if policies is None:
+        return [("", batch)]
+    parts = batch.by_entry()
+    check_policies(parts, policies)
+    return [*parts.items()]
 
 
 def answers_of(
