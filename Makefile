@@ -159,7 +159,7 @@ dist: $(VENV)/installed-release ## the wheel and the sdist, into dist/
 	rm -rf dist
 	$(PY) -m build
 
-bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib $(OPENENV)/installed ## every benchmark, peers included (their packages are large)
+bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib ## every benchmark that has a table, with every peer (their packages are large)
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache

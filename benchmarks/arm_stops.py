@@ -1,7 +1,7 @@
 """How far does a robot arm travel after the process that drives it is killed or stopped?
 
     python benchmarks/arm_stops.py
-    python benchmarks/arm_stops.py --signals HUP KILL --places client --json stops.json
+    python benchmarks/arm_stops.py --signals HUP KILL --places client
 
 Three simulated Piper arms, one for each kind of safe stop, are moving to a far target when one
 process gets a signal: the trainer whose arms are in workers, the workers, a trainer whose arms are
@@ -21,7 +21,7 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -294,7 +294,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--signals", nargs="+", choices=SIGNALS, default=SIGNALS)
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES)
-    parser.add_argument("--json", type=Path, help="write what was measured there")
     parser.add_argument("--drive", nargs="+", help=argparse.SUPPRESS)
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -311,8 +310,6 @@ def main() -> None:
             for one in measure(place, name)
         ]
         print(table(found))
-        if arguments.json:
-            arguments.json.write_text(json.dumps([asdict(one) for one in found], indent=2))
         print(f"{len(found)} arms in {time.monotonic() - began:.0f} s", file=sys.stderr)
 
 

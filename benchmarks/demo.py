@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from contenders import GymnasiumAsync, MakeVec, Work
+from contenders import GymnasiumVector, OursVector, Work
 from harness import Contender, Figures, Stage, number_text, throughput
-from headline import GYMNASIUM, OURS
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from waiting import BriefAwaiting, BriefSleeping
+from waiting import BriefAwaiting
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,30 +36,6 @@ Next:
 
 
 @dataclass
-class InProcesses(Contender):
-    """`AsyncVectorEnv`, which waits for the slowest env at each step."""
-
-    name: str = "AsyncVectorEnv"
-
-    def setup(self) -> None:
-        from gymnasium.vector import AsyncVectorEnv
-
-        self._envs: Any = AsyncVectorEnv([BriefSleeping] * NUM_ENVS)
-        self._envs.reset(seed=0)
-        self._actions = np.zeros(NUM_ENVS, np.int64)
-
-    def round(self, seconds: float) -> float:
-        return throughput(self._step, seconds)
-
-    def _step(self) -> int:
-        self._envs.step(self._actions)
-        return NUM_ENVS
-
-    def teardown(self) -> None:
-        self._envs.close()
-
-
-@dataclass
 class Awaited(Contender):
     """A group of awaitable envs on the event loop of one worker: first come, first served."""
 
@@ -69,7 +44,7 @@ class Awaited(Contender):
     def setup(self) -> None:
         from rlightning_aio import sync
 
-        self._group = sync.build_env_group(BriefAwaiting, num_workers=NUM_ENVS)
+        self._group = sync.build_env_group(BriefAwaiting, num_workers=NUM_ENVS, step_timeout=60)
         self._group.init()
         batch, _ = self._group.reset(seed=0)
         self._actions = np.zeros(NUM_ENVS, np.int64)
@@ -95,15 +70,21 @@ class Line(NamedTuple):
     ours: Contender
 
 
-CARTPOLES = Work("CartPole-v1", NUM_ENVS)
+def theirs(task: str) -> Contender:
+    """Return `AsyncVectorEnv`, which waits for the slowest env at each step."""
+    return GymnasiumVector("AsyncVectorEnv", Work(task, NUM_ENVS), "async")
+
+
+def ours(task: str, mode: str | None = None) -> Contender:
+    """Return what `make_vec` makes."""
+    return OursVector("make_vec", Work(task, NUM_ENVS), mode)
+
+
+MUJOCO, PYTHON, SLEEPING = "HalfCheetah-v5", "CartPole-v1", "waiting:benchmarks/Sleeping-v0"
 LINES = (
-    Line("MuJoCo in one batch", GYMNASIUM, OURS),
-    Line(
-        "plain Python in workers",
-        GymnasiumAsync("AsyncVectorEnv", CARTPOLES),
-        MakeVec("make_vec", CARTPOLES),
-    ),
-    Line("an env that waits", InProcesses(), Awaited()),
+    Line("MuJoCo in one batch", theirs(MUJOCO), ours(MUJOCO)),
+    Line("plain Python in workers", theirs(PYTHON), ours(PYTHON, "async")),
+    Line("an env that waits", theirs(SLEEPING), Awaited()),
 )
 
 
@@ -137,12 +118,11 @@ def table_of(rates: list[Rates]) -> Table:
 def measure(line: Line, found: Rates, rounds: int, seconds: float, show: Callable[[], Any]) -> None:
     """Have both take turns; add what they reach to `found`."""
     with ExitStack() as stack:
-        theirs, ours = (stack.enter_context(Stage(one)) for one in (line.theirs, line.ours))
+        stages = [stack.enter_context(Stage(one)) for one in (line.theirs, line.ours)]
         for _ in range(rounds):
-            rate, _ = theirs.round(seconds)
-            found.theirs.append(rate)
-            rate, _ = ours.round(seconds)
-            found.ours.append(rate)
+            for stage, rates in zip(stages, found, strict=True):
+                rate, _ = stage.round(seconds)
+                rates.append(rate)
             show()
 
 

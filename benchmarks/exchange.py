@@ -2,39 +2,49 @@
 
 The bare exchange has only what a group can't omit: forked workers, one pinned to each core, arrays
 that they share with the trainer, an eventfd in each direction, one copy in and one copy out. Its
-envs are those of `gymnasium.make`. It has no request numbers, errors, infos, and deaths. Rounds of
-contenders alternate in one run. The processor time per step and the context switches per batch of
-all envs, both of all processes, are given in addition to the rate; they depend less on other work
-on the machine. *Python twins* are the same group
-without the compiled kernel, as after an installation without a C compiler.
+envs are those of `gymnasium.make`. It has no request numbers, errors, infos, limits and deaths.
+Rounds of contenders alternate in one run. The processor time of all processes for a step is given
+in addition to the rate; it depends less on other work on the machine. *Python twins* are the same
+group without the compiled kernel, as after an installation without a C compiler.
 """
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
 import select
 import signal
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from contenders import OursAsync, OursSync, Work
-from harness import (
-    Contender,
-    Question,
-    Target,
-    arguments,
-    machine_text,
-    measure,
-    tables,
-    throughput,
-)
+from harness import STEPS, Contender, Question, Target, measure, parser_of, tables, tell, throughput
 
-CHEETAH = Work("HalfCheetah-v5", num_envs=32, backend="mujoco")
-POLE = Work("CartPole-v1", num_envs=64)
+CHEETAH, POLE = Work("HalfCheetah-v5", 32), Work("CartPole-v1", 64)
+TWINS = ", Python twins"
+
+
+def choose(name: str) -> None:
+    """Run the hot path as a contender's name says, in this process and its workers."""
+    if name.endswith(TWINS):
+        kernel = import_module("rlightning_aio.protocol.kernel")
+        kernel.select("python")
+        os.environ[kernel.VARIABLE] = "python"
+
+
+class Sync(OursSync):
+    def setup(self) -> None:
+        choose(self.name)
+        super().setup()
+
+
+class Async(OursAsync):
+    def setup(self) -> None:
+        choose(self.name)
+        super().setup()
 
 
 @dataclass
@@ -131,77 +141,46 @@ def shared(shape: tuple[int, ...], dtype: Any) -> Any:
     return np.frombuffer(mmap.mmap(-1, max(size, 1)), dtype)[: int(np.prod(shape))].reshape(shape)
 
 
-def question(
-    name: str,
-    work: Work,
-    pairs: list[tuple[Contender, Contender, float]],
-    twins: list[Contender],
-) -> Question:
-    """Make the question of one work; `twins` run without the compiled kernel."""
-    return Question(
-        name=name,
-        title=f"{work.task}, {work.num_envs} envs",
-        unit="env steps/s",
-        contenders=[*(contender for pair in pairs for contender in pair[:2]), *twins],
-        targets=[Target(ours.name, bare.name, bound) for ours, bare, bound in pairs],
-        rounds=7,
-        seconds=1.5,
-        batch=work.num_envs,
-    )
-
-
+SYNC, HALF, BARE = "rlightning_aio sync", "rlightning_aio async, 16 of 32", "bare exchange"
 QUESTIONS = (
-    question(
-        "exchange-cheetah",
-        CHEETAH,
+    Question(
+        "exchange",
+        "HalfCheetah-v5, 32 envs",
+        STEPS,
         [
-            (OursSync("rlightning_aio sync", CHEETAH), Bare("bare exchange", CHEETAH), 0.95),
-            (
-                OursAsync("rlightning_aio async, 16 of 32", CHEETAH, min_results=16),
-                Bare("bare exchange, 16 of 32", CHEETAH, min_workers=1),
-                0.85,
-            ),
+            Sync(SYNC, CHEETAH),
+            Bare(BARE, CHEETAH),
+            Async(HALF, CHEETAH, 16),
+            Bare(f"{BARE}, 16 of 32", CHEETAH, min_workers=1),
+            Sync(f"{SYNC}{TWINS}", CHEETAH),
+            Async(f"{HALF}{TWINS}", CHEETAH, 16),
         ],
-        [
-            OursSync("sync, Python twins", CHEETAH, implementation="python"),
-            OursAsync(
-                "async, 16 of 32, Python twins", CHEETAH, min_results=16, implementation="python"
-            ),
-        ],
+        [Target(SYNC, BARE, 0.95), Target(HALF, f"{BARE}, 16 of 32", 0.85)],
     ),
-    question(
-        "exchange-pole",
-        POLE,
-        [(OursSync("rlightning_aio sync", POLE), Bare("bare exchange", POLE), 0.7)],
-        [OursSync("sync, Python twins", POLE, implementation="python")],
+    Question(
+        "exchange",
+        "CartPole-v1, 64 envs",
+        STEPS,
+        [Sync(SYNC, POLE), Bare(BARE, POLE), Sync(f"{SYNC}{TWINS}", POLE)],
+        [Target(SYNC, BARE, 0.7)],
     ),
 )
 
 
 def main() -> None:
-    given = arguments(__doc__, QUESTIONS[0].rounds, QUESTIONS[0].seconds)
-    reports = [measure(asked, given.rounds, given.seconds, given.only) for asked in QUESTIONS]
-    shown = "\n\n".join(tables(report) for report in reports if report["results"])
-    print(f"{shown}\n\n{machine_text(reports[0]['machine'])}")
-    if given.json:
-        whole = {
-            **reports[0],
-            "name": "exchange",
-            "title": "A group and a bare exchange over the same shared memory",
-            "results": {
-                f"{name}, {report['title']}": found
-                for report in reports
-                for name, found in report["results"].items()
-            },
-            "targets": [
-                {**target, "subject": f"{target['subject']}, {report['title']}"}
-                for report in reports
-                for target in report["targets"]
-            ],
-            "skipped": {name: why for report in reports for name, why in report["skipped"].items()},
-            "tables": shown,
-        }
-        given.json.write_text(json.dumps(whole, indent=1) + "\n")
+    given = parser_of(__doc__, QUESTIONS[0].rounds, QUESTIONS[0].seconds).parse_args()
+    reports = [measure(asked, given) for asked in QUESTIONS]
+    for report in reports:
+        for target in report["targets"]:
+            target["subject"] += f", {report['title']}"
+    whole = {
+        **reports[0],
+        "title": "A group and a bare exchange over the same shared memory",
+        "results": {report["title"]: report["results"] for report in reports},
+        "targets": [target for report in reports for target in report["targets"]],
+        "tables": "\n\n".join(tables(report) for report in reports if report["results"]),
+    }
+    tell(whole, given)
 
 
 if __name__ == "__main__":

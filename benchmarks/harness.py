@@ -8,6 +8,7 @@ Left out on purpose: the work to measure, which is in the scripts, one question 
 from __future__ import annotations
 
 import argparse
+import copy
 import importlib.util
 import json
 import multiprocessing as mp
@@ -16,35 +17,45 @@ import sys
 import tempfile
 import time
 import traceback
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio.cli.measurement import Figures, family, in_turns, machine_facts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from multiprocessing.connection import Connection
 
 # One math thread for each contender: none is faster with more, and some would
 # start one for each core in each of their processes.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 NAME_WIDTH = 34
+STEPS = "env steps/s"
+"""The unit of figures with which processor time can be told by env step, too."""
 
 
 class Contender:
     """One way to do the work; subclasses are dataclasses that can be pickled.
 
     Everything but the constructor runs in the contender's own process.
+
+    Attributes:
+        source: a folder that is searched for modules before all others.
     """
 
     name: str
+    source: str = ""
 
     @property
     def requires(self) -> tuple[str, ...]:
         """Return the modules without which it is left out."""
         return ()
+
+    @property
+    def is_ours(self) -> bool:
+        return "rlightning_aio" in self.requires
 
     def setup(self) -> None:
         """Prepare the first round; called once, not measured."""
@@ -60,21 +71,27 @@ class Contender:
         """Clean up after the last round; called once, also if a round has failed."""
 
 
+def beside(contender: Contender, source: Path) -> Contender:
+    """Return the contender as it is with the library of another checkout, in `source`/src."""
+    other = copy.copy(contender)
+    other.name = f"{contender.name}, of {source.name}"
+    other.source = str(source.resolve() / "src")
+    return other
+
+
 @dataclass(frozen=True)
 class Target:
-    """A bound for `subject` in comparison to `reference`, both contenders' names.
+    """A bound for the ratio of `subject` and `reference`, both contenders' names.
 
     Attributes:
-        bound: of the ratio (or difference) of their figures in the same round.
+        bound: of the ratio of their figures in the same round.
         at_most: the bound is an upper one.
-        difference: compare by difference, not by ratio.
     """
 
     subject: str
     reference: str
     bound: float
     at_most: bool = False
-    difference: bool = False
 
     def is_met(self, value: float) -> bool:
         return value <= self.bound if self.at_most else value >= self.bound
@@ -88,11 +105,9 @@ class Question:
         name: of the result files.
         title: one line, with the workload.
         unit: of the contenders' figures.
-        seconds: length of a round; None where the work itself gives the length.
-        counts_steps: the figures are env steps per second, so processor time can be reported by
-            env step, too.
-        batch: the number of env steps in a batch, for context switches by batch; None if they are
-            not reported.
+        reference: the name of the contender of which the others' figures are given as multiples;
+            the first that took part if this one didn't; empty for none.
+        seconds: length of a round.
     """
 
     name: str
@@ -100,40 +115,9 @@ class Question:
     unit: str
     contenders: Sequence[Contender]
     targets: Sequence[Target] = ()
+    reference: str = ""
     rounds: int = 7
-    seconds: float | None = 1.5
-    counts_steps: bool = True
-    batch: int | None = None
-
-
-class Load(NamedTuple):
-    """What all processes of a contender asked of the machine in a round.
-
-    Attributes:
-        cores: number of processors that they kept busy. If it is well below the possible number,
-            the contender waited, for others or for itself.
-        switches: context switches per second.
-    """
-
-    cores: float
-    switches: float
-
-
-def load_by_step(
-    rates: Sequence[float], loads: Sequence[Load], batch: int | None
-) -> dict[str, float]:
-    """Return the processor time of all processes for a step, the number of busy processors, and the
-    context switches for a batch of `batch` steps.
-    """
-    pairs = list(zip(loads, rates, strict=True))
-    found = {
-        "cpu_us_per_step": Figures([1e6 * load.cores / rate for load, rate in pairs]),
-        "cores_used": Figures([load.cores for load in loads]),
-    }
-    if batch is not None:
-        switches = [batch * load.switches / rate for load, rate in pairs]
-        found["switches_per_batch"] = Figures(switches)
-    return {name: figures.median for name, figures in found.items()}
+    seconds: float = 1.5
 
 
 def throughput(step: Callable[[], int], seconds: float) -> float:
@@ -155,6 +139,10 @@ def throughput(step: Callable[[], int], seconds: float) -> float:
     return count / (now - began)
 
 
+class ContenderFailed(Exception):
+    """A contender raised or died; the text has the reason."""
+
+
 class Stage:
     """A contender's process."""
 
@@ -165,31 +153,30 @@ class Stage:
         context = mp.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_perform, args=(theirs, self.contender))
-        self._process.start()
+        with _searched_first(self.contender.source):
+            self._process.start()
         theirs.close()
         self._answer()
         return self
 
-    def round(self, seconds: float) -> tuple[Any, Load]:
-        """Run a round; return its value, and what it asked of the machine."""
-        before, began = self._used(), time.perf_counter()
+    def round(self, seconds: float) -> tuple[Any, float]:
+        """Run a round; return its value, and how many processors all its processes kept busy."""
+        before, began = self._busy_ns(), time.perf_counter_ns()
         self._connection.send(seconds)
         value = self._answer()
-        wall = time.perf_counter() - began
-        busy, switches = (
-            after - earlier for after, earlier in zip(self._used(), before, strict=True)
-        )
-        return value, Load(busy / wall, switches / wall)
+        wall = time.perf_counter_ns() - began
+        return value, (self._busy_ns() - before) / wall
 
-    def _used(self) -> tuple[float, int]:
-        """Return the seconds of processor time and the context switches of the contender's
-        processes so far.
-        """
+    def _busy_ns(self) -> int:
         assert self._process.pid is not None
-        threads = [
-            t for pid in family(self._process.pid) for t in Path(f"/proc/{pid}/task").glob("*")
-        ]
-        return sum(map(_busy_ns, threads)) / 1e9, sum(map(_switches, threads))
+        found = 0
+        for pid in family(self._process.pid):
+            for thread in Path(f"/proc/{pid}/task").glob("*"):
+                try:
+                    found += int(thread.joinpath("schedstat").read_text().split()[0])
+                except (FileNotFoundError, ProcessLookupError):
+                    continue
+        return found
 
     def _answer(self) -> Any:
         try:
@@ -209,23 +196,15 @@ class Stage:
             self._process.join()
 
 
-def _busy_ns(thread: Path) -> int:
+@contextmanager
+def _searched_first(folder: str) -> Iterator[None]:
+    """A process that is started within has this folder first on its path."""
+    path = sys.path[:]
+    sys.path[:0] = filter(None, [folder])
     try:
-        return int(thread.joinpath("schedstat").read_text().split()[0])
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-
-
-def _switches(thread: Path) -> int:
-    try:
-        lines = thread.joinpath("status").read_text().splitlines()
-    except (FileNotFoundError, ProcessLookupError):
-        return 0
-    return sum(int(line.split()[1]) for line in lines if "ctxt_switches" in line)
-
-
-class ContenderFailed(Exception):
-    """A contender raised or died; the text has the reason."""
+        yield
+    finally:
+        sys.path[:] = path
 
 
 def _perform(connection: Connection, contender: Contender) -> None:
@@ -253,32 +232,32 @@ def _perform(connection: Connection, contender: Contender) -> None:
             os.chdir("/")
 
 
-def missing(contender: Contender) -> list[str]:
-    """Return the modules that the contender needs and that aren't installed."""
-    return [name for name in contender.requires if importlib.util.find_spec(name) is None]
-
-
-def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]) -> dict[str, Any]:
-    """Run a question; return its report as plain data."""
-    machine = machine_facts(modules_of(question.contenders))
-    turns, skipped = take_turns(question.contenders, rounds, seconds, only)
+def measure(question: Question, given: argparse.Namespace) -> dict[str, Any]:
+    """Run a question as the command line says; return its report as plain data."""
+    turns, skipped = take_turns(question.contenders, given)
     figures = {name: Figures([value for value, _ in found]) for name, found in turns.items()}
+    reference = question.reference
+    if reference and reference not in figures:
+        reference = next(iter(figures), "")
+    results: dict[str, dict[str, Any]] = {}
+    for name, found in figures.items():
+        results[name] = found.as_json()
+        cores = [cores for _, cores in turns[name]]
+        if question.unit == STEPS:
+            spent = [1e6 * busy / rate for busy, rate in zip(cores, found.values, strict=True)]
+            results[name]["cpu_us_per_step"] = Figures(spent).median
+            results[name]["cores_used"] = Figures(cores).median
+        if reference:
+            results[name]["times"] = found.over(figures[reference]).as_json()
     return {
         "name": question.name,
         "title": question.title,
         "unit": question.unit,
-        "rounds": rounds,
-        "seconds": question.seconds and seconds,
-        "machine": machine,
-        "results": {
-            name: found.as_json()
-            | (
-                load_by_step(found.values, [load for _, load in turns[name]], question.batch)
-                if question.counts_steps
-                else {}
-            )
-            for name, found in figures.items()
-        },
+        "rounds": given.rounds,
+        "seconds": given.seconds,
+        "reference": reference,
+        "machine": machine_facts(modules_of(question.contenders)),
+        "results": results,
         "targets": [
             _judged(target, figures)
             for target in question.targets
@@ -290,54 +269,56 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
 
 def take_turns(
     contenders: Sequence[Contender],
-    rounds: int,
-    seconds: float,
-    only: Sequence[str],
-    text_of: Callable[[Any], str] | None = None,
-) -> tuple[dict[str, list[tuple[Any, Load]]], dict[str, str]]:
-    """Let contenders take turns, each in its own process.
+    given: argparse.Namespace,
+    number_of: Callable[[Any], float] = float,
+) -> tuple[dict[str, list[tuple[Any, float]]], dict[str, str]]:
+    """Let contenders take turns, each in its own process, with one math thread.
 
     Args:
         contenders: in the order of their turns.
-        rounds: number of turns of each.
-        seconds: about the length of a turn.
-        only: parts of the names of those that take part; all if empty.
-        text_of: returns the value of a round as text.
+        given: the arguments of the command line.
+        number_of: returns what is shown of the value of a round.
 
-    Returns the values and loads of each contender's rounds, and the reasons why others were left
-    out.
+    Returns the values and the busy processors of each contender's rounds, and the reasons why
+    others were left out.
     """
-    found: dict[str, list[tuple[Any, Load]]] = {}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    found: dict[str, list[tuple[Any, float]]] = {}
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
-        stages = _stages(contenders, only, stack, skipped)
-        for number, stage in in_turns(stages, rounds):
+        stages = _stages(contenders, given, stack, skipped)
+        for number, stage in in_turns(stages, given.rounds):
             name = stage.contender.name
             try:
-                value, load = stage.round(seconds)
+                value, cores = stage.round(given.seconds)
             except ContenderFailed as error:
                 stages.remove(stage)
                 found.pop(name, None)
                 skipped[name] = _last_line(name, error)
                 continue
-            found.setdefault(name, []).append((value, load))
-            text = (text_of or number_text)(value)
-            say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
+            found.setdefault(name, []).append((value, cores))
+            text = number_text(number_of(value))
+            say(f"  round {number + 1}/{given.rounds}  {name:{NAME_WIDTH}} {text}")
     return found, skipped
 
 
 def _stages(
     contenders: Sequence[Contender],
-    only: Sequence[str],
+    given: argparse.Namespace,
     stack: ExitStack,
     skipped: dict[str, str],
 ) -> list[Stage]:
+    asked = [
+        one for one in contenders if not given.only or any(part in one.name for part in given.only)
+    ]
+    if given.beside:
+        pairs = [(one, beside(one, given.beside)) for one in asked]
+        asked = [one for pair in pairs for one in pair if not one.source or one.is_ours]
     stages: list[Stage] = []
-    for contender in contenders:
-        if only and not any(part in contender.name for part in only):
-            continue
-        if lacking := missing(contender):
-            skipped[contender.name] = f"needs {', '.join(lacking)}"
+    for contender in asked:
+        missing = [name for name in contender.requires if importlib.util.find_spec(name) is None]
+        if missing:
+            skipped[contender.name] = f"needs {', '.join(missing)}"
             continue
         try:
             stages.append(stack.enter_context(Stage(contender)))
@@ -353,8 +334,7 @@ def _last_line(name: str, error: ContenderFailed) -> str:
 
 
 def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
-    subject, reference = figures[target.subject], figures[target.reference]
-    found = subject.minus(reference) if target.difference else subject.over(reference)
+    found = figures[target.subject].over(figures[target.reference])
     return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
 
 
@@ -378,19 +358,24 @@ def number_text(value: float) -> str:
     return f"{value:.3g}"
 
 
-JUDGED = ("| compared | median | lowest to highest | target | |", "|---|---:|---:|---:|---|")
-"""The head of a table of targets."""
+def spread_text(found: dict[str, Any]) -> str:
+    return f"{number_text(found['low'])} to {number_text(found['high'])}"
 
 
 def tables(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
     results = report["results"]
+    reference = report.get("reference")
+
+    def times_text(times: dict[str, Any]) -> str:
+        return f"{number_text(times['median'])} ({spread_text(times)})"
+
     more = [
         (heading, name, text)
         for heading, name, text in (
             ("CPU time, µs/step", "cpu_us_per_step", number_text),
             ("cores used", "cores_used", "{:.2f}".format),
-            ("context switches/batch", "switches_per_batch", number_text),
+            (f"times {reference}", "times", times_text),
         )
         if any(name in found for found in results.values())
     ]
@@ -400,100 +385,66 @@ def tables(report: dict[str, Any]) -> str:
         "|---|---:|---:|" + "---:|" * len(more),
     ]
     for name, found in results.items():
-        spread = f"{number_text(found['low'])} to {number_text(found['high'])}"
-        row = f"| {name} | {number_text(found['median'])} | {spread} |"
+        row = f"| {name} | {number_text(found['median'])} | {spread_text(found)} |"
         lines.append(row + "".join(f" {text(found[key])} |" for _, key, text in more))
     if report["targets"]:
-        lines += ["", *JUDGED]
-        lines += [target_row(target, report["unit"]) for target in report["targets"]]
+        lines += ["", "| compared | ratio | lowest to highest | target | |"]
+        lines += ["|---|---:|---:|---:|---|", *map(target_row, report["targets"])]
     lines += [f"\n{name}: {why}" for name, why in report["skipped"].items()]
     return "\n".join(lines)
 
 
-def target_row(target: dict[str, Any], unit: str) -> str:
+def target_row(target: dict[str, Any]) -> str:
     """A target as a row of a table."""
-    sign, suffix = ("minus", f" {unit}") if target["difference"] else ("/", "")
-    bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}{suffix}"
-    compared = f"{target['subject']} {sign} {target['reference']}"
-    return judged_row(compared, Figures(target["values"]), bound, met=target["met"])
-
-
-def judged_row(compared: str, found: Figures, bound: str, *, met: bool) -> str:
-    """Figures and their bound as a row of a table."""
-    spread = f"{number_text(min(found.values))} to {number_text(max(found.values))}"
-    cells = (compared, number_text(found.median), spread, bound, "met" if met else "missed")
-    return f"| {' | '.join(cells)} |"
+    compared = f"{target['subject']} / {target['reference']}"
+    bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}"
+    met = "met" if target["met"] else "missed"
+    ratio = number_text(target["median"])
+    return f"| {compared} | {ratio} | {spread_text(target)} | {bound} | {met} |"
 
 
 def machine_text(machine: dict[str, Any]) -> str:
     """Describe the machine in one sentence."""
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
-    when = f"{machine['date']}: " if "date" in machine else "An earlier version: "
     return (
-        f"{when}{machine['cores']} cores ({machine['cpu']}), {machine['memory_gib']} GiB, "
-        f"{machine['system']}, Python {machine['python']}; {versions}."
+        f"{machine['date']}: {machine['cores']} cores ({machine['cpu']}), "
+        f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; {versions}."
     )
-
-
-def plot(report: dict[str, Any], path: Path) -> None:
-    """Plot a bar for each contender's median, and a dot for each round."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    results = report["results"]
-    figure, axes = plt.subplots(figsize=(7.5, 0.9 + 0.38 * len(results)), layout="constrained")
-    for place, (name, found) in enumerate(results.items()):
-        color = "tab:blue" if name.startswith("rlightning") else "tab:gray"
-        axes.barh(place, found["median"], color=color, alpha=0.6)
-        axes.plot(found["values"], [place] * len(found["values"]), ".", color="black", markersize=4)
-    axes.set_yticks(range(len(results)), list(results))
-    axes.invert_yaxis()
-    axes.set_xlim(left=0)
-    axes.set_xlabel(report["unit"])
-    axes.set_title(report["title"], fontsize=10, loc="left")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
 
 
 # ---- the command line of every script
 
 
-def arguments(description: str | None, rounds: int, seconds: float | None) -> argparse.Namespace:
-    """Return a parser for every script; `seconds` is None if the work defines a round's length.
-
-    Math libraries are kept to one thread from here on.
-    """
+def parser_of(description: str | None, rounds: int, seconds: float) -> argparse.ArgumentParser:
+    """Return a parser for every script."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rounds", type=int, default=rounds, help="default: %(default)s")
-    if seconds is not None:
-        parser.add_argument(
-            "--seconds", type=float, default=seconds,
-            help="length of one contender's round (default: %(default)s)",
-        )  # fmt: skip
+    parser.add_argument(
+        "--seconds", type=float, default=seconds,
+        help="length of one contender's round (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument(
         "--only", action="append", default=[], metavar="PART",
         help="run contenders whose name holds PART; may be given more than once",
     )  # fmt: skip
+    parser.add_argument(
+        "--beside", type=Path, metavar="CHECKOUT",
+        help="measure contenders of this library with that of another checkout, too",
+    )  # fmt: skip
     parser.add_argument("--json", type=Path, help="write the report here")
-    parser.add_argument("--plot", type=Path, help="draw the report here (needs matplotlib)")
-    given = parser.parse_args()
-    if given.plot and importlib.util.find_spec("matplotlib") is None:
-        parser.error("--plot needs matplotlib: pip install matplotlib")
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    return given
+    return parser
+
+
+def tell(report: dict[str, Any], given: argparse.Namespace) -> None:
+    """Print a report, whose own tables go first, and write it down where that was asked for."""
+    print(f"{report.get('tables') or tables(report)}\n\n{machine_text(report['machine'])}")
+    if given.json:
+        given.json.write_text(json.dumps(report, indent=1) + "\n")
 
 
 def main(question: Question, description: str | None) -> None:
     """Parse the arguments, run the question, print the report."""
-    given = arguments(description, question.rounds, question.seconds)
-    report = measure(question, given.rounds, getattr(given, "seconds", 0.0), given.only)
-    print(f"{tables(report)}\n\n{machine_text(report['machine'])}")
-    if given.json:
-        given.json.write_text(json.dumps(report, indent=1) + "\n")
-    if given.plot:
-        plot(report, given.plot)
+    given = parser_of(description, question.rounds, question.seconds).parse_args()
+    tell(measure(question, given), given)

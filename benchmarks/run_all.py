@@ -1,12 +1,13 @@
-"""Run every benchmark, keep the reports and plots, and renew the tables of the results pages.
+"""Run the benchmarks that have results, keep the reports, and renew what shows them.
 
-`tables.md` has the table of each script, and `README.md` the comparisons that matter most.
+`tables.md` has the table of each, `README.md` the comparisons with their targets, and
+`docs/pictures/speed.svg` is drawn from three of them.
 
-    python benchmarks/run_all.py              # all of them, twenty minutes
-    python benchmarks/run_all.py cheetah pong
-    python benchmarks/run_all.py training     # takes hours, so it runs only if it is named
+    python benchmarks/run_all.py                      # all of them, a quarter of an hour
+    python benchmarks/run_all.py exchange remote
+    python benchmarks/run_all.py --pages              # only what shows the kept reports
 
-The scripts run one after the other, each in its own interpreter.
+They run one after the other, each in its own interpreter.
 """
 
 from __future__ import annotations
@@ -16,92 +17,145 @@ import json
 import re
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
+from xml.sax.saxutils import escape
 
-import picture
 from harness import machine_text, say, tables, target_row
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
-TABLES = HERE / "tables.md"
-README = HERE / "README.md"
-SCRIPTS = (
-    "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
-    "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "pool",
-    "tracing", "filming", "thread_share", "loop_pause", "headline", "exchange", "awaitable",
-)  # fmt: skip
-# Run only if they are named.
-LONG = ("training",)
-# Those whose comparisons the README shows.
-SHOWN = ("headline", "batches", "exchange", "start")
+TABLES, README = HERE / "tables.md", HERE / "README.md"
+PICTURE = HERE.parent / "docs" / "pictures" / "speed.svg"
+UNEVEN = ["waiting:benchmarks/Uneven-v0", "64", "--ready", "1", "--envs-per-process", "1"]
+RUNS = {
+    "HalfCheetah-v5-32": ["compare", "HalfCheetah-v5", "32"],
+    "CartPole-v1-64": ["compare", "CartPole-v1", "64"],
+    "Humanoid-v5-16": ["compare", "Humanoid-v5", "16"],
+    "Pong-v5-8": ["compare", "ale_py:ALE/Pong-v5", "8"],
+    # Several times the 1.6 seconds of a full cycle of an env's times.
+    "Uneven-v0-64": ["compare", *UNEVEN, "--seconds", "5"],
+    "exchange": ["exchange"],
+    "awaitable": ["awaitable"],
+    "remote": ["remote"],
+}
+"""The name of each report, and the program with its arguments that writes it."""
+THEIRS = "Gymnasium AsyncVectorEnv"
+# Title, report, and our contender, which is compared with Gymnasium's.
+PANELS = (
+    ("32 x HalfCheetah-v5, make_vec", "HalfCheetah-v5-32", "rlightning_aio make_vec"),
+    ("64 x CartPole-v1, step", "CartPole-v1-64", "rlightning_aio group, all"),
+    ("64 envs of uneven speed, first ready", "Uneven-v0-64", "rlightning_aio group, 1 of 64"),
+)
+WIDTH, PANEL, TOP, LEFT, LONGEST = 720, 92, 44, 190, 400
+BAR, GAP = 22, 6
+OURS_COLOUR, THEIRS_COLOUR = "#3f51b5", "#b0b4c3"
 
 
-def run_script(name: str) -> bool:
-    """Run one script; return True if it ended well."""
+def run(name: str) -> bool:
+    """Run one of `RUNS`; return True if it ended well."""
     say(f"== {name}")
-    command = [sys.executable, str(HERE / f"{name}.py"), "--json", str(RESULTS / f"{name}.json")]
-    if find_spec("matplotlib") is not None:
-        command += ["--plot", str(RESULTS / f"{name}.png")]
+    program, *arguments = RUNS[name]
+    command = [sys.executable, str(HERE / f"{program}.py"), *arguments]
+    command += ["--json", str(RESULTS / f"{name}.json")]
     return subprocess.run(command, check=False).returncode == 0
 
 
-def with_table(text: str, name: str) -> str:
-    """Return `text` with a new table of `name` between its two marks."""
+def shown(name: str) -> str:
+    """Return the tables of a kept report, and how they came about."""
     path = RESULTS / f"{name}.json"
+    command = f"`python benchmarks/{RUNS[name][0]}.py {' '.join(RUNS[name][1:])}".rstrip() + "`"
     if not path.exists():
-        absent = f"No figures of this version are kept; `python benchmarks/{name}.py` prints them."
-        return between_marks(text, name, absent)
+        return f"No figures of this version are kept; {command} prints them."
     report = json.loads(path.read_text())
-    machine = machine_text(report["machine"])
-    # A script with other figures makes its own tables.
-    shown = report.get("tables") or tables(report)
-    shown += f"\n\n{report['rounds']} rounds. {machine}"
-    if path.with_suffix(".png").exists():
-        shown += f"\n\n![{report['title']}](results/{name}.png)"
-    return between_marks(text, name, shown)
-
-
-def between_marks(text: str, name: str, shown: str) -> str:
-    """`text` with `shown` between the two marks of `name`."""
-    marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
-    return marks.sub(lambda found: f"{found[1]}\n{shown}\n\n{found[2]}", text)
+    about = f"{command}, {report['rounds']} rounds"
+    if "step_timeout" in report:
+        limit = report["step_timeout"]
+        about += f", {f'time limits of {limit:g} s' if limit else 'without time limits'}"
+    own = report.get("tables") or tables(report)
+    return f"{own}\n\n{about}. {machine_text(report['machine'])}"
 
 
 def comparisons() -> str:
-    """The comparisons of the scripts in `SHOWN` as one table, and the machine of each run."""
+    """Return the targets of all kept reports as one table, with the machine of each run."""
     lines = ["| compared | ratio | lowest to highest | target | |", "|---|---:|---:|---:|---|"]
     machines: list[str] = []
-    for name in SHOWN:
-        path = RESULTS / f"{name}.json"
+    for path in [RESULTS / f"{name}.json" for name in RUNS]:
         if path.exists():
             report = json.loads(path.read_text())
-            lines += [target_row(target, report["unit"]) for target in report["targets"]]
-            machines.append(machine_text(report["machine"]))
+            for target in report["targets"]:
+                if report["title"].endswith("envs"):
+                    target["subject"] += f", {report['title']}"
+                lines.append(target_row(target))
+            if report["targets"]:
+                machines.append(machine_text(report["machine"]))
     return "\n".join(lines) + "\n\n" + "\n\n".join(dict.fromkeys(machines))
+
+
+def between_marks(text: str, name: str, new: str) -> str:
+    """`text` with `new` between the two marks of `name`."""
+    marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+    return marks.sub(lambda found: f"{found[1]}\n{new}\n\n{found[2]}", text)
 
 
 def renew_pages() -> None:
     """Renew the tables, the comparisons and the picture from the kept reports."""
     text = TABLES.read_text()
-    for name in (*SCRIPTS, *LONG):
-        text = with_table(text, name)
+    for name in RUNS:
+        text = between_marks(text, name, shown(name))
     TABLES.write_text(text)
     README.write_text(between_marks(README.read_text(), "comparisons", comparisons()))
-    picture.PICTURE.write_text(picture.drawn(RESULTS))
+    PICTURE.write_text(drawn(RESULTS))
+
+
+def drawn(results: Path) -> str:
+    """Return the picture as SVG: a pair of bars for each of `PANELS`, env steps per second."""
+    height = TOP + PANEL * len(PANELS)
+    size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">',
+        "<title>Env steps per second beside Gymnasium</title>",
+        f'<rect width="{WIDTH}" height="{height}" rx="8" fill="#ffffff"/>',
+        _text(16, 26, "Env steps per second on two cores", weight="bold"),
+    ]
+    for number, (title, name, ours) in enumerate(PANELS):
+        medians = json.loads((results / f"{name}.json").read_text())["results"]
+        rates = medians[ours]["median"], medians[THEIRS]["median"]
+        top = TOP + number * PANEL
+        parts.append(_text(16, top + 16, f"{title}: {rates[0] / rates[1]:.1f} times as fast"))
+        for row, (label, rate) in enumerate(
+            zip(("rlightning_aio", "AsyncVectorEnv"), rates, strict=True)
+        ):
+            y = top + 26 + row * (BAR + GAP)
+            length = LONGEST * rate / max(rates)
+            colour = THEIRS_COLOUR if row else OURS_COLOUR
+            shape = f'x="{LEFT}" y="{y}" width="{length:.0f}" height="{BAR}" rx="3"'
+            parts += [
+                _text(LEFT - 10, y + 16, label, anchor="end"),
+                f'<rect {shape} fill="{colour}"/>',
+                # Three digits, as in the tables.
+                _text(LEFT + length + 8, y + 16, f"{float(f'{rate:.3g}'):,.0f}"),
+            ]
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _text(x: float, y: int, text: str, *, anchor: str = "start", weight: str = "normal") -> str:
+    return (
+        f'<text x="{x:.0f}" y="{y}" text-anchor="{anchor}" font-weight="{weight}" '
+        f'fill="#22252d">{escape(text)}</text>'
+    )
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    known = (*SCRIPTS, *LONG)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(known)}")
-    names = parser.parse_args().names or SCRIPTS
-    if unknown := set(names) - set(known):
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(RUNS)}")
+    parser.add_argument("--pages", action="store_true", help="run nothing, renew pages")
+    given = parser.parse_args()
+    names = [] if given.pages else given.names or list(RUNS)
+    if unknown := set(names) - set(RUNS):
         parser.error(f"no such benchmark: {', '.join(sorted(unknown))}")
-    RESULTS.mkdir(exist_ok=True)
-    failed = [name for name in names if not run_script(name)]
+    failed = [name for name in names if not run(name)]
     renew_pages()
     if failed:
         say(f"failed: {', '.join(failed)}")

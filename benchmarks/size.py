@@ -39,10 +39,6 @@ def lines(paths: Iterable[Path]) -> int:
     return sum(path.read_bytes().count(b"\n") for path in paths)
 
 
-def words(pages: Iterable[Path]) -> int:
-    return sum(len(page.read_text().split()) for page in pages)
-
-
 def package_of(path: Path) -> str:
     """Return the row of a module: its package, two deeper in `_core`; small modules share one."""
     parts = path.relative_to(SRC).with_suffix("").parts
@@ -52,14 +48,14 @@ def package_of(path: Path) -> str:
 
 
 def options() -> list[str]:
-    """Return the options of the program and of all commands, without `--help`."""
+    """Return the options of the program and of all commands, without those that typer adds."""
     group: Any = typer.main.get_command(app)
+    found = [option for command in (group, *group.commands.values()) for option in command.params]
+    added = ("help", "install_completion", "show_completion")
     return [
-        parameter.opts[-1]
-        for command in (group, *group.commands.values())
-        for parameter in command.params
-        if parameter.param_type_name == "option"
-        and parameter.name not in ("help", "install_completion", "show_completion")
+        option.opts[-1]
+        for option in found
+        if option.param_type_name == "option" and option.name not in added
     ]
 
 
@@ -81,10 +77,11 @@ def main() -> None:
         "modules of src": len(modules),
         "tests": lines(code("tests")),
         "benchmarks": lines(code("benchmarks")),
-        "words of README, ARCHITECTURE, CONTRIBUTING, docs/*.md": words([*texts, *pages]),
+        "words of README, ARCHITECTURE, CONTRIBUTING, docs/*.md": sum(
+            len(page.read_text().split()) for page in (*texts, *pages)
+        ),
         "pages in docs/": len(pages),
         "options of all commands": len(options()),
-        "different ones": len(set(options())),
         "fields of an entry": len(EnvConfig.model_fields),
     }
     print()

@@ -30,10 +30,9 @@ from rlightning_aio.sync import build_env_group
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container
+    from collections.abc import Callable
     from types import CodeType, FrameType
 
-SRC = str(Path(rlightning_aio.__file__).parent)
 NUM_ENVS = 8
 ROUNDS = 40
 CARTPOLE = {
@@ -47,19 +46,9 @@ CARTPOLE = {
 
 @dataclass
 class Calls:
-    """Calls between `start` and `stop`.
-
-    Attributes:
-        of: number of calls of each function.
-        left: number of returns to a file that had been left.
-    """
+    """The number of calls of each function between `start` and `stop`."""
 
     of: Counter[CodeType] = field(default_factory=Counter)
-    left: int = 0
-    until: Container[str] = ()
-    """Functions of the library at which the counting ends."""
-    _seen: set[str] = field(default_factory=set)
-    _last: str = ""
 
     def start(self) -> None:
         sys.setprofile(self._note)
@@ -69,17 +58,8 @@ class Calls:
 
     def _note(self, frame: FrameType, event: str, argument: Any) -> None:
         del argument
-        code = frame.f_code
-        if event != "call" or code.co_filename == __file__:
-            return
-        if code.co_qualname in self.until:
-            self.stop()
-            return
-        self.of[code] += 1
-        if code.co_filename != self._last:
-            self.left += code.co_filename in self._seen
-            self._seen.add(code.co_filename)
-            self._last = code.co_filename
+        if event == "call" and frame.f_code.co_filename != __file__:
+            self.of[frame.f_code] += 1
 
     def figures(self) -> dict[str, int]:
         return {
@@ -87,8 +67,6 @@ class Calls:
             "functions": len(self.of),
             # Functions that `dataclasses` and the import system make are in no file.
             "files": len({code.co_filename for code in self.of if code.co_filename[0] != "<"}),
-            "files of src": len({code.co_filename for code in self.of if SRC in code.co_filename}),
-            "returns": self.left,
         }
 
     def listed(self) -> str:
@@ -145,24 +123,6 @@ class Held:
         return self._epoll.poll(timeout)
 
 
-class Death(Held):
-    """The same, but the first worker is killed when the trainer waits.
-
-    Attributes:
-        calls: from then on, until the results are ready.
-    """
-
-    def __init__(self, group: Any) -> None:
-        super().__init__(group)
-        self.calls = Calls(until={"Steps.hand_out"})
-
-    def poll(self, timeout: float) -> Any:
-        self._driver["_epoll"] = self._epoll
-        os.kill(self._pids.pop(0), signal.SIGKILL)
-        self.calls.start()
-        return super().poll(timeout)
-
-
 def counted(group: Any, call: Callable[[], Any]) -> Calls:
     """Return the calls of one `call`, which sends steps and waits for their results."""
     found: list[Calls] = []
@@ -179,31 +139,32 @@ def counted(group: Any, call: Callable[[], Any]) -> Calls:
     return fewest_of(found)
 
 
-def step_and_collect() -> Calls:
-    """Count `step_async` and `collect_async` of the synchronous group."""
+def stepped(turn: Callable[[Any, Any], Any]) -> Calls:
+    """Count a turn of the synchronous group, which takes a response and returns a batch."""
     with build_env_group(CARTPOLE) as group, group.auto_reset():
         batch, _ = group.reset(seed=0)
         actions = np.zeros(NUM_ENVS, np.int64)
 
-        def turn() -> None:
+        def call() -> None:
             nonlocal batch
-            group.step_async(batch.respond(action=actions))
-            batch, _ = group.collect_async(wait_all=True)
+            batch, _ = turn(group, batch.respond(action=actions))
 
-        return counted(group, turn)
+        return counted(group, call)
+
+
+def step_and_collect() -> Calls:
+    """Count `step_async` and `collect_async` of the synchronous group."""
+
+    def turn(group: Any, response: Any) -> Any:
+        group.step_async(response)
+        return group.collect_async(wait_all=True)
+
+    return stepped(turn)
 
 
 def step() -> Calls:
     """Count `step` of the synchronous group."""
-    with build_env_group(CARTPOLE) as group, group.auto_reset():
-        batch, _ = group.reset(seed=0)
-        actions = np.zeros(NUM_ENVS, np.int64)
-
-        def turn() -> None:
-            nonlocal batch
-            batch, _ = group.step(batch.respond(action=actions))
-
-        return counted(group, turn)
+    return stepped(lambda group, response: group.step(response))
 
 
 def step_and_collect_async() -> Calls:
@@ -259,31 +220,12 @@ def collect_16() -> Calls:
         return counted(group, collector.collect)
 
 
-def death() -> Calls:
-    """A worker's death while its step is awaited, until the marked results are ready.
-
-    What returns results to the caller is the same as in any step, and isn't counted.
-    """
-    with build_env_group(CARTPOLE) as group, group.auto_reset():
-        batch, _ = group.reset(seed=0)
-        actions = np.zeros(NUM_ENVS, np.int64)
-        for _ in range(ROUNDS):
-            batch, _ = group.step(batch.respond(action=actions))
-        with Death(group) as held:
-            held.hold()
-            batch, _ = group.step(batch.respond(action=actions))
-        held.calls.stop()
-        assert batch.restarted.sum() == NUM_ENVS // 2
-        return held.calls
-
-
 MEASURED = {
     "step_async and collect_async": step_and_collect,
     "the same, asynchronous": step_and_collect_async,
     "step": step,
     "VectorEnv.step": vector_step,
     "Collector.collect, 16 transitions": collect_16,
-    "death: files": death,
 }
 
 

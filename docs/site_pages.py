@@ -30,7 +30,6 @@ PAGES = {
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
     "benchmarks/tables.md": "benchmark_tables.md",
-    "benchmarks/faults.md": "benchmark_faults.md",
     "examples": "docs/examples.md",
 }
 LINK = re.compile(r"(?<=\])\(([^)\s#:]+)(#[^)\s]*)?\)|(?<=src=)\"([^\"#:]+)\"")

@@ -1,7 +1,4 @@
-"""How many Python calls a step makes on the trainer's side: no more than was agreed.
-
-And how many files a death passes through.
-"""
+"""How many Python calls a step makes on the trainer's side: no more than was agreed."""
 
 from __future__ import annotations
 
@@ -24,7 +21,6 @@ MOST = {
     "VectorEnv.step": {"calls": 71 + TWINS},
     # It steps twice. A round may wait once more in the second, if a worker is late: 294 to 309.
     "Collector.collect, 16 transitions": {"calls": 309 + 2 * TWINS},
-    "death: files": {"files of src": 24},
 }
 
 

@@ -21,8 +21,8 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The example, its parts, and the baseline."""
-    for folder in ("benchmarks", "examples"):
-        monkeypatch.syspath_prepend(ROOT / folder)
+    for folder in (ROOT / "examples", Path(__file__).parent):
+        monkeypatch.syspath_prepend(folder)
     names = ("ppo", "training_run", "gymnasium_ppo")
     return {name: importlib.import_module(name) for name in names}
 
@@ -45,7 +45,7 @@ def test_weights_equal_the_baselines(
     args = make(total_steps=50 * size, folder=str(tmp_path), **changed)
     ours = modules["ppo"].train(args)
     weights = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["agent"]
-    theirs, agent = modules["gymnasium_ppo"].train(args, "SyncVectorEnv")
+    theirs, agent = modules["gymnasium_ppo"].train(args)
     assert weights.keys() == agent.state_dict().keys()
     for name, value in agent.state_dict().items():
         assert torch.equal(weights[name], value), name

@@ -1,77 +1,24 @@
-"""The baseline of `training.py`: PPO as CleanRL writes it, on vector environments of all kinds.
+"""The baseline of `test_ppo.py`: PPO as CleanRL writes it, on Gymnasium's `SyncVectorEnv`.
 
 Rule: the loop, the wrappers around each environment and the hyperparameters are CleanRL's
-(ppo.py, ppo_continuous_action.py, with SAME_STEP as its change to Gymnasium 1 has it). `make_vec`
-and EnvPool, which knows only NEXT_STEP, are in the same wrappers for vector environments. The
-network and the learner are those of `examples/ppo.py`, so only the source of experience differs.
+(ppo.py, ppo_continuous_action.py, with SAME_STEP as its change to Gymnasium 1 has it). The network
+and the learner are those of `examples/ppo.py`, so only the source of experience differs.
 """
 
 from __future__ import annotations
 
-import sys
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import batch_space
-from gymnasium.wrappers import vector as wrappers
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
-
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from ppo import Agent, advantages, learn  # The examples are not a package.
 from training_run import Run
 
 if TYPE_CHECKING:
     from ppo import Args
-
-KINDS = {"AsyncVectorEnv": AsyncVectorEnv, "SyncVectorEnv": SyncVectorEnv}
-
-
-class Pool(gym.vector.VectorEnv[Any, Any, Any]):
-    """EnvPool as the vector environment that it is, but not by class."""
-
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
-
-    def __init__(self, task: str, num_envs: int, seed: int) -> None:
-        import envpool
-
-        self._envs = envpool.make(task, env_type="gymnasium", num_envs=num_envs, seed=seed)
-        self.num_envs = num_envs
-        self.single_observation_space = self._envs.observation_space
-        self.single_action_space = self._envs.action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        del seed, options  # It was given its seed.
-        return self._envs.reset()[0], {}
-
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        return *self._envs.step(actions.astype(np.float64))[:4], {}
-
-    def close_extras(self, **kwargs: Any) -> None:
-        del kwargs
-        self._envs.close()
-
-
-def make_together(args: Args, kind: str) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Make environments that are stepped together, in CleanRL's wrappers."""
-    if kind == "EnvPool":
-        envs: Any = Pool(args.task, args.num_envs, args.seed)
-    else:
-        from rlightning_aio.vector import make_vec
-
-        envs = make_vec(args.task, args.num_envs)
-    envs = wrappers.NormalizeObservation(
-        wrappers.ClipAction(wrappers.RecordEpisodeStatistics(envs))
-    )
-    envs = wrappers.TransformObservation(envs, lambda o: np.clip(o, -10, 10))
-    envs = wrappers.NormalizeReward(envs, gamma=args.gamma)
-    return wrappers.TransformReward(envs, lambda r: np.clip(r, -10, 10))
 
 
 def returns_of(infos: dict[str, Any]) -> list[float]:
@@ -92,14 +39,11 @@ def make_env(args: Args) -> gym.Env[Any, Any]:
     return gym.wrappers.TransformReward(env, lambda r: np.clip(r, -10, 10))
 
 
-def train(args: Args, kind: str) -> tuple[Run, Agent]:
-    """Train on one of Gymnasium's vector environments, on ``make_vec``'s or on EnvPool's."""
+def train(args: Args) -> tuple[Run, Agent]:
+    """Train as CleanRL does."""
     torch.manual_seed(args.seed)
-    if kind in KINDS:
-        makers = [partial(make_env, args)] * args.num_envs
-        envs: Any = KINDS[kind](makers, autoreset_mode=AutoresetMode.SAME_STEP)
-    else:
-        envs = make_together(args, kind)
+    makers = [partial(make_env, args)] * args.num_envs
+    envs: Any = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
     agent = Agent(envs.single_observation_space, envs.single_action_space)
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
     shape = (args.num_steps, args.num_envs)
