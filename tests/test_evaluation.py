@@ -359,17 +359,6 @@ def test_an_episode_may_be_for_one_env() -> None:
     assert sorted(own)[:3] == [0, 1, 2]
 
 
-def test_an_episode_for_one_env_that_resets_itself_has_its_own_seed() -> None:
-    """It begins with a reset, not where the env goes on by itself."""
-    make = scripted(lambda seed: seed % 2 == 0)
-    own = lambda: SyncVectorEnv([make], autoreset_mode=AutoresetMode.NEXT_STEP)  # noqa: E731
-    queue = [EpisodeSpec("", seed, env_id="env-0") for seed in range(3)]
-    with group_of(own) as group:
-        found = evaluate(group, nothing, queue)
-    lengths = [(one.spec.seed, one.length) for one in found.played]
-    assert lengths == [(0, SHORT), (1, LONG), (2, SHORT)]
-
-
 def test_an_env_that_was_given_up_before_plays_nothing() -> None:
     """Others play the queue; what only that env may play is an error."""
     env = scripted(lambda _: True)

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from kit.scripted import Counts
 
 from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
-from rlightning_aio.attempts.success import success_of
+from rlightning_aio.attempts.records import success_of
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:

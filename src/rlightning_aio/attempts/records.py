@@ -1,4 +1,7 @@
-"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task."""
+"""`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task.
+
+`success_of` reads from an info whether an episode has succeeded.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,9 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Final, cast, overload
+
+import numpy as np
 
 from rlightning_aio.attempts.spec import EpisodeSpec, plain, spec_of
 from rlightning_aio.json_text import finite
@@ -15,7 +20,10 @@ from rlightning_aio.outcomes import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["Attempt", "AttemptGroup", "attempt_of"]
+__all__ = ["Attempt", "AttemptGroup", "attempt_of", "success_of"]
+
+_KEYS: Final = ("success", "is_success")
+"""In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
 
 
 @dataclass(slots=True)
@@ -144,3 +152,22 @@ class AttemptGroup(Sequence[Attempt]):
 
     def __iter__(self) -> Iterator[Attempt]:
         return iter(self.attempts)
+
+
+def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
+    """Read the success of an episode from its last info, or from the ``final_info`` in it.
+
+    None if it says nothing, or something that is neither a bool nor a number.
+    """
+    final: Any = info.get("final_info")
+    marked: Any = info.get("_final_info")
+    if isinstance(final, dict) and (marked is None or marked[sub_env]):
+        info = cast("dict[str, Any]", final)  # The rest is about the next episode.
+    for key in _KEYS:
+        given, known = info.get(key), info.get(f"_{key}")
+        if given is not None and (known is None or known[sub_env]):
+            # It may be a tensor on another device.
+            array = np.asarray(given.tolist() if hasattr(given, "tolist") else given).reshape(-1)
+            if array.size and array.dtype.kind in "biuf":
+                return bool(array[sub_env if array.size > 1 else 0])
+    return None

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from rlightning_aio.attempts.records import Attempt
-from rlightning_aio.attempts.success import success_of
+from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end

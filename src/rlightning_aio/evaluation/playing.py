@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.attempts.records import Attempt
-from rlightning_aio.attempts.success import success_of
+from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.errors import EnvFault, GroupClosed, WorkerDied
 from rlightning_aio.outcomes import Outcome, own_end
