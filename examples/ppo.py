@@ -11,7 +11,6 @@ a truncated episode as a terminated one; ppo_async.py does better.
 
 from __future__ import annotations
 
-import pickle
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -182,7 +181,7 @@ def train(args: Args) -> Run:
                 "optimizer": optimizer.state_dict(),
                 "normalizer": tensors(normalizer.state_dict()),
                 "random": torch.get_rng_state(),
-                "envs": pickle.dumps(envs.save_state()),
+                "envs": envs.snapshot(),
                 "observation": observation,
                 "sums": torch.from_numpy(sums.copy()),
             }
@@ -190,7 +189,7 @@ def train(args: Args) -> Run:
         block = (args.num_steps, args.num_envs)
         with run, group.trace(args.trace) if group else nullcontext():
             if run.saved:
-                envs.load_state(pickle.loads(run.saved["envs"]))  # noqa: S301  # Of this program.
+                envs.restore(run.saved["envs"])
                 observation, sums = run.saved["observation"], run.saved["sums"].numpy().copy()
             else:
                 first, _ = envs.reset(seed=args.seed)

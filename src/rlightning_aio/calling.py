@@ -14,9 +14,12 @@ from rlightning_aio._core.group.api.sync import driver_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from rlightning_aio.sync import EnvGroup
 
-__all__ = ["await_cancelled", "collect_calls", "in_one_call", "send_calls"]
+__all__ = ["collect_calls", "due_for_reset", "in_one_call", "send_calls"]
 
 T = TypeVar("T")
 
@@ -57,6 +60,6 @@ def collect_calls(group: Any, deadline: float | None = None) -> Any:
     return group._driver.run(calls.collect_calls(time.monotonic(), deadline))  # noqa: SLF001
 
 
-def await_cancelled(group: EnvGroup) -> None:
-    """Wait until no call runs that was cancelled; `EnvBusy` is raised for its envs until then."""
-    group._driver.run(group._core.calls.await_cancelled(time.monotonic()))  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:
+    """Return for each env whether its next step is a reset, while `auto_reset` is open."""
+    return group._core.tables.continuity.due.copy()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]

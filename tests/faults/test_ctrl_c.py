@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -18,11 +19,9 @@ from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio.sync
-from rlightning_aio.calling import collect_calls, send_calls
-from rlightning_aio.errors import EnvBusy, GroupClosed
+from rlightning_aio.errors import EnvBusy, EnvFault, GroupClosed
 from rlightning_aio.protocol import kernel
 from rlightning_aio.vector import VectorEnv
-from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -38,6 +37,12 @@ PLACES = {
 pytestmark = pytest.mark.usefixtures("python_raises")
 NUM_LINES = 3000
 """More lines than any of the calls below executes."""
+
+
+def drop_outstanding(group: Any) -> None:
+    """Wait until nothing is in flight, and drop it."""
+    with contextlib.suppress(EnvFault):
+        group.drain(deadline=HANG)
 
 
 def step(group: Any, batch: BatchedData) -> None:
@@ -56,8 +61,7 @@ def reset(group: Any, batch: BatchedData) -> None:
 
 def call(group: Any, batch: BatchedData) -> None:
     del batch
-    send_calls(group, "call_wrapped", "get_wrapper_attr", "render_mode")
-    collect_calls(group)
+    group.call("call_wrapped", "get_wrapper_attr", "render_mode")
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -228,7 +232,7 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
                 break
 
 
-@pytest.mark.parametrize("interrupted", ["save_state", "load_state"])
+@pytest.mark.parametrize("interrupted", ["snapshot", "restore"])
 def test_a_vector_env_waits_for_the_rest_of_a_call_that_was_interrupted(
     interrupted: str, tmp_path: Path
 ) -> None:
@@ -236,10 +240,10 @@ def test_a_vector_env_waits_for_the_rest_of_a_call_that_was_interrupted(
     go_on = tmp_path / "go-on"
     env = VectorEnv([Waiting])
     env.reset()
-    state = env.save_state()
+    state = env.snapshot()
     env.set_attr("waits_for", [(os.getpid(), str(go_on))])
     with pytest.raises(KeyboardInterrupt):
-        env.save_state() if interrupted == "save_state" else env.load_state(state)
+        env.snapshot() if interrupted == "snapshot" else env.restore(state)
     timer = threading.Timer(0.1, go_on.touch)
     timer.start()
     env.reset()

@@ -26,14 +26,16 @@ from rlightning_aio.errors import EnvFault, SnapshotError, StartFailed, WorkerDi
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 class Vectors(Session):
     """A run of a program that steps a `VectorEnv`.
 
     Attributes:
-        shown: the state that each row showed last; over: its episode has ended.
+        shown: the state that each row showed last; over: its episode has ended; lost: it was lost,
+            and the next one has not been shown.
+        is_cut_off: the last call has not returned, so that only a reset may follow.
     """
 
     envs_: Any
@@ -86,7 +88,7 @@ class Vectors(Session):
         self.breaks = 0
         self.kept: list[tuple[Any, Any]] = []
         self.saved: Any = None
-        self.is_whole = False
+        self.is_whole = self.is_cut_off = False
         require(self.rows.num_envs == len(codes), "as many rows", self.rows.num_envs)
 
     def faults_of(self, env: Env) -> list[str]:
@@ -100,15 +102,12 @@ class Vectors(Session):
     async def op_reset(self, rng: Random) -> None:
         """Reset all."""
         seed = rng.choice([None, rng.randrange(1000)])
-        self.is_whole = False
         try:
-            observation, infos = self.reset_rows(seed)
+            with self.cutting_off():
+                observation, infos = self.reset_rows(seed)
         except EnvFault as fault:
             self.fail(fault)
             return
-        except KeyboardInterrupt:
-            self.shown = []  # Perhaps nothing was sent, and steps are not refused.
-            raise
         words = self.words(observation)
         self.say(f"   {words}")
         for k, one in enumerate(words):
@@ -121,40 +120,44 @@ class Vectors(Session):
         self.is_whole = True
         self.keep(observation)
 
+    @contextmanager
+    def cutting_off(self) -> Iterator[None]:
+        """Context of a call of the envs; if it raises, only a reset may follow."""
+        was_whole, self.is_whole, self.is_cut_off = self.is_whole, False, True
+        yield
+        self.is_whole, self.is_cut_off = was_whole, False
+
+    def refused(self, ask: Callable[[], Any]) -> bool:
+        """Have a call refused after one that was cut off; return False if none was."""
+        if self.is_cut_off:
+            with self.expected(ResetNeeded, "a call after one that was cut off"):
+                ask()
+        return self.is_cut_off
+
     def reset_rows(self, seed: int | None) -> tuple[Any, Any]:
         return self.rows.reset(seed=seed)
 
     async def op_step(self, rng: Random) -> None:
         if not self.shown:
             return
-        if any(self.lost):
+        if self.mode == "disabled" and any(self.lost):
             await self.op_mask(rng)
             if any(self.lost):
-                self.is_whole = False
                 await self.op_reset(rng)
             return
         acts = [self.act(rng, env, plain=self.plain) for env in self.env_of]
         actions = self.actions([encoded(self.controls, *act) for act in acts])
-        if not self.is_whole:
-            with self.expected(ResetNeeded, "a step of envs that were not reset"):
-                self.step_rows(actions, rng)
+        if self.refused(lambda: self.step_rows(actions, rng)):
             return
-        self.is_whole, pressed = False, self.num_interrupts
         try:
-            found = self.step_rows(actions, rng)
+            with self.cutting_off():
+                found = self.step_rows(actions, rng)
         except EnvFault as fault:
             self.fail(fault)
             return
-        except KeyboardInterrupt:
-            # Perhaps it has only waited for a save, or heard what was pressed before, and was not
-            # sent.
-            if self.still_saves or pressed == self.num_interrupts:
-                self.shown = []
-            raise
-        self.is_whole, self.still_saves = True, False
         self.take(acts, found)
 
-    plain = still_saves = False
+    plain = False
 
     def step_rows(self, actions: Any, rng: Random) -> Any:
         if rng.random() < 0.5:
@@ -171,14 +174,13 @@ class Vectors(Session):
         mask = np.array(self.over) | np.array([rng.random() < 0.3 for _ in self.over])
         if not mask.any():
             return
-        self.is_whole = False
         try:
-            observation, _ = self.rows.reset(options={"reset_mask": mask})
+            with self.cutting_off():
+                observation, _ = self.rows.reset(options={"reset_mask": mask})
         except EnvFault as fault:
             self.fail(fault)
             return
         self.breaks += 1
-        self.is_whole = True
         for k, one in enumerate(self.words(observation)):
             if mask[k]:
                 require(is_begun(one), "no reset", k, one)
@@ -188,9 +190,14 @@ class Vectors(Session):
 
     async def op_call(self, rng: Random) -> None:
         """Call a method of all."""
+        if self.refused(lambda: self.rows.call("peek", 7)):
+            return
+        was_whole = self.is_whole
         try:
-            values = self.rows.call("peek", 7)
+            with self.cutting_off():
+                values = self.rows.call("peek", 7)
         except WorkerDied as fault:
+            self.is_whole, self.is_cut_off = was_whole, False
             self.fail(fault)
             return
         for k, (words, echo) in enumerate(values):
@@ -202,31 +209,34 @@ class Vectors(Session):
 
     async def op_state(self, rng: Random) -> None:
         """Save the state of all, or restore what was saved last."""
+        before = self.is_whole, self.is_cut_off
         if self.saved is None or rng.random() < 0.5:
-            if not self.is_whole:
+            if self.refused(self.rows.snapshot) or not self.is_whole:
                 return
-            self.still_saves = True  # After Ctrl-C.
-            with self.perhaps_none():
-                state = self.rows.save_state()
+            with self.perhaps_none(), self.cutting_off():
+                state = self.rows.snapshot()
                 self.saved = state, deepcopy((self.trails, self.shown, self.over, self.lost))
-                self.still_saves = False
+            self.is_whole, self.is_cut_off = before  # Not after Ctrl-C.
             return
         state, model = self.saved
-        is_restored, is_whole, self.is_whole = False, self.is_whole, False
-        with self.perhaps_none():
-            try:
-                self.rows.load_state(state)
-            except EnvFault:
-                is_whole = False
+        found: Any = None
+        try:
+            with self.cutting_off():
+                found, _ = self.rows.restore(state)
+        except (SnapshotError, EnvFault) as fault:
+            with self.perhaps_none():
                 raise
-            except KeyboardInterrupt:
-                self.shown = []  # As in a reset.
-                raise
-            is_restored = True
-        if not is_restored:
-            self.is_whole = is_whole
+            if isinstance(fault, SnapshotError):  # Nothing was changed.
+                self.is_whole, self.is_cut_off = before
             return
         self.trails, self.shown, self.over, self.lost = deepcopy(model)
+        for k, now in enumerate(self.words(found)):
+            if self.lost[k]:
+                require(is_begun(now), "no next episode", k, now)
+                self.over[k] = self.lost[k] = False
+            else:
+                require(now == self.shown[k], "not restored", k, now, self.shown[k])
+            self.shown[k] = now
         self.breaks += 1
         self.is_whole = True
 
@@ -295,7 +305,7 @@ class Vectors(Session):
             require(may_be, "marked, and nothing is lost", info)
         was_over, stays = self.over[k], self.mode == "disabled" and not died
         self.over[k] = any(ends) or (was_over and stays)
-        self.shown[k] = now
+        self.shown[k], self.lost[k] = now, False
         if self.mode == "next_step" and was_over:
             require((reward, ends) == (0.0, (False, False)), "a reset", k, reward, ends)
             require(is_begun(now) or died, "no reset", k, now)
@@ -310,7 +320,7 @@ class Vectors(Session):
             if self.mode == "same_step":
                 require("worker_restarted" in info["final_info"], "final_info", info)
             trail.last = None  # The episode ends with the step before.
-            self.lost[k] = self.mode == "disabled"
+            self.lost[k] = self.mode != "same_step"
             return
         trail.allow(self.breaks + env.losses)
         trail.add(Transition(before, act, reward, *ends, after), goes_on=was_over and stays)

@@ -86,16 +86,14 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
     with pytest.raises(multiprocessing.TimeoutError, match="step_async"):
         env.step_wait(timeout=0.01)
     gate.touch()
-    env.call_async("wait")
-    assert env.call_wait(timeout=60) == (1, 1)
-    with pytest.raises(ResetNeeded, match=r"lost.*timed out"):
-        env.step(np.zeros(2, np.int64))
+    for ask in (partial(env.step, np.zeros(2, np.int64)), env.snapshot, partial(env.call, "wait")):
+        with pytest.raises(ResetNeeded, match=r"lost.*timed out"):
+            ask()
     env.reset()
-    gate.unlink()
-    env.call_async("wait")
-    with pytest.raises(multiprocessing.TimeoutError):
-        env.call_wait(timeout=0.01)
-    gate.touch()
+    env.call_async("double", 2)
+    with pytest.raises(AlreadyPendingCallError, match="call_wait"):
+        env.step(np.zeros(2, np.int64))
+    assert env.call_wait(timeout=60) == (4, 4)
     assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [1, 1]
     with pytest.raises(EnvRaised, match="no such action"):
         env.step(np.array([0, 2]))
@@ -148,29 +146,6 @@ def test_a_seed_that_is_not_an_int_raises_with_its_env(seed: Any, whose: str) ->
         with pytest.raises(ValueError, match=f"the seed{whose} must be an int from 0 .*, not "):
             env.reset(seed=seed)
         env.reset(seed=[1, None])
-
-
-def test_its_envs_are_proxies() -> None:
-    """Attributes are read, called and set."""
-    with contextlib.closing(VectorEnv([toy] * 2)) as env:
-        env.reset(seed=3)
-        one = env.envs[1]
-        assert len(env.envs) == env.num_envs == 2
-        assert one.np_random_seed == one.unwrapped.np_random_seed == 4
-        assert one.metadata["render_fps"] > 0
-        assert not hasattr(one, "no_such")
-        with pytest.raises(AttributeError, match="no_such"):
-            one.no_such  # noqa: B018  # Read for its error.
-        assert one.has_wrapper_attr("metadata")
-        assert one.double(2.0, plus=1.0) == 5.0
-        one.speed = 7.0
-        assert env.get_attr("speed") == (1.0, 7.0)
-        with pytest.raises(ValueError, match="itself"):
-            one.step(0)
-        env.step_async(env.action_space.sample())
-        with pytest.raises(AlreadyPendingCallError):
-            one.metadata  # noqa: B018
-        env.step_wait()
 
 
 class Unsaid(Plain):

@@ -149,31 +149,31 @@ class Interrupting(Counts):
 
 
 def test_after_ctrl_c_it_is_reset() -> None:
-    """Results of the interrupted step appear nowhere; an interrupted call loses none."""
+    """Nothing of the interrupted call appears, and until then no other call is made."""
     from rlightning_aio.sb3 import VecEnv
 
     trainer = os.getpid()
     env = VecEnv([lambda: Interrupting(trainer)] * 2)
     env.reset()
-    with pytest.raises(KeyboardInterrupt):
-        env.step([1, 0])
-    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
-    assert env.get_attr("steps") == [1, 1]
-    with pytest.raises(ResetNeeded, match="interrupted"):
-        env.step([0, 0])
-    assert env.reset().tolist() == [[0], [0]]
-    assert env.step([0, 0])[0].tolist() == [[1], [1]]
-    with pytest.raises(KeyboardInterrupt):
-        env.env_method("step", 1, indices=[0])
-    assert env.get_attr("steps", indices=[1]) == [1]
-    env.set_attr("note", 7)
-    assert env.step([0, 0])[0].tolist() == [[3], [2]]
+    interrupted: list[Any] = [
+        lambda: env.step([1, 0]),
+        lambda: env.env_method("step", 1, indices=[0]),
+    ]
+    for cut_off in interrupted:
+        with pytest.raises(KeyboardInterrupt):
+            cut_off()
+        for ask in (lambda: env.get_attr("steps"), lambda: env.set_attr("note", 7)):
+            with pytest.raises(ResetNeeded, match="interrupted"):
+                ask()
+        with pytest.raises(ResetNeeded, match="set_env"):
+            env.step([0, 0])
+        assert env.reset().tolist() == [[0], [0]]
+        assert env.step([0, 0])[0].tolist() == [[1], [1]]
     env.close()
 
 
-@pytest.mark.parametrize("kind", ["together", "sync", "group"])
+@pytest.mark.parametrize("kind", ["sync", "group"])
 def test_a_method_of_some_envs_leaves_the_others_alone(kind: str) -> None:
-    """Also for envs that are stepped together; shared attributes can't be set for some."""
     from rlightning_aio.sb3 import VecEnv
 
     env = VecEnv(hoppers(kind))
@@ -186,9 +186,6 @@ def test_a_method_of_some_envs_leaves_the_others_alone(kind: str) -> None:
     same = [np.array_equal(one, other) for one, other in zip(before, after, strict=True)]
     assert same == [True, False, True]
     np.testing.assert_array_equal(after[1], [*state, *-state])
-    if kind == "together":
-        with pytest.raises(ValueError, match="note can't be set for simulations"):
-            env.env_method("set_wrapper_attr", "note", 1, indices=[0])
     env.env_method("set_wrapper_attr", name="note", value=[1, 2])
     assert env.get_attr("note", indices=[2]) == [[1, 2]]
     env.close()
@@ -271,13 +268,12 @@ def test_any_vector_env_does_the_same_as_dummy_vec_env(kind: str) -> None:
     assert ours.get_attr("dt") == theirs.get_attr("dt")
     assert ours.has_attr("frame_skip")
     assert not ours.has_attr("nothing")
-    if kind == "async":
-        with pytest.raises(ValueError, match="AsyncVectorEnv can't call get_wrapper_attr"):
-            ours.get_attr("dt", indices=[1])
-        assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [False] * 3  # It can't be asked.
-    else:
-        assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
-        assert ours.get_attr("np_random_seed", indices=[2, -3]) == [7, 5]
+    # An AsyncVectorEnv can't be asked.
+    assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [kind != "async"] * 3
+    assert ours.get_attr("np_random_seed", indices=[2, -3]) == [7, 5]
+    if kind in ("together", "async"):
+        with pytest.raises(ValueError, match=r"VectorEnv can't call .* of only some of its envs"):
+            ours.env_method("get_wrapper_attr", "dt", indices=[1])
     ours.set_attr("frame_skip", 2)
     assert ours.get_attr("frame_skip") == [2, 2, 2]
     ours.close()
@@ -299,13 +295,78 @@ def test_a_vector_env_in_another_mode_is_refused() -> None:
         VecEnv([lambda: gym.make("CartPole-v1")], task="Acrobot-v1")
     with pytest.raises(ConfigError, match="step_timeout: a vector env has no workers"):
         VecEnv(envs.venv.envs, step_timeout=3.0)
-    with pytest.raises(ValueError, match="can't be set for only some envs of a MujocoVectorEnv"):
+    with pytest.raises(ValueError, match="MujocoVectorEnv can't set frame_skip of only"):
         envs.set_attr("frame_skip", 2, indices=[1])
     envs.set_options([{"a": 1}, {}])
-    with pytest.raises(ValueError, match="options differ"):
+    with pytest.raises(ValueError, match="options of envs differ, and a MujocoVectorEnv resets"):
         envs.reset()
     envs.close()
     pole.close()
+
+
+class Bare(gym.vector.VectorEnv[Any, Any, Any]):
+    """Counts to 2 and back; its infos have no masks and no final_info, and it has no `call`."""
+
+    metadata: ClassVar = {"autoreset_mode": AutoresetMode.SAME_STEP}
+    num_envs = 2
+    single_observation_space = gym.spaces.Box(0, 2, (1,), np.int64)
+    single_action_space = gym.spaces.Discrete(2)
+    tells = True
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.counts = np.array([[0], [1]])
+        return self.counts.copy(), {"count": self.counts[:, 0].copy()}
+
+    def step(self, actions: Any) -> Any:
+        self.counts += 1
+        last, done = self.counts.copy(), self.counts[:, 0] == 2
+        self.counts[done] = 0
+        infos = {"count": self.counts[:, 0].copy()}
+        if done.any() and self.tells:
+            infos["final_obs"] = last
+        return self.counts.copy(), np.ones(2), done, np.zeros(2, np.bool_), infos
+
+
+def test_a_vector_env_without_masks_and_without_final_info() -> None:
+    """Nor a way to ask its envs. Without last observations it is no use."""
+    from rlightning_aio.sb3 import VecEnv
+
+    envs = Bare()
+    env = VecEnv(envs)
+    assert env.render_mode is None
+    assert env.get_attr("tells", indices=[0]) == [True]
+    assert (env.has_attr("tells"), env.has_attr("nothing")) == (True, False)
+    with pytest.raises(NotImplementedError, match=r"a Bare can't call render\(\) of its envs"):
+        env.env_method("render")
+    assert env.reset().tolist() == [[0], [1]]
+    assert env.reset_infos == [{"count": 0}, {"count": 1}]
+    observation, _, done, infos = env.step([0, 0])
+    assert observation.tolist() == [[1], [0]]
+    assert done.tolist() == [False, True]
+    assert infos[0] == {"count": 1, "TimeLimit.truncated": False}
+    assert infos[1].pop("terminal_observation").tolist() == [2]
+    assert infos[1] == {"TimeLimit.truncated": False}
+    assert env.reset_infos == [{"count": 0}, {"count": 0}]
+    envs.tells = False
+    with pytest.raises(ValueError, match="Bare has ended an episode without final_obs"):
+        env.step([0, 0])
+
+
+def test_the_vector_env_of_ale_py() -> None:
+    """It is trained on as it is."""
+    pytest.importorskip("ale_py")
+    from ale_py.vector_env import AtariVectorEnv
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from rlightning_aio.sb3 import VecEnv
+
+    mode = AutoresetMode.SAME_STEP
+    envs: Any = AtariVectorEnv("breakout", 2, autoreset_mode=mode, max_num_frames_per_episode=60)
+    env = VecMonitor(VecEnv(envs))
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=32, seed=0, device="cpu").learn(64)
+    assert len(model.ep_info_buffer) > 2
+    env.close()
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import multiprocessing
-import pickle
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -127,14 +126,6 @@ def test_a_mask_that_resets_nothing_is_refused(fields: dict[str, Any]) -> None:
     env.close()
 
 
-def saved(env: Any) -> Any:
-    return env.save_state() if isinstance(env, VectorEnv) else env.snapshot()
-
-
-def put_back(env: Any, state: Any) -> Any:
-    return env.load_state(state) if isinstance(env, VectorEnv) else env.restore(state)
-
-
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("task", ["Hopper-v5", "Reacher-v5"])
 @pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
@@ -148,7 +139,7 @@ def test_a_state_can_be_restored_again(
     one.action_space.seed(0)
     actions = [one.action_space.sample() for _ in range(9)]
     one.step(actions[0])
-    kept = pickle.loads(pickle.dumps(saved(one)))
+    kept = one.snapshot()
 
     def steps(env: Any) -> list[Any]:
         found = [env.step(each) for each in actions[1:5]]
@@ -158,7 +149,7 @@ def test_a_state_can_be_restored_again(
     found = steps(one)
     copies = copy.deepcopy(found)
     for env in (one, one, other):
-        put_back(env, kept)
+        env.restore(kept)
         assert_alike(steps(env), copies)
     assert_alike(found, copies)
     one.close()
@@ -181,7 +172,7 @@ def test_a_batch_refuses_the_state_of_another_one(other: str) -> None:
     for env in (theirs, ours, alike):
         env.reset(seed=0)
     with pytest.raises(SnapshotError, match=r"into a MujocoVectorEnv.*nothing was changed"):
-        put_back(ours, saved(theirs))
+        ours.restore(theirs.snapshot())
     actions = np.zeros((2, 1), np.float32)
     for _ in range(5):
         assert_alike(ours.step(actions), alike.step(actions))
@@ -190,37 +181,18 @@ def test_a_batch_refuses_the_state_of_another_one(other: str) -> None:
         env.close()
 
 
-@pytest.mark.parametrize("other", ["mode", "limit"])
-def test_separate_envs_refuse_the_state_of_another_mode_or_limit(other: str) -> None:
-    fields = {"num_envs": 2, "autoreset_mode": "Disabled", "placement": "inline"}
-    theirs, ours = (
-        VectorEnv([Toy] * 2, autoreset_mode=one["autoreset_mode"], **INLINE, **limit)
-        for one, limit in (
-            (fields | OTHERS["mode"], {}) if other == "mode" else (fields, OTHERS["limit"]),
-            (fields, {}),
-        )
-    )
-    for env in (theirs, ours):
-        env.reset(seed=0)
-    with pytest.raises(ValueError, match="the state is of envs with"):
-        ours.load_state(theirs.save_state())
-    ours.step(np.zeros(2, np.int64))
-    for env in (theirs, ours):
-        env.close()
-
-
 def test_nothing_is_saved_before_a_reset_or_while_a_step_is_pending() -> None:
     for env in (make_vec(PENDULUM, 2), make_vec(PENDULUM, 2, vector_kwargs=INLINE)):
         with pytest.raises((ResetNeeded, SnapshotError)):
-            saved(env)
+            env.snapshot()
         env.reset(seed=0)
-        state = saved(env)
+        state = env.snapshot()
         if isinstance(env, VectorEnv):
             env.step_async(np.zeros((2, 1), np.float32))
             with pytest.raises(AlreadyPendingCallError):
-                env.save_state()
+                env.snapshot()
             with pytest.raises(AlreadyPendingCallError):
-                env.load_state(state)
+                env.restore(state)
             env.step_wait()
         env.close()
 
@@ -247,9 +219,9 @@ def test_the_state_of_another_kind_of_vector_env_is_refused() -> None:
     for env in (together, separate):
         env.reset(seed=0)
     with pytest.raises(SnapshotError, match="can't be put into a MujocoVectorEnv: its "):
-        put_back(together, separate.group.snapshot())
+        together.restore(separate.snapshot())
     with pytest.raises(SnapshotError):
-        separate.group.restore(saved(together))
+        separate.restore(together.snapshot())
     together.close()
     separate.close()
 

@@ -6,8 +6,9 @@ import copy as copying
 import math
 import multiprocessing
 import warnings
+from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -16,26 +17,29 @@ from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.contents import reported_infos
-from rlightning_aio.calling import collect_calls, in_one_call
+from rlightning_aio.batch.contents import lost_rows, reported_infos
+from rlightning_aio.calling import due_for_reset
 from rlightning_aio.envs.adapted.makers import adapted
+from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.errors import BadAction, EnvFault, SnapshotError
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
-from rlightning_aio.vector.deaths import Deaths, Stepped
-from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.pending import check_free, check_running, check_sent
-from rlightning_aio.vector.proxies import CalledEnvs, check_name
-from rlightning_aio.vector.requests import (
-    send_call,
-    send_look_up,
-    send_resets,
-    send_values,
-    send_wrapper_question,
+from rlightning_aio.vector.deaths import Stepped, with_deaths
+from rlightning_aio.vector.interface import (
+    CalledEnvs,
+    check_free,
+    check_name,
+    check_running,
+    check_sent,
 )
-from rlightning_aio.vector.reset_arguments import checked_mask, checked_mode, seeds_of_envs
+from rlightning_aio.vector.reset_arguments import (
+    checked_mode,
+    mask_and_options,
+    options_of_envs,
+    seeds_of_envs,
+)
 from rlightning_aio.vector.spaces import adopted_spaces
 
 if TYPE_CHECKING:
@@ -48,6 +52,8 @@ if TYPE_CHECKING:
 __all__ = ["VectorEnv", "per_worker"]
 
 T = TypeVar("T")
+_PATIENCE: Final = 1e6
+"""Seconds that `reset` waits for what an interrupted call has left: time limits end it before."""
 
 
 class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_random` is a tuple.
@@ -112,13 +118,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self.closed = True  # Until it has started.
         self._pending: str | None = None
         self._arguments: Any = None
-        # Requests are outstanding whose results nobody will return.
-        self._has_leftovers = False
-        # Results of a step or reset were not returned, so no episode can go on.
-        self._has_lost = False
-        # What a state is of, besides the envs of the group.
-        limit = entry.get("max_episode_steps")
-        self._kind = {"autoreset_mode": self.autoreset_mode.value, "max_episode_steps": limit}
+        # Every call so far has returned what it was about, and nothing is in flight.
+        self._is_whole = True
         config = adapted(env_fns, self.autoreset_mode, entry)
         if max_concurrency is not None:
             together = per_worker(max_concurrency, len(env_fns))
@@ -133,7 +134,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             raise
 
     def _adopt(self, metas: list[EnvMeta]) -> None:
-        """Set up what depends on the envs: spaces, metadata, deaths, resets."""
+        """Set up what depends on the envs: spaces, metadata, resets."""
         self.num_envs = len(metas)
         (
             self.single_observation_space,
@@ -148,8 +149,11 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             setattr(self, name, value)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self._fits_rows = leaves(self.single_action_space) is not None
-        self._deaths = Deaths(self.group, self.autoreset_mode, self._collect)
         self._observations: Any = None
+        # Envs whose next step is a reset, and the ones that have lost their episodes, which are
+        # sent that reset here; None if there are none.
+        self._due = np.zeros(len(metas), np.bool_)
+        self._lost: NDArray[np.bool_] | None = None
         # The last results of all envs, in order; actions respond to them.
         self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
@@ -162,63 +166,91 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self,
         *,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        options: dict[str, Any] | Sequence[dict[str, Any] | None] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all envs, or those of a mask, and wait for them.
+
+        Without a mask it always works: what an interrupted or failed call has left in flight is
+        awaited and dropped.
 
         Args:
             seed: env k gets ``seed + k``; or a sequence with one seed or None for each env.
             options: passed to each env, without ``reset_mask``: a bool array ``[num_envs]`` that
-                selects the envs to reset. The others return their last observation again.
+                selects the envs to reset. The others return their last observation again. Or a
+                sequence with the options of each env, or None.
 
         Returns batched observations and infos.
 
         Raises:
-            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to collect.
+            EnvRaised, WorkerDied, EnvHung: an env failed; reset all again.
+            ResetNeeded: with a mask, other envs have lost their episodes; reset all.
             AlreadyPendingCallError: another call is pending.
             ClosedEnvironmentError: the vector env is closed.
         """
-        return _in_one_call(self.group, partial(self.reset_async, seed, options), self.reset_wait)
+        mask = self._send_resets(seed, options)
+        return self._begun(self._collected("reset", None), mask)
 
     def reset_async(
         self,
         seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        options: dict[str, Any] | Sequence[dict[str, Any] | None] | None = None,
     ) -> None:
         """Send resets without waiting; `reset_wait` returns their results."""
-        self._begin("reset_async")
-        seeds = seeds_of_envs(seed, self.num_envs)
-        mask = None
-        if options is not None and "reset_mask" in options:
-            options = dict(options)
-            mask = checked_mask(options.pop("reset_mask"), self.num_envs)
-        which = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
-        if mask is not None and not mask.all():
-            self._check_whole()
-        # A reset that can't be sent leaves those before it outstanding.
-        self._has_leftovers = self._has_lost = True
-        send_resets(self.group, seeds, [options] * self.num_envs, which)
-        self._pending, self._arguments, self._has_leftovers = "reset", mask, False
+        self._arguments = self._send_resets(seed, options)
+        self._pending = "reset"
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """Wait for `reset_async`, at most `timeout` seconds.
 
         Raises:
-            TimeoutError: the resets continue; their results will be dropped.
-            ResetNeeded: with a mask, other envs have lost their episodes; reset all.
+            TimeoutError: late results will be dropped.
             NoAsyncCallError: no reset was sent.
         """
-        batch = self._finish("reset", timeout, self._collect)
-        mask = self._arguments
-        self._deaths.note_reset(... if mask is None else mask)
-        found, infos = batch.observation, reported_infos(batch)
-        if mask is not None and not mask.all():
+        check_sent(self, self._pending, "reset")
+        self._pending = None
+        return self._begun(self._collected("reset", timeout), self._arguments)
+
+    def _send_resets(self, seed: Any, options: Any) -> NDArray[np.bool_] | None:
+        """Send resets; return the mask of their envs, or None if it is all of them."""
+        check_free(self, self._pending, "reset_async")
+        seeds = seeds_of_envs(seed, self.num_envs)
+        mask, options = mask_and_options(options, self.num_envs)
+        each = options_of_envs(options, self.num_envs)
+        if mask is not None:
+            self._check_whole()
+        else:
+            self._drop_outstanding()
+        self._is_whole = False
+        places = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
+        group, env_ids = self.group, self.group.env_ids
+        # As many at once as have the same options.
+        alike = all(each[k] is each[places[0]] for k in places)
+        for some in [places] if alike else [[k] for k in places]:
+            own = {env_ids[k]: int(seeds[k]) for k in some if seeds[k] is not None}
+            group.reset_async(own, each[some[0]], [env_ids[k] for k in some])
+        return mask
+
+    def _drop_outstanding(self) -> None:
+        """Wait until nothing is in flight, and drop it with its errors."""
+        if not self._is_whole:
+            with suppress(EnvFault):
+                self.group.drain(deadline=_PATIENCE)
+
+    def _begun(self, batch: BatchedData, mask: NDArray[np.bool_] | None) -> tuple[Any, Any]:
+        """Return the results of resets of all envs, or of those of a mask."""
+        found = batch.observation
+        infos = self._infos(batch)
+        if mask is None:
+            self._answerable, self._lost = batch, None
+        else:
+            if self._lost is not None:
+                self._lost = self._lost & ~mask
             chosen = np.flatnonzero(mask)
             found = merged(self._observations, found, chosen, self.num_envs)
             infos = spread(infos, chosen, self.num_envs)
-        found = self._observed(found)
-        self._has_lost = False
-        return found, infos
+        result = self._observed(found), infos
+        self._is_whole = True
+        return result
 
     # -- steps ------------------------------------------------------------------------
 
@@ -233,39 +265,27 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
 
         Raises:
             ValueError, TypeError: the number of actions is wrong, or they don't fit the space.
-            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to collect.
-            ResetNeeded: the results of the last step or reset were lost: by such an error, a
-                timeout, or Ctrl-C.
+            EnvRaised, WorkerDied, EnvHung: an env failed; reset all.
+            ResetNeeded: the last call was cut off: by such an error, a timeout, or Ctrl-C.
             AlreadyPendingCallError: another call is pending.
             ClosedEnvironmentError: the vector env is closed.
         """
-        if self._deaths.unfinished:
-            return _in_one_call(self.group, partial(self.step_async, actions), self.step_wait)
         responses = self._responses(actions)
-        self._has_leftovers = self._has_lost = True  # Until they are returned.
+        if self._lost is not None:
+            self._send_steps(responses)
+            return self._stepped(self._collected("step", None))
+        self._is_whole = False  # Until the results are returned.
         try:
-            self._answerable, _ = self.group.step(responses)
+            batch, _ = self.group.step(responses)
         except BadAction:
-            self._has_lost = False  # Nothing was sent.
+            self._is_whole = True  # Nothing was sent.
             raise
-        self._has_leftovers = False
-        found = self._stepped(self._answerable)
-        self._has_lost = False
-        return found
+        return self._stepped(batch)
 
     def step_async(self, actions: Any) -> None:
         """Send steps without waiting; `step_wait` returns their results."""
-        responses = self._responses(actions)
-        self._has_leftovers = self._has_lost = True  # As in `step`.
-        try:
-            if self._deaths.unfinished:
-                self._deaths.send(responses)
-            else:
-                self.group.step_async(responses)
-        except BadAction:
-            self._has_lost = False
-            raise
-        self._pending, self._has_leftovers = "step", False
+        self._send_steps(self._responses(actions))
+        self._pending = "step"
 
     def step_wait(
         self, timeout: float | None = None
@@ -273,18 +293,19 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Wait for `step_async`, at most `timeout` seconds.
 
         Raises:
-            TimeoutError: the steps continue; their results will be dropped.
+            TimeoutError: late results will be dropped.
             NoAsyncCallError: no step was sent.
         """
-        collect = self._deaths.collect if self._deaths.unfinished else self._collect
-        found = self._stepped(self._finish("step", timeout, collect))
-        self._has_lost = False
-        return found
+        check_sent(self, self._pending, "step")
+        self._pending = None
+        return self._stepped(self._collected("step", timeout))
 
     def _responses(self, actions: Any) -> BatchedData:
         """Check that the envs may be stepped, and make responses of actions."""
-        self._begin("step_async")
+        check_free(self, self._pending, "step_async")
         self._check_whole()
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            self._due = due_for_reset(self.group)
         is_tree = isinstance(actions, dict | tuple) and isinstance(
             self.single_action_space, gym.spaces.Dict | gym.spaces.Tuple
         )
@@ -301,37 +322,48 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         pairs = zip(env_ids, each, strict=True)
         return BatchedData(env_ids, [PolicyResponse(id_, action) for id_, action in pairs])
 
+    def _send_steps(self, responses: BatchedData) -> None:
+        """Send steps, and resets to those envs that have lost their episodes in the last one."""
+        lost, self._is_whole = self._lost, False
+        try:
+            if lost is None:
+                self.group.step_async(responses)
+                return
+            self._due |= lost
+            if not lost.all():
+                self.group.step_async(responses.take(np.flatnonzero(~lost).tolist()))
+        except BadAction:
+            self._is_whole = True  # Nothing was sent.
+            raise
+        self.group.reset_async(env_ids=self._ids(np.flatnonzero(lost).tolist()))
+
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
-        ends = batch.terminated, batch.truncated
-        stepped = Stepped(batch.observation, batch.reward, *ends, reported_infos(batch))
-        if self._deaths.concern(batch):
-            stepped = self._deaths.settle(batch, stepped, self._observations)
-        self._deaths.note_step(stepped)
-        return (self._observed(stepped.observations), *stepped[1:])
+        self._answerable, self._lost = batch, None
+        if lost_rows(batch):
+            stepped, lost = with_deaths(batch, self._observations, self._due, self.autoreset_mode)
+            if self.autoreset_mode == AutoresetMode.NEXT_STEP and lost.any():
+                self._lost = lost
+        else:
+            ends = batch.terminated, batch.truncated
+            stepped = Stepped(batch.observation, batch.reward, *ends, self._infos(batch))
+        found = (self._observed(stepped.observations), *stepped[1:])
+        self._is_whole = True
+        return found
 
     # -- both -------------------------------------------------------------------------
 
-    def _begin(self, what: str) -> None:
-        """Check that requests may be sent, and drop those that an earlier call has left."""
-        check_free(self, self._pending, what)
-        if self._has_leftovers:
-            drop_outstanding(self.group)
-            self._has_leftovers = False
-
     def _check_whole(self) -> None:
-        if self._has_lost:
+        if not self._is_whole:
             raise ResetNeeded(
-                "the results of the last step or reset were lost, as it failed, timed out or was "
+                "the results of the last call were lost, as it failed, timed out or was "
                 "interrupted; call reset() without a mask to begin new episodes"
             )
 
-    def _finish(self, what: str, timeout: float | None, collect: Callable[..., Any]) -> Any:
-        """Collect the pending requests by `collect`, within `timeout` seconds."""
-        check_sent(self, self._pending, what)
-        self._pending = None
-        self._has_leftovers = True  # Until all are collected.
+    def _collected(self, what: str, timeout: float | None) -> BatchedData:
+        """Collect the results of all envs, within `timeout` seconds; 0: those that are there."""
+        deadline = None if timeout is None else max(timeout, 1e-9)
         try:
-            found = collect(deadline=_seconds(timeout))
+            return self.group.collect_async(wait_all=True, deadline=deadline)[0]
         except EnvFault:
             raise  # Before the next clause, as an env may have raised `TimeoutError`.
         except TimeoutError as error:
@@ -339,12 +371,9 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
                 f"the envs have not answered {what}_async within {timeout} s; late results are "
                 "dropped"
             ) from error
-        self._has_leftovers = False
-        return found
 
-    def _collect(self, deadline: float | None = None) -> BatchedData:
-        batch, _ = self.group.collect_async(wait_all=True, deadline=deadline)
-        return batch
+    def _infos(self, batch: BatchedData) -> dict[str, Any]:
+        return reported_infos(batch)
 
     def _observed(self, observations: Any) -> Any:
         """Batch observations as Gymnasium does, and keep the columns for masks and deaths."""
@@ -354,70 +383,87 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         result = batched(self.single_observation_space, observations)
         return copying.deepcopy(result) if self.copy else result
 
+    def _ids(self, places: Sequence[int]) -> list[str]:
+        env_ids = self.group.env_ids  # Each look makes a list.
+        return [env_ids[k] for k in places]
+
     # -- methods and attributes -------------------------------------------------------
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call method `name` of each env, found through its wrappers, or get an attribute."""
-        send = partial(self.call_async, name, *args, **kwargs)
-        return _in_one_call(self.group, send, self.call_wait)
-
-    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
-        """Send calls without waiting; `call_wait` returns their values."""
-        self._begin("call_async")
-        check_name(name)
-        self._has_leftovers = True  # Until all are sent.
-        send_call(self.group, name, args, kwargs)
-        self._pending = "call"
-
-    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Wait for `call_async`, at most `timeout` seconds, and return one value for each env.
+        """Call method `name` of each env, found through its wrappers, or get an attribute.
 
         Raises:
-            TimeoutError: the calls continue; their values will be dropped.
-            NoAsyncCallError: no call was sent.
+            ResetNeeded: the last call was cut off.
+            AlreadyPendingCallError: another call is pending.
         """
-        collect = partial(collect_calls, self.group)
-        return tuple(self._finish("call", timeout, collect))
-
-    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env at `place`, or get its attribute."""
         check_name(name)
-        send = partial(send_call, self.group, name, args, kwargs, [place])
-        return self._answered("call_async", send)[0]
+        return tuple(self.ask(None, "call_wrapped", name, *args, **kwargs))
+
+    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
+        """Note a call, which `call_wait` makes."""
+        check_free(self, self._pending, "call_async")
+        check_name(name)
+        self._pending, self._arguments = "call", (name, args, kwargs)
+
+    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
+        """Call as `call_async` was told, and return one value for each env.
+
+        `timeout` is ignored: a call has no time limit.
+
+        Raises:
+            NoAsyncCallError: no call was noted.
+        """
+        del timeout
+        check_sent(self, self._pending, "call")
+        self._pending = None
+        name, args, kwargs = self._arguments
+        return self.call(name, *args, **kwargs)
+
+    def ask(
+        self, places: Sequence[int] | None, name: str, /, *args: Any, **kwargs: Any
+    ) -> list[Any]:
+        """Call a method of the `BaseEnv` in the workers, of all envs or of those at `places`.
+
+        ``call_wrapped`` finds methods and attributes of the env itself.
+
+        Raises:
+            ResetNeeded, AlreadyPendingCallError: as of `call`.
+        """
+        env_ids = None if places is None else self._ids(places)
+        call = partial(self.group.call, name, *args, env_ids=env_ids, **kwargs)
+        return self._called("call_async", call)
+
+    def _called(self, what: str, call: Callable[[], T]) -> T:
+        """Make a call that leaves episodes alone; Ctrl-C leaves it in flight, an error doesn't."""
+        check_free(self, self._pending, what)
+        self._check_whole()
+        self._is_whole = False
+        try:
+            found = call()
+        except Exception:
+            self._is_whole = True
+            raise
+        self._is_whole = True
+        return found
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of any env."""
-        places = range(self.num_envs)
-        send = partial(send_wrapper_question, self.group, wrapper_class, places)
-        return any(self._answered("call_async", send))
-
-    def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
-        send = partial(send_look_up, self.group, name, place)
-        return self._answered("call_async", send)[0]
-
-    def _answered(self, what: str, send: Callable[[], None]) -> Any:
-        """Return what comes of calls that `send` sends."""
-
-        def begin() -> None:
-            self._begin(what)
-            self._has_leftovers = True  # A value that can't be sent leaves the calls before it.
-            send()
-            self._pending = "call"
-
-        finish = partial(self._finish, "call", None, partial(collect_calls, self.group))
-        return _in_one_call(self.group, begin, finish)
+        return any(self.ask(None, "is_wrapped", name_of(wrapper_class)))
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of each env: a list or tuple has one value for each env."""
         check_running(self)
-        single = not isinstance(values, list | tuple)
-        each = [values] * self.num_envs if single else list(cast("list[Any]", values))
+        if not isinstance(values, list | tuple):
+            self.ask(None, "call_wrapped", "set_wrapper_attr", name, values)
+            return
+        each = list(cast("list[Any]", values))
         if len(each) != self.num_envs:
             raise ValueError(
                 f"{len(each)} values for num_envs={self.num_envs}; give one for each, or a single "
                 "one that is not a list or tuple"
             )
-        self._answered("set_attr", partial(send_values, self.group, name, each))
+        for k, value in enumerate(each):
+            self.ask([k], "call_wrapped", "set_wrapper_attr", name, value)
 
     def render(self) -> tuple[Any, ...]:
         """Return one rendered frame of each env."""
@@ -425,50 +471,38 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
 
     # -- state ------------------------------------------------------------------------
 
-    def save_state(self) -> dict[str, Any]:
-        """Return the state of all envs, as a copy that can be pickled; see `EnvGroup.snapshot`.
+    def snapshot(self) -> bytes:
+        """Return the state of all envs; see `EnvGroup.snapshot`.
 
         Raises:
             SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.snapshot`.
-            ResetNeeded: the results of the last step or reset were lost.
+            ResetNeeded: the last call was cut off.
             AlreadyPendingCallError: another call is pending.
         """
-        self._begin("save_state")
-        self._check_whole()
-        self._has_leftovers = True
-        snapshot = self.group.snapshot()
-        self._has_leftovers = False
-        return {
-            "kind": self._kind,
-            "group": snapshot,
-            "observations": copying.deepcopy(self._observations),
-            "deaths": self._deaths.save_state(),
-        }
+        return self._called("snapshot", self.group.snapshot)
 
-    def load_state(self, state: dict[str, Any]) -> None:
-        """Restore the state of all envs, of this vector env or of another one of equal envs.
+    def restore(self, snapshot: bytes) -> tuple[Any, dict[str, Any]]:
+        """Reset all envs to states that `snapshot` has returned, here or in a run before.
+
+        What was in flight is dropped, as by `reset`. An env that had ended its episode is reset by
+        its next step, if it would have been so then.
+
+        Returns what `reset` does: the last observations, and the infos.
 
         Raises:
-            ValueError: it is the state of envs that are stepped together, or with another mode or
-                step limit; nothing was changed.
-            SnapshotError, EnvRaised, WorkerDied, EnvHung: as `EnvGroup.restore`.
+            SnapshotError: it is of other envs, or damaged; nothing was changed.
+            EnvRaised, WorkerDied, EnvHung: as `EnvGroup.restore`; reset all, or restore again.
             AlreadyPendingCallError: another call is pending.
         """
-        self._begin("load_state")
-        if "group" not in state:
-            raise ValueError("this is the state of envs that are stepped together, without a group")
-        if state["kind"] != self._kind:
-            raise ValueError(f"the state is of envs with {state['kind']}, not {self._kind}")
-        had_lost, self._has_lost, self._has_leftovers = self._has_lost, True, True
+        check_free(self, self._pending, "restore")
+        self._drop_outstanding()
+        was_whole, self._is_whole = self._is_whole, False
         try:
-            self._answerable, _ = self.group.restore(state["group"])
-        except SnapshotError:  # All envs are as they were.
-            self._has_lost, self._has_leftovers = had_lost, False
+            batch, _ = self.group.restore(snapshot)
+        except SnapshotError:
+            self._is_whole = was_whole
             raise
-        self._has_leftovers = False
-        self._observations = copying.deepcopy(state["observations"])
-        self._deaths.load_state(state["deaths"], self._answerable)
-        self._has_lost = False
+        return self._begun(batch, None)
 
     # -- the end ----------------------------------------------------------------------
 
@@ -489,24 +523,9 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self.group.close()
 
 
-def _in_one_call(group: EnvGroup, send: Callable[[], None], wait: Callable[[], T]) -> T:
-    """Send and wait; Ctrl-C comes in the wait, and leaves nothing pending."""
-
-    def ask() -> T:
-        send()
-        return wait()
-
-    return in_one_call(group, ask)
-
-
 def per_worker(max_concurrency: Any, num_envs: int) -> int:
     """Number of envs that share a worker if there are at most `max_concurrency` workers."""
     count = as_int(max_concurrency)
     if count is None or count < 1:
         raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")
     return -(-num_envs // count)
-
-
-def _seconds(timeout: float | None) -> float | None:
-    """Convert a timeout to a deadline; 0 collects only what has arrived."""
-    return timeout if timeout is None else max(timeout, 1e-9)

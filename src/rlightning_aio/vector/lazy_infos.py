@@ -76,16 +76,26 @@ class LazyColumns(dict[str, Any]):
 
     Args:
         make: returns the entries; called once, and again after an error.
+        make_each: returns the infos of the single envs, without making the columns.
     """
 
-    __slots__ = ("_make",)
+    __slots__ = ("_make", "_make_each")
 
     # Mutable, as any dict.
     __hash__ = None  # pyright: ignore[reportAssignmentType]
 
-    def __init__(self, make: Callable[[], dict[str, Any]]) -> None:
+    def __init__(
+        self,
+        make: Callable[[], dict[str, Any]],
+        make_each: Callable[[], list[dict[str, Any]]] | None = None,
+    ) -> None:
         super().__init__()
         self._make: Callable[[], dict[str, Any]] | None = make
+        self._make_each = make_each
+
+    def each(self) -> list[dict[str, Any]] | None:
+        """Return the infos of the single envs; None if only the columns say what they are now."""
+        return None if self._make is None or self._make_each is None else self._make_each()
 
     def fill(self) -> None:
         """Make the entries, unless that has been done."""

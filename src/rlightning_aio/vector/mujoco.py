@@ -21,9 +21,8 @@ from rlightning_aio._core.group.episodes.snapshot_format import (
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.errors import SnapshotError
+from rlightning_aio.vector.interface import CalledEnvs, check_name, check_running
 from rlightning_aio.vector.lazy_infos import LazyColumns
-from rlightning_aio.vector.pending import check_running
-from rlightning_aio.vector.proxies import CalledEnvs, check_name
 from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 
 if TYPE_CHECKING:
@@ -109,15 +108,6 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         check_running(self)
         super().set_attr(name, values)
 
-    def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
-        is_method = callable(getattr(self.env, name, None))
-        return is_method, None if is_method else self._call_one(place, name)
-
-    def _call_one(self, place: int, name: str, /, *args: Any) -> Any:
-        """Get attribute `name` of env `place`."""
-        check_running(self)
-        return self.call_one(place, name, *args)
-
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
         check_running(self)
@@ -135,7 +125,7 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         if self._ended is None or not self._is_whole:
             raise ResetNeeded("there is no state to save before reset()")
         state = pickle.dumps(self.save_state())
-        return pack([EnvSnapshot("simulations", self._identity(), 0, False, state)])
+        return pack([EnvSnapshot("simulations", self._identity(), {}, 0, False, state)])
 
     def restore(self, snapshot: bytes) -> tuple[NDArray[Any], dict[str, Any]]:
         """Put all envs into a state that `snapshot` has returned, here or in a run before.

@@ -13,7 +13,13 @@ from rlightning_aio._core.group.episodes.seeds import checked_seed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["checked_mask", "checked_mode", "seeds_of_envs"]
+__all__ = [
+    "checked_mask",
+    "checked_mode",
+    "mask_and_options",
+    "options_of_envs",
+    "seeds_of_envs",
+]
 
 
 def checked_mode(mode: Any) -> AutoresetMode:
@@ -48,6 +54,35 @@ def seeds_of_envs(seed: int | Sequence[int | None] | None, num_envs: int) -> lis
     return [
         None if one is None else checked_seed(one, f" of env {k}") for k, one in enumerate(seed)
     ]
+
+
+def options_of_envs(options: Any, num_envs: int) -> list[Any]:
+    """Return the options of each env, which are given for all, or as a list or tuple.
+
+    Raises:
+        ValueError: there are not options of `num_envs` envs.
+    """
+    if not isinstance(options, list | tuple):
+        return [options] * num_envs
+    each = list(cast("list[Any]", options))
+    if len(each) != num_envs:
+        raise ValueError(f"options of {len(each)} envs for num_envs={num_envs}; give each its own")
+    return each
+
+
+def mask_and_options(options: Any, num_envs: int) -> tuple[NDArray[np.bool_] | None, Any]:
+    """Return the mask that `options` have, or None if it selects all envs; and the rest of them.
+
+    Raises:
+        TypeError, ValueError: as of `checked_mask`.
+    """
+    if not isinstance(options, dict):
+        return None, options
+    rest = dict(cast("dict[str, Any]", options))
+    if "reset_mask" not in rest:
+        return None, rest
+    mask = checked_mask(rest.pop("reset_mask"), num_envs)
+    return None if mask.all() else mask, rest
 
 
 def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:

@@ -120,11 +120,6 @@ class GymnasiumEnv(FastPath, BaseEnv):
         found = self.env.get_wrapper_attr(name)
         return found(*args, **kwargs) if callable(found) else found
 
-    def look_up(self, name: str) -> tuple[bool, Any]:
-        """Return True and None if `call_wrapped` would call a method; otherwise the attribute."""
-        found = self.env.get_wrapper_attr(name)
-        return callable(found), None if callable(found) else found
-
     def is_wrapped(self, name: ClassName) -> bool:
         """Return True if the class of that name is among the env's wrappers."""
         return has_wrapper(self.env, name)
