@@ -198,17 +198,6 @@ def snapshots(use: Use, folder: Path) -> None:
     assert seen[0] == seen[1]
 
 
-def video(use: Use, folder: Path) -> None:
-    """Filming an env changes nothing that any env does."""
-    if use.options.task == "CartPole":
-        return  # Its renderer is a package of its own.
-    env_ids = use.group.env_ids[:1]
-    use.done(use.group.record_video(folder, env_ids, episodes=[0]))
-    step_all(use, 20).check(5)
-    use.done(use.group.record_video(None, env_ids))
-    assert list(folder.glob("*.mp4"))
-
-
 FEATURES = (
     steps,
     first_come,
@@ -217,5 +206,4 @@ FEATURES = (
     evaluation,
     timeline,
     snapshots,
-    video,
 )

@@ -1,8 +1,8 @@
 """Where envs live: worker processes, this process, Ray, remote clients.
 
 The seam is `base` and `messages`: what a group asks of a host, and what a host reports. Each folder
-is a way to carry requests to envs, except `running`, the code that runs an env wherever it lives,
-and `filming`. No module outside this package knows where an env runs; none here imports `group`.
+is a way to carry requests to envs, except `running`, the code that runs an env wherever it lives.
+No module outside this package knows where an env runs; none here imports `group`.
 
 Which host can do what, beside what all can (`base`): `process` and `ray` are `Killable`,
 `here.inline` is `Executing`, `env_server` has `Membership`. Requests are aborted by `here`, by

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 __all__ = [
     "CASTS",
     "NO_ACTION",
-    "RECORD_VIDEO",
     "STEP_IN_ROW",
     "AttachOrder",
     "Attached",
@@ -48,7 +47,6 @@ __all__ = [
     "EnvState",
     "ErrorText",
     "Faulted",
-    "FilmOrder",
     "Joined",
     "Lost",
     "NewSchema",
@@ -74,10 +72,11 @@ NO_ACTION: Final = _Marker.NO_ACTION
 """Sent in place of an action if only its extras travel out of band."""
 STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 """The action and the extras of a step that has no arguments out of band."""
-RECORD_VIDEO: Final = "rlightning_aio.record_video"
-"""The name of a call to the runner instead of the env; no method can have this name."""
 CASTS: Final = "rlightning_aio.casts"
-"""Another one: it returns the casts of observations that were noted since the first such call."""
+"""The name of a call to the runner instead of the env, which no method can have. It returns the
+
+of observations that were noted since the first such call.
+"""
 OutOfBand: TypeAlias = dict[str, Any]
 """The part of a result that has no place in its row. Keys: ``observation``, ``info``, ``extra``
 (the result's ``_extra``), ``ret`` (the whole result)."""
@@ -123,45 +122,16 @@ class StartOrder:
 
 
 @dataclass(frozen=True)
-class FilmOrder:
-    """The episodes of an env to film; the argument of `RECORD_VIDEO`, where None stops filming.
-
-    Attributes:
-        folder: absolute, for the files.
-        every: film episodes 0, every, 2 * every, …
-        episodes: film only these.
-        sub_env: number of the sub-environment to film.
-    """
-
-    folder: str
-    every: int = 1
-    episodes: tuple[int, ...] | None = None
-    sub_env: int = 0
-
-    def wants(self, episode: int) -> bool:
-        """True if the episode with this number is to be filmed."""
-        if self.episodes is not None:
-            return episode in self.episodes
-        return episode % self.every == 0
-
-
-@dataclass(frozen=True)
 class AttachOrder:
     """The rows of the envs of a host. Each env knows the layout of its row.
 
     Attributes:
         slabs: offset in the arena and number of rows of each slab of the group.
         rows: index of the slab, and the row in it, for each env.
-        films: what each env of a replacement goes on filming, if anything. Empty if none does.
-        restarts: how many workers had these envs before; seed: of the last reset of the first env
-            that had one. They seed the global generators of a replacement.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
-    films: tuple[FilmOrder | None, ...] = ()
-    restarts: int = 0
-    seed: int | None = None
 
 
 @dataclass(frozen=True)

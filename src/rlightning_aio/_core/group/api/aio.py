@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio._core.group.api.episode import Agents, EnvEpisode
 from rlightning_aio._core.group.api.facade import only_result, steps_of
-from rlightning_aio._core.group.api.filming import film, film_order
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
@@ -22,7 +21,6 @@ from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Coroutine, Mapping, Sequence
 
     from rlightning_aio._core.group.setup.plan import Plan
@@ -119,17 +117,6 @@ class EnvGroup(GroupInterface):
         return await self._driver.run(
             self._core.restore(time.monotonic(), snapshot, env_ids, source)
         )
-
-    async def record_video(
-        self,
-        folder: str | os.PathLike[str] | None,
-        env_ids: Sequence[str] | None = None,
-        every: int = 1,
-        episodes: Sequence[int] | None = None,
-        sub_env: int = 0,
-    ) -> None:
-        order = film_order(folder, every, episodes, sub_env)
-        await self._driver.run(film(self._core, env_ids, order))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         return self._handle(env_id, EnvHandle, ServerHandle)

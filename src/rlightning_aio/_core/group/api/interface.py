@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from rlightning_aio._core.group.api.facade import Facade
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Mapping, Sequence
 
     from rlightning_aio._core.group.engine.core import Core
@@ -257,46 +256,6 @@ class GroupInterface(Facade):
             EnvRaised, WorkerDied, EnvHung: an env could not be restored, perhaps because it has
                 another version of a library. It has lost its episode, so its next request is a
                 reset. The others are restored: their results are in the error's ``results``.
-            GroupClosed: the group was not initialised, or is closed.
-        """
-        raise NotImplementedError
-
-    def record_video(
-        self,
-        folder: str | os.PathLike[str] | None,
-        env_ids: Sequence[str] | None = None,
-        every: int = 1,
-        episodes: Sequence[int] | None = None,
-        sub_env: int = 0,
-    ) -> Any:
-        """Start filming envs with their next episode, as Gymnasium's `RecordVideo`; or stop.
-
-        The envs must be idle: call it before the first reset, or between collecting their results
-        and answering them. A later call for an env replaces an earlier one.
-
-        Args:
-            folder: for ``<env id>-episode-<n>.mp4``, or ``<env id>-sub-<k>-episode-<n>.mp4`` of
-                envs with sub-environments; created if missing. An unfinished episode is called
-                ``….partial.mp4``. If the folder has films of the env, n continues after the last
-                one. None stops filming; a film in progress becomes a partial one.
-            env_ids: the envs to film; None: all local ones. Envs that share a worker wait while it
-                renders, so give those of an entry that is filmed for long a worker each
-                (``envs_per_process: 1``). A replaced worker continues filming.
-            every: film episodes 0, every, 2 * every, … of each, counted from now.
-            episodes: film only these.
-            sub_env: index of the sub-environment to film.
-
-        ``render`` must return frames ``[height, width, 3]`` uint8, as Gymnasium's envs do with
-        ``render_mode: rgb_array``. A film has the simulator's ``render_fps``.
-
-        Raises (and films no env of `env_ids`):
-            EnvRaised: an env renders nothing or has no such sub-environment, or ffmpeg or the
-                folder is missing.
-            EnvBusy: an env has a request outstanding.
-            UnknownEnv: no env of this group has that id.
-            NotImplementedError: an env belongs to an env_server.
-            WorkerDied, EnvHung: a worker ended.
-            ConfigError: `sub_env`, `every` or `episodes` is invalid.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError

@@ -11,7 +11,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar, TypeVarTuple
 
 from rlightning_aio._core.group.api.facade import only_result, steps_of
-from rlightning_aio._core.group.api.filming import film, film_order
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
@@ -21,7 +20,6 @@ from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable, Mapping, Sequence
 
     from rlightning_aio._core.group.setup.plan import Plan
@@ -116,17 +114,6 @@ class EnvGroup(GroupInterface):
         self, snapshot: bytes, env_ids: Sequence[str] | None = None, source: str | None = None
     ) -> tuple[BatchedData, list[bool]]:
         return self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids, source))
-
-    def record_video(
-        self,
-        folder: str | os.PathLike[str] | None,
-        env_ids: Sequence[str] | None = None,
-        every: int = 1,
-        episodes: Sequence[int] | None = None,
-        sub_env: int = 0,
-    ) -> None:
-        order = film_order(folder, every, episodes, sub_env)
-        self._driver.run(film(self._core, env_ids, order))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         return self._handle(env_id, EnvHandle, ServerHandle)

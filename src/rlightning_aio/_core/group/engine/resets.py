@@ -185,8 +185,6 @@ class Resets:
     ) -> None:
         entries = self._requests.issue(slots, Operation.RESET, owner, now)
         self._results.note_unasked(slots)
-        seeded = seeds >= 0
-        self._envs.last_seed[slots[seeded]] = seeds[seeded]
         if packed is None:
             self._layout.write_seeds(slots, seeds)
         self._dispatch.hand_over(slots, entries, packed)

@@ -13,7 +13,6 @@ import numpy as np
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.config import makers_of
 from rlightning_aio.errors import UnknownEnv
-from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.registry import name_of
 
 if TYPE_CHECKING:
@@ -47,7 +46,6 @@ class EnvTable:
         num_sub_envs: sub-environments of each slot; seed_offset: the number of seeds before its
             own; num_seeds: the number for all local envs.
         resets_itself: True where envs need no reset after an end; any_resets_itself: for any slot.
-        last_seed: the seed of the last reset of each slot that had one; -1 before.
         observation_spaces: of the local envs.
     """
 
@@ -89,7 +87,6 @@ class EnvTable:
         self.num_sub_envs = np.ones(size, np.int64)
         self.seed_offset = np.zeros(size, np.int64)
         self.num_seeds = self._next_index = 0
-        self.last_seed = np.full(size, NO_SEED, np.int64)
         self.resets_itself = np.zeros(size, np.bool_)
         self.any_resets_itself = False
         self.observation_spaces: list[gym.Space[Any] | None] = []

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         Death,
         EnvStarted,
         ErrorText,
-        FilmOrder,
     )
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.errors import WorkerDied
@@ -129,7 +128,6 @@ class HostRecord:
     Attributes:
         started: its envs, once built.
         order: the rows of its envs, once assigned.
-        films: what its envs film, by slot.
         start_by: the deadline of its start; late: it missed that, and is being killed.
         traffic: see `Killable`, when `note_traffic` was last called.
         restart_at: the time of its next restart; restarts: the number so far.
@@ -161,7 +159,6 @@ class HostRecord:
     stage: Stage = Stage.NEW
     started: list[EnvStarted] = field(default_factory=list["EnvStarted"])
     order: AttachOrder | None = None
-    films: dict[int, FilmOrder | None] = field(default_factory=dict[int, "FilmOrder | None"])
     start_by: float | None = None
     late: bool = False
     traffic: int = 0

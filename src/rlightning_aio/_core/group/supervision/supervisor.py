@@ -386,15 +386,7 @@ class Supervisor:
         record.restarts += 1
         record.lost_slots.clear()
         assert record.order is not None
-        # What the generators of a seeded group begin with must not be by chance.
-        seed = self._envs.last_seed.item(record.slots.start)
-        order = replace(
-            record.order,
-            films=tuple(record.films.get(slot) for slot in record.slots),
-            restarts=record.restarts,
-            seed=seed if seed >= 0 else None,
-        )
-        record.host.attach(order)
+        record.host.attach(record.order)
         record.give_time(self._clock())
 
     def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:

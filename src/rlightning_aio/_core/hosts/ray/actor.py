@@ -23,7 +23,7 @@ from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
-from rlightning_aio._core.hosts.running.runner import close_all, give_rows, renew_all
+from rlightning_aio._core.hosts.running.runner import close_all, give_rows
 from rlightning_aio.protocol.entries import op_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.slab import Slab, rows_for
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder
+    from rlightning_aio._core.hosts.messages import Completion, StartOrder
     from rlightning_aio._core.hosts.ray.row_table import Columns
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.protocol.frames import Frame
@@ -141,10 +141,6 @@ class EnvActor:
             return frame_of(Built(SENDER, [runner.started() for runner in self._runners]))
         except BaseException as error:
             return frame_of(not_built(SENDER, given, len(self._runners), error))
-
-    def renew(self, order: AttachOrder) -> None:
-        """Seed a replacement, and film those of its envs that were."""
-        renew_all(self._runners, order)
 
     def execute(self, batch: Batch) -> Reply:
         """Execute requests one after the other."""

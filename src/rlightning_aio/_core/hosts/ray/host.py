@@ -175,8 +175,6 @@ class RayHost(Host):
             found = placed(self._started, order, self._wiring.arena.map)
             places = [(slab, row) for _, slab, row in found]
             self._table = RowTable(self.first_slot, places)
-        elif self._life is not None and order.restarts:
-            self._life.call(self._life.actor.renew, self._on_renewed, order)
         # A replacement is not built yet.
         if self._life is not None and self._life.is_built:
             self._post(Attached(self.host_id))
@@ -312,10 +310,6 @@ class RayHost(Host):
         life.is_built = True
         if self._table is not None:  # A replacement has its rows already.
             self._post(Attached(self.host_id))
-
-    def _on_renewed(self, life: _Life, outcome: Any) -> None:
-        del life
-        self._has_returned(outcome)
 
     def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
         if self._has_returned(outcome):

@@ -43,9 +43,8 @@ class AwaitedRunner(EnvRunner):
         return self._not_attached
 
     def use_rows_of(self, other: AwaitedRunner) -> None:
-        """Take over the row of `other`, which this env replaces, its episode and its films."""
+        """Take over the row of `other`, which this env replaces, and its episode."""
         self.attach(other._slab, other._row, other._announce)
-        self.keep_filming(other._film)
         self.reset_with = other.reset_with
 
     async def answer(self, op: int, arguments: Any) -> Any:

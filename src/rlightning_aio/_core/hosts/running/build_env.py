@@ -12,6 +12,7 @@ from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
+from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -35,7 +36,13 @@ def build_env(
     for module in config.imports:
         importlib.import_module(module)
     env_class = env_class or ENVS.resolve(config.backend)
-    return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
+    if RECORD_VIDEO not in config.env_kwargs:
+        return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
+    own = {name: value for name, value in config.env_kwargs.items() if name != RECORD_VIDEO}
+    unfilmed = config.model_copy(update={"env_kwargs": own})
+    env = env_class(unfilmed, worker_index=worker_index, preprocess_fn=preprocess_fn)
+    record(env, config)
+    return env
 
 
 def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:

@@ -1,4 +1,4 @@
-"""Functions that execute steps: in two halves, or followed by something else."""
+"""Functions that execute steps in two halves."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from rlightning_aio._core.hosts.messages import OutOfBand
 
-__all__ = ["Execute", "GetInput", "followed", "step_in_halves"]
+__all__ = ["Execute", "GetInput", "step_in_halves"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns the part of the result that is out of band."""
@@ -43,15 +43,3 @@ def step_in_halves(
         return end
 
     return begin
-
-
-def followed(execute: Execute, followers: Sequence[Callable[[], None]]) -> Execute:
-    """Return a function that calls `execute`, then each of `followers`."""
-
-    def execute_all() -> OutOfBand | None:
-        outcome = execute()
-        for then in followers:
-            then()
-        return outcome
-
-    return execute_all

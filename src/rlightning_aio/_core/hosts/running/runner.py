@@ -10,7 +10,6 @@ import contextlib
 import logging
 import pickle
 import random
-import sys
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
@@ -20,7 +19,6 @@ import numpy as np
 from rlightning_aio._core.hosts.messages import (
     CASTS,
     NO_ACTION,
-    RECORD_VIDEO,
     STEP_IN_ROW,
     Attached,
     EnvStarted,
@@ -31,7 +29,7 @@ from rlightning_aio._core.hosts.messages import (
 )
 from rlightning_aio._core.hosts.running.casts import Casts
 from rlightning_aio._core.hosts.running.env_calls import call_env
-from rlightning_aio._core.hosts.running.env_steps import followed, step_in_halves
+from rlightning_aio._core.hosts.running.env_steps import step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
@@ -53,8 +51,7 @@ from rlightning_aio.protocol.slab import RowLayout, Slab
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
-    from rlightning_aio._core.hosts.filming.camera import Camera
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, FilmOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completion
     from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio._core.hosts.running.row_writer import ShownResult
@@ -70,7 +67,6 @@ __all__ = [
     "give_rows",
     "loaded",
     "placed",
-    "renew_all",
     "seed_generators",
 ]
 
@@ -82,12 +78,12 @@ def loaded(arguments: Any) -> Any:
     return pickle.loads(arguments) if type(arguments) is bytes else arguments
 
 
-def seed_generators(*entropy: int) -> None:
-    """Seed the global generators of NumPy and Python, from the system if no numbers are given.
+def seed_generators() -> None:
+    """Seed the global generators of NumPy and Python from the system.
 
     For processes that only run envs; in the trainer they belong to the program.
     """
-    words = np.random.SeedSequence(entropy or None).generate_state(8)
+    words = np.random.SeedSequence().generate_state(8)
     np.random.seed(words)  # noqa: NPY002
     random.seed(words.tobytes())
 
@@ -108,7 +104,6 @@ class EnvRunner:
 
     Attributes:
         inline: it lives in the trainer's process.
-        restarts: how many workers had this env before, and how often it was rebuilt.
         fast_path: what the env offers to save time.
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
@@ -126,11 +121,8 @@ class EnvRunner:
         inline: bool = False,
         rebuild: Callable[[], BaseEnv] | None = None,
     ) -> None:
-        self.restarts = 0
         self.inline = inline
         self._rebuild = rebuild
-        self._film: FilmOrder | None = None
-        self._camera: Camera | None = None
         # The env has raised, and is to be rebuilt; it was closed for that.
         self._is_spent = self._has_closed = False
         self._on_stepped: Callable[[], None] | None = None
@@ -191,12 +183,9 @@ class EnvRunner:
         self._bind()
 
     def _bind(self) -> None:
-        """Choose the functions that step the env with the action in its row, and what follows."""
-        self._followers = [] if self._camera is None else [self._camera.see]
+        """Choose the functions that step the env with the action in its row."""
         self.begin_step = None
         self.step = self._stepper()
-        if self._followers:  # A step in halves would bypass them.
-            self.step, self.begin_step = followed(self.step, self._followers), None
 
     def execute(self, op: int, arguments: Any) -> Any:
         """Execute a request.
@@ -226,15 +215,13 @@ class EnvRunner:
             self._renew()
         if op == Operation.STEP:
             action, extras = arguments or STEP_IN_ROW
-            return partial(self._step_with, action, extras), self._finish_step
+            return partial(self._step_with, action, extras), self._store_step
         if op == Operation.RESET:
             return self._reset_request(arguments)
         if op == Operation.SNAPSHOT:
             return self._snapshot, _outcome
         if op == Operation.RESTORE:
             return partial(self._restore, *arguments), self._finish_restore
-        if arguments[0] == RECORD_VIDEO:
-            return partial(self._record_video, *arguments[1]), _outcome
         if arguments[0] == CASTS:
             return self._noted_casts, _outcome
         return partial(call_env, self.env, *arguments), _outcome
@@ -271,10 +258,8 @@ class EnvRunner:
         return shown_result
 
     def _finish_restore(self, shown_result: ShownResult, busy_ns: int) -> OutOfBand | None:
-        """Show a result again; frames that follow aren't of the episode being filmed."""
+        """Show a result again."""
         del busy_ns
-        if self._camera is not None:
-            self._camera.close()
         out_of_band = self._writer.write_shown(shown_result)
         self._note_reset()
         return out_of_band
@@ -314,52 +299,18 @@ class EnvRunner:
         self._has_closed = False
         if self.layout.key != key:
             raise ValueError("its spaces changed with the restart")
-        self.restarts += 1
-        self._camera = None
         self._attach_again()
-        self.keep_filming(self._film)
         self._is_spent = False
 
     def close(self) -> Awaitable[None] | None:
-        """Close the env, and the film of an episode that is under way."""
+        """Close the env, once."""
         if self._has_closed:
             return None
         self._has_closed = True
-        try:
-            if self._camera is not None:
-                self._camera.close()
-        finally:
-            closing = self.env.close()
-        return closing
+        return self.env.close()
 
     def _not_attached(self) -> OutOfBand | None:
         raise RuntimeError("this env has no row yet")
-
-    # -- films --------------------------------------------------------------------
-
-    def keep_filming(self, film: FilmOrder | None) -> None:
-        """Film as the env did that this one replaces. If it can't, training goes on all the same.
-
-        Args:
-            film: what that one filmed, if anything.
-        """
-        if film is None:
-            return
-        try:
-            self._record_video(film)
-        except Exception as error:
-            sys.stderr.write(f"env {self.env.env_id!r} is no longer filmed: {error}\n")
-
-    def _record_video(self, film: FilmOrder | None) -> None:
-        """Film episodes from the next one on, or stop filming; the current film ends here."""
-        camera = None if film is None else _camera(self.env, film)
-        former, self._camera, self._film = self._camera, camera, film
-        if camera is not None:
-            limits = self.meta.autoreset, self.meta.max_episode_steps
-            camera.watch(self._slab, self._row, *limits)
-        self._bind()
-        if former is not None:
-            former.close()
 
     # -- steps --------------------------------------------------------------------
 
@@ -399,9 +350,6 @@ class EnvRunner:
         method = "collect_async" if is_async_first(self.env) else "step"
         return self._write(method, returned, busy_ns)
 
-    def _finish_step(self, returned: Any, busy_ns: int) -> OutOfBand | None:
-        return followed(partial(self._store_step, returned, busy_ns), self._followers)()
-
     # -- resets -------------------------------------------------------------------
 
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
@@ -412,19 +360,8 @@ class EnvRunner:
         return partial(bare or self.env.reset, seed=seed, options=options), finish
 
     def _seed_and_options(self, arguments: Any) -> tuple[int | None, dict[str, Any] | None]:
-        """Return what to reset the env with, and seed the generators."""
-        seed, options = arguments or (self._slab.take_seed(self._row), None)
-        self._seed_generators(seed)
-        return seed, options
-
-    def _seed_generators(self, seed: int | None) -> None:
-        """Seed the global generators for an episode that begins with a seed.
-
-        An episode that is repeated after a death gets other numbers: an env that crashes by chance
-        would crash at the same step again.
-        """
-        if seed is not None and not self.inline:
-            seed_generators(seed, self.restarts)
+        """Return what to reset the env with."""
+        return arguments or (self._slab.take_seed(self._row), None)
 
     def _finish_reset(self, returned: Any, busy_ns: int, *, is_bare: bool) -> OutOfBand | None:
         if is_bare:
@@ -434,8 +371,6 @@ class EnvRunner:
         else:
             out_of_band = self._write("reset", returned, busy_ns)
         self._note_reset()
-        if self._camera is not None:
-            self._camera.see()
         return out_of_band
 
     def _write(self, method: str, returned: Any, busy_ns: int) -> OutOfBand | None:
@@ -522,19 +457,7 @@ def attach_all(
         post: gets completions, as of `give_rows`, and `Attached`.
     """
     give_rows(placed(runners, order, map_part), host_id, post)
-    renew_all(runners, order)
     post(Attached(host_id))
-
-
-def renew_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
-    """Seed a replacement, and film those of its envs that were."""
-    if order.seed is not None:
-        # Not the numbers of an episode that begins with that seed.
-        seed_generators(order.seed, order.restarts, 1)
-    for runner in runners:
-        runner.restarts = order.restarts
-    for runner, film in zip(runners, order.films, strict=False):
-        runner.keep_filming(film)
 
 
 def close_all(
@@ -565,10 +488,3 @@ def disconnect_all(runners: Sequence[EnvRunner]) -> None:
     for runner in runners:
         with contextlib.suppress(Exception):
             runner.env.on_disconnect()
-
-
-def _camera(env: BaseEnv, film: FilmOrder) -> Camera:
-    # Not at the top: few workers need it.
-    from rlightning_aio._core.hosts.filming.camera import Camera  # noqa: PLC0415
-
-    return Camera(env, film)
