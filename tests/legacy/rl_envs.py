@@ -27,8 +27,6 @@ class RichRet(EnvRet):
 
     belief: list[Any] = field(default_factory=list[Any])
 
-    __hash__ = EnvRet.__hash__
-
 
 @ENVS.register("counting")
 class CountingEnv(BaseEnv):

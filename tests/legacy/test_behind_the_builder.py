@@ -19,9 +19,7 @@ MODULES = {
     "types": """
         from rlightning_aio.plugins.legacy import types as like
 
-        class EnvRet(like.EnvRet):
-            __hash__ = like.EnvRet.__hash__
-
+        class EnvRet(like.EnvRet): ...
         class PolicyResponse(like.PolicyResponse): ...
         class BatchedData(like.BatchedData): ...
     """,
@@ -113,7 +111,7 @@ assert RemoteEnvClient.__module__ == "rlightning_aio.plugins.legacy.remote"
 rets = Engine(group).rollout(5)
 assert [ret.observation[0] for ret in rets[::2]] == [0, 1, 2, 0, 1]
 assert [ret.info.get("seed", "none") for ret in rets[::2]] == [0, "none", "none", None, "none"]
-assert rets[2].to_dict()["kept"]
+assert rets[2]._extra["kept"]
 group.close()
 print("with", rlightning.__file__)
 """

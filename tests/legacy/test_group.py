@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,14 +10,14 @@ import numpy as np
 import pytest
 
 from rlightning_aio.errors import EnvRaised, StartFailed
-from rlightning_aio.plugins.legacy.names import is_rlightning_installed, names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 if is_rlightning_installed():
     pytest.skip("RLightning itself is installed", allow_module_level=True)
-names_in_use()
+make_importable()
 
 from legacy import rl_envs  # noqa: E402
 from rlightning.env.env_group import EnvGroup  # noqa: E402
@@ -28,9 +27,7 @@ from rlightning.utils.config import EnvConfig  # noqa: E402
 
 
 def entry(backend: str, **fields: Any) -> EnvConfig:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # RLightning warns about each backend that is not its own.
-        return EnvConfig(name="same/name", backend=backend, task="any", **fields)
+    return EnvConfig(name="same/name", backend=backend, task="any", **fields)
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +63,8 @@ def test_a_group_has_the_attributes_of_rlightnings(group: EnvGroup) -> None:
     assert metas[0].action_space == group.get_action_spaces()[0]
     assert len(group.get_observation_spaces()) == 3
     env: Any = group[group.env_ids[2]]
-    assert group.id_to_env[group.env_ids[2]] is group.env_list[2] is env
-    assert group.env_to_id[env] == env.get_env_id() == group.env_ids[2]
+    assert group.env_list[2] is env
+    assert env.get_env_id() == group.env_ids[2]
     assert (env.index, env.config.seed) == (2, [4])
     assert not hasattr(env, "__deepcopy__")
     with pytest.raises(EnvRaised, match="no_such_method"):
@@ -127,9 +124,7 @@ def test_auto_reset_resets_by_its_counter_alone(group: EnvGroup) -> None:
     assert group.step_counter is None
     with group.auto_reset():
         assert [group.step_counter[env_id] for env_id in ids] == [-1, -1, -1]
-    with contextlib.ExitStack() as stack:
-        with pytest.warns(UserWarning, match="overrides"):
-            stack.enter_context(group.auto_reset(max_episode_steps=3))
+    with group.auto_reset(max_episode_steps=3):
         _, flags = group.reset(seed=1)
         assert (flags, group.step_counter[ids[0]]) == ([False] * 3, 0)
         told = []
@@ -294,7 +289,7 @@ def test_a_group_calls_a_method_of_all_envs(
     assert not group.env_list[0].evaluates
     group.offload()
     group.reload()
-    group.print_timing_summary(reset=True)
+    group.print_timing_summary()
     assert "steps per second" in capsys.readouterr().out
 
 

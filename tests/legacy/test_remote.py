@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from rlightning_aio.errors import EnvRaised
-from rlightning_aio.plugins.legacy.names import is_rlightning_installed, names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
 
 if is_rlightning_installed():
     pytest.skip("RLightning itself is installed", allow_module_level=True)
-names_in_use()
+make_importable()
 
 from rlightning.env import BaseEnv  # noqa: E402
-from rlightning.env.env_server import RemoteEnvServer  # noqa: E402
 from rlightning.env.remote_env import RemoteEnvClient  # noqa: E402
 from rlightning.types import BatchedData, EnvRet, PolicyResponse  # noqa: E402
 from rlightning.utils.builders import build_env_group  # noqa: E402
@@ -129,26 +128,3 @@ def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:
         robot.steps = STEPS  # It is finished.
         group.close()
         thread.join()
-
-
-def test_a_server_without_a_group_waits_for_clients() -> None:
-    """`collect_async` with a timeout may return no result."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        config = EnvConfig(name="robots", backend="env_server", task="real")
-    server = RemoteEnvServer(config)
-    with pytest.raises(RuntimeError, match="init"):
-        server.get_address_port()
-    server.init()
-    thread, _ = serving(server.get_address_port(), times=1)
-    rets = server.reset()
-    for _ in range(STEPS):
-        batch = BatchedData([server.env_id] * len(rets), rets)
-        server.step_async(answers(batch).values())
-        rets = server.collect_async()
-        assert [ret.last_reward for ret in rets] == [1.0]
-    thread.join()
-    assert server.collect_async(timeout=0.001) == ()
-    with pytest.raises(NotImplementedError, match="step_async"):
-        server.step(None)
-    server.close()

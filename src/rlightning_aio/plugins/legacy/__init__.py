@@ -1,9 +1,9 @@
 """Runs programs that were written for RLightning; users import it as `rlightning_aio.legacy`.
 
-Where RLightning is not installed, this
-package provides its names for envs and groups. Where it is installed, its own builder makes our
-groups, which return its own `EnvRet` and `BatchedData`. docs/rlightning.md lists the differences
-from rlightning_aio's own interface, which new programs should use.
+Where RLightning is not installed, this package provides its names for envs and groups. Where it is
+installed, its own builder makes our groups, which return its own `EnvRet` and `BatchedData`.
+docs/rlightning.md lists the differences from rlightning_aio's own interface, which new programs
+should use.
 
 Rule: every difference in RLightning's behaviour is handled in this package and in no other.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import importlib
 
-from rlightning_aio.plugins.legacy.names import names_in_use
+from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
 
 __all__ = ["install"]
 
@@ -23,14 +23,14 @@ def install() -> None:
     Call it before anything imports names from RLightning: names that were imported earlier keep
     their old values. Idempotent.
     """
-    if not names_in_use().own:
+    make_importable()
+    if not is_rlightning_installed():
         return
-    group = importlib.import_module("rlightning_aio.plugins.legacy.group").EnvGroup
-    remote = importlib.import_module("rlightning_aio.plugins.legacy.remote")
     replaced = {
-        "EnvGroup": (group, ("env", "env.env_group", "utils.builders")),
-        "RemoteEnvClient": (remote.RemoteEnvClient, ("env.remote_env.env_client",)),
+        "group": ("EnvGroup", ("env", "env.env_group", "utils.builders")),
+        "remote": ("RemoteEnvClient", ("env.remote_env.env_client",)),
     }
-    for name, (ours, homes) in replaced.items():
+    for module, (name, homes) in replaced.items():
+        ours = getattr(importlib.import_module(f"rlightning_aio.plugins.legacy.{module}"), name)
         for home in homes:
             setattr(importlib.import_module(f"rlightning.{home}"), name, ours)

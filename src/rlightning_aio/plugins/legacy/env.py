@@ -1,17 +1,19 @@
-"""RLightning's `BaseEnv` and its default preprocess function."""
+"""RLightning's `BaseEnv`, and its built-in envs on our backends."""
 
 from __future__ import annotations
 
 import abc
 import copy
-import logging
 import uuid
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.plugins.legacy.flags import InternalFlag
+from rlightning_aio import ENVS as BACKENDS
+from rlightning_aio import EnvConfig
+from rlightning_aio import PolicyResponse as Response
+from rlightning_aio.plugins.legacy.registry import ENVS
 from rlightning_aio.plugins.legacy.types import EnvMeta, EnvRet
 from rlightning_aio.types import default_env_preprocess_fn
 
@@ -20,7 +22,13 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["BaseEnv", "default_env_preprocess_fn"]
+__all__ = [
+    "ALEEnv",
+    "BaseEnv",
+    "MujocoEnv",
+    "SimulatedEnv",
+    "default_env_preprocess_fn",
+]
 
 
 class BaseEnv(abc.ABC):
@@ -31,7 +39,6 @@ class BaseEnv(abc.ABC):
         env_id: ``<uuid>-<worker_index>``.
         env: the simulator.
         num_envs, max_episode_steps: the entry's.
-        timing_raw: the durations that `profiler.timer_wrap` measured.
     """
 
     def __init__(
@@ -47,7 +54,6 @@ class BaseEnv(abc.ABC):
         self.max_episode_steps: int | None = self.config.max_episode_steps
         self._preprocess_fn: Any = preprocess_fn
         self._episode_env_infos: dict[str, list[Any]] = defaultdict(list)
-        self.timing_raw: dict[str, dict[str, Any]] = {}
 
     @abc.abstractmethod
     def reset(self, *args: Any, **kwargs: Any) -> Any:
@@ -73,8 +79,8 @@ class BaseEnv(abc.ABC):
         """Return the step limit for `EnvGroup.auto_reset`."""
         return self.max_episode_steps
 
-    def get_metadata(self) -> EnvMeta:
-        """Return the id, the spaces and the number of sub-environments."""
+    def init(self) -> Any:
+        """Return the metadata; `EnvGroup.init` calls it and returns the values."""
         return EnvMeta(
             env_id=self.env_id,
             action_space=self.get_action_space(),
@@ -82,39 +88,18 @@ class BaseEnv(abc.ABC):
             num_envs=self.num_envs,
         )
 
-    def init(self) -> Any:
-        """Return the metadata; `EnvGroup.init` calls it and returns the values."""
-        return self.get_metadata()
-
-    def step_async(self, policy_resp_list: Any) -> None:
-        """Raise an error: only a server of remote envs has it."""
-        raise NotImplementedError("step_async() belongs to RemoteEnvServer")
-
-    def collect_async(self) -> Any:
-        """Raise an error: only a server of remote envs has it."""
-        raise NotImplementedError("collect_async() belongs to RemoteEnvServer")
-
-    # -- reset and step with the hooks around them, which a group calls
+    # -- reset and step with what is recorded of them, which a group calls
 
     def _reset(self, *args: Any, **kwargs: Any) -> Any:
-        return self._post_step_hook(self.reset(*args, **kwargs))
+        return self._recorded(self.reset(*args, **kwargs))
 
     def _step(self, policy_resp: Any) -> Any:
-        return self._post_step_hook(self.step(self._pre_step_hook(policy_resp)))
+        return self._recorded(self.step(policy_resp))
 
-    def _pre_step_hook(self, policy_resp: Any) -> Any:
-        return policy_resp.cpu()
-
-    def _post_step_hook(self, env_ret: Any) -> Any:
-        self._record_episode_info(env_ret)
-        if InternalFlag.REMOTE_STORAGE:
-            env_ret = env_ret.numpy()
-        env_ret.mark_env_sent()
-        return env_ret
-
-    def _record_episode_info(self, env_ret: EnvRet) -> None:
+    def _recorded(self, env_ret: EnvRet) -> EnvRet:
         for name, value in env_ret.info.get("episode_info", {}).items():
             self._episode_env_infos[name].append(value)
+        return env_ret
 
     def get_env_stats(self, reset: bool = False) -> dict[str, list[float]]:
         """Return sum and count of each metric in ``info["episode_info"]`` since `reset`."""
@@ -125,13 +110,6 @@ class BaseEnv(abc.ABC):
         if reset:
             self._episode_env_infos.clear()
         return stats
-
-    def print_timing_summary(self, reset: bool = False) -> None:
-        """Log the durations that `profiler.timer_wrap` measured."""
-        for name, stats in self.timing_raw.items():
-            logging.getLogger(__name__).debug("env %s, %s: %s", self.env_id, name, stats)
-        if reset:
-            self.timing_raw = {}
 
     # -- methods that a subclass may define
 
@@ -148,11 +126,76 @@ class BaseEnv(abc.ABC):
     def reload(self) -> None:
         """Allocate the memory again."""
 
-    def apply_evaluate_cfg(self) -> None:
-        """Apply ``config.evaluate_cfg``."""
-
-    def restore_evaluate_cfg(self) -> None:
-        """Undo `apply_evaluate_cfg`."""
-
     def finish_rollout(self) -> None:
         """Finish a rollout; `EnvGroup.get_env_stats` calls it."""
+
+
+class SimulatedEnv(BaseEnv):
+    """An env of one of our backends: of the one that the entry names.
+
+    Attributes:
+        native: the backend's own env, whose simulator is ``self.env``.
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        worker_index: int | None = 0,
+        preprocess_fn: Callable[[Any], Any] | None = default_env_preprocess_fn,
+        **kwargs: Any,
+    ) -> None:
+        del kwargs  # Accepted so that subclasses can pass on all their arguments.
+        super().__init__(config, worker_index, preprocess_fn)
+        native = EnvConfig(
+            name=config.name,
+            backend=config.backend,
+            task=config.task,
+            num_envs=config.num_envs,
+            max_episode_steps=config.max_episode_steps,
+            env_kwargs=config.env_kwargs.to_dict(),
+        )
+        self.native = BACKENDS.resolve(config.backend)(native, worker_index or 0)
+        self.env = self.native.env
+        self.observation_space: Any = self.native.get_observation_space()
+        self.action_space: Any = self.native.get_action_space()
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return self.observation_space
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return self.action_space
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None, **kwargs: Any
+    ) -> EnvRet:
+        del kwargs  # RLightning's envs accept each other's arguments.
+        result = self.native.reset(seed=seed, options=options)
+        return EnvRet(self.env_id, result.observation, info=result.info)
+
+    def step(self, policy_resp: Any) -> EnvRet:
+        result = self.native.step(Response(self.env_id, self._preprocess_fn(policy_resp)))
+        return EnvRet(
+            self.env_id,
+            result.observation,
+            result.last_reward,
+            result.last_terminated,
+            result.last_truncated,
+            result.info,
+        )
+
+    def offload(self) -> None:
+        self.native.offload()
+
+    def reload(self) -> None:
+        self.native.reload()
+
+    def is_finish(self) -> bool:
+        return self.native.is_finish()
+
+    def close(self) -> None:
+        self.native.close()
+
+
+MujocoEnv = ALEEnv = SimulatedEnv
+for _backend in ("mujoco", "ale", "maniskill", "isaac_manager_based", "isaac_marl", "piper"):
+    ENVS.provide(_backend, SimulatedEnv)

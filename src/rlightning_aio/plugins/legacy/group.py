@@ -1,59 +1,52 @@
 """RLightning's `EnvGroup` over the public synchronous group of rlightning_aio.
 
 Rule: RLightning's behaviour is reproduced in this package: ids, the arguments of a reset, what
-`auto_reset` resets, when a window opens, what an empty collect returns. Our own group does not
-know of it.
+`auto_reset` resets, requests to an env that still owes a result, what an empty collect returns. Our
+own group does not know of it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
+import dataclasses
 import logging
+import math
 import time
-import warnings
-from typing import TYPE_CHECKING, Any, ClassVar, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from rlightning_aio.errors import EnvFault, UnknownEnv
-from rlightning_aio.plugins.legacy.counter import EnvStepCounter, ThroughputTracker
+from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio.errors import EnvFault, UnknownEnv, WorkerDied
+from rlightning_aio.plugins.legacy.config import EnvConfig
 from rlightning_aio.plugins.legacy.env import default_env_preprocess_fn
-from rlightning_aio.plugins.legacy.handles import EnvHandle, ServerHandle
-from rlightning_aio.plugins.legacy.hosted import ARGUMENTS, off_device
-from rlightning_aio.plugins.legacy.names import names_in_use
-from rlightning_aio.plugins.legacy.plan import (
-    Plan,
-    define_env_instance_cfgs,
-    listed_configs,
-    repeated,
-)
-from rlightning_aio.plugins.legacy.translated_group import TranslatedGroup
+from rlightning_aio.plugins.legacy.hosted import ARGUMENTS, SERVER, entries_of, off_device
+from rlightning_aio.plugins.legacy.names import named
+from rlightning_aio.sync import build_env_group as build_our_group
+from rlightning_aio.trees import as_numpy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import Callable, Generator, Iterable, Sequence
 
     import gymnasium as gym
 
-    from rlightning_aio.plugins.legacy.translated_group import ResultRow
+__all__ = ["EnvGroup", "EnvStepCounter", "build_env_group"]
 
-__all__ = ["EnvGroup", "build_env_group", "define_env_instance_cfgs"]
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
+_PATIENCE_SECONDS: Final = 60.0
+"""How long a reset waits for a call of a method that was interrupted."""
 _log = logging.getLogger(__name__)
 
 
-def _one_call(
-    method: Callable[Concatenate[EnvGroup, P], T],
-) -> Callable[Concatenate[EnvGroup, P], T]:
-    """Let Ctrl-C interrupt a method only where it waits, so that it takes no result."""
+class _Row(NamedTuple):
+    """A result.
 
-    @functools.wraps(method)
-    def in_one_call(self: EnvGroup, *args: P.args, **kwargs: P.kwargs) -> T:
-        group = self._group  # pyright: ignore[reportPrivateUsage]  # Same module.
-        return group.in_one_call(functools.partial(method, self, *args, **kwargs))
+    Attributes:
+        batch_id: its id in batches; of a client's result, that of the env_server.
+        ret: RLightning's `EnvRet`.
+        at_limit: with it the episode has reached its limit of steps.
+    """
 
-    return in_one_call
+    batch_id: str
+    ret: Any
+    at_limit: bool = False
 
 
 class EnvGroup:
@@ -65,12 +58,9 @@ class EnvGroup:
 
     Attributes:
         env_list, env_servers: handles on the local envs and on the env_servers.
-        env_ids: the ids of both; id_to_env, env_to_id and id_to_num_envs are mappings.
+        env_ids: the ids of both.
         step_counter: an `EnvStepCounter` inside `auto_reset`, None outside.
     """
-
-    _STEP_ASYNC_WARNED: ClassVar[bool] = True  # No warning is needed: everything is asynchronous.
-    throughput: ClassVar[ThroughputTracker] = ThroughputTracker()
 
     def __init__(
         self,
@@ -79,34 +69,30 @@ class EnvGroup:
     ) -> None:
         if not env_cfg_list:
             raise ValueError("a group needs at least one config")
-        if preprocess_fn is default_env_preprocess_fn:
-            preprocess_fn = names_in_use().default_env_preprocess_fn
-        fns = repeated(preprocess_fn, len(env_cfg_list))
+        fns = _listed(preprocess_fn, len(env_cfg_list))
         if len(fns) != len(env_cfg_list):
             raise ValueError(f"{len(fns)} preprocess functions for {len(env_cfg_list)} envs")
-        plan = Plan(env_cfg_list, fns)
-        self._names = names_in_use()
-        self._group = TranslatedGroup(plan)
-        local_ids = self._group.local_ids
-        self._local_ids = frozenset(local_ids)
-        self.env_ids = [*local_ids, *self._group.server_ids]
-        self.env_list = [EnvHandle(self._group, env_id) for env_id in local_ids]
-        self.env_servers = [ServerHandle(self._group, id_) for id_ in self._group.server_ids]
-        handles = [*self.env_list, *self.env_servers]
-        self.id_to_env = dict(zip(self.env_ids, handles, strict=True))
-        self.env_to_id = dict(zip(handles, self.env_ids, strict=True))
-        counts = [config.num_envs for config in (*plan.local, *plan.servers)]
-        self.id_to_num_envs = dict(zip(self.env_ids, counts, strict=True))
-        self.observation_spaces: list[Any] | None = None
-        self.action_spaces: list[Any] | None = None
-
-    @property
-    def step_counter(self) -> EnvStepCounter | None:
-        return self._group.counter
-
-    @property
-    def _in_auto_reset_context(self) -> bool:
-        return self.step_counter is not None
+        entries = entries_of(env_cfg_list, fns)
+        self._group = build_our_group([entry for entry, _ in entries], mixed_actions=True)
+        self._group.init()
+        # There, a step after an end is nothing unusual.
+        self._group.auto_reset(math.inf, on_done=False).__enter__()
+        self.env_ids = [env_id for _, ids in entries for env_id in ids]
+        core_ids = [f"{entry.name}-{k}" for entry, ids in entries for k in range(len(ids))]
+        self._id_of = dict(zip(core_ids, self.env_ids, strict=True))
+        self._core_id_of = dict(zip(self.env_ids, core_ids, strict=True))
+        num_local = sum(len(ids) for entry, ids in entries if entry.backend != SERVER)
+        self._local, self._servers = core_ids[:num_local], core_ids[num_local:]
+        self.env_list = [EnvHandle(self, env_id) for env_id in self.env_ids[:num_local]]
+        self.env_servers = [
+            ServerHandle(self._group[one], self._id_of[one]) for one in self._servers
+        ]
+        self._env_of = dict(zip(self.env_ids, [*self.env_list, *self.env_servers], strict=True))
+        self.step_counter: EnvStepCounter | None = None
+        # Results that came before `collect_async` has asked for them.
+        self._kept: list[_Row] = []
+        self._num_steps = {"sync": 0, "async": 0}
+        self._began = time.monotonic()
 
     # -- contents
 
@@ -116,27 +102,11 @@ class EnvGroup:
         Raises:
             ValueError: shapes of action spaces differ, not counting the axis of sub-environments.
         """
-        metas = self._group.call_all("of_env", "init", (), {})
-        known = [(meta.env_id, _action_shape(meta)) for meta in metas]
-        shapes = [(env_id, shape) for env_id, shape in known if shape is not None]
-        for env_id, shape in shapes:
-            first_id, first = shapes[0]
-            if shape != first:
-                raise ValueError(
-                    f"all envs of a group need actions of one shape: {first_id} has {first}, and "
-                    f"{env_id} has {shape}"
-                )
+        metas = self.call_all("init")
+        shapes = {meta.env_id: _action_shape(meta) for meta in metas}
+        if len({shape for shape in shapes.values() if shape is not None}) > 1:
+            raise ValueError(f"all envs of a group need actions of one shape, not {shapes}")
         return metas
-
-    @classmethod
-    def build_env(
-        cls, env_cfg: Any, preprocess_fn: Any = None, worker_index: int | None = None
-    ) -> tuple[Any, bool]:
-        """Make one env in this process. Return it, and True if it is an env_server."""
-        names = names_in_use()
-        fn = preprocess_fn or names.default_env_preprocess_fn
-        env = names.ENVS.get(env_cfg.backend)(env_cfg, worker_index=worker_index, preprocess_fn=fn)
-        return env, env_cfg.backend == "env_server"
 
     def __len__(self) -> int:
         """Return the number of local envs and env_servers."""
@@ -147,48 +117,42 @@ class EnvGroup:
         return len(self.env_list)
 
     def __getitem__(self, env_id: str) -> EnvHandle | ServerHandle:
-        return self.id_to_env[env_id]
+        return self._env_of[env_id]
 
     def get_observation_spaces(self) -> list[gym.Space[Any]]:
         """Return the observation spaces of the local envs."""
-        if self.observation_spaces is None:
-            self.observation_spaces = self._group.call_all(
-                "of_env", "get_observation_space", (), {}
-            )
-        return self.observation_spaces
+        return self.call_all("get_observation_space")
 
     def get_action_spaces(self) -> list[gym.Space[Any]]:
         """Return the action spaces of the local envs."""
-        if self.action_spaces is None:
-            self.action_spaces = self._group.call_all("of_env", "get_action_space", (), {})
-        return self.action_spaces
+        return self.call_all("get_action_space")
 
     # -- resets and steps
 
-    @_one_call
     def reset(self, *args: Any, **kwargs: Any) -> tuple[Any, list[bool]]:
         """Reset every env with exactly these arguments. Return results in the group's order.
 
-        Clients of env_servers get only `seed` and `options`.
+        What local envs still owe, as after Ctrl-C, is awaited and dropped. Clients of env_servers
+        get only `seed` and `options`.
         """
-        self._group.settle()
-        local_ids = self._group.local_ids
-        self._group.send_resets(local_ids, {ARGUMENTS: (args, kwargs)} if args or kwargs else None)
-        rows = self._results_of(local_ids)
-        try:
-            for env_id in self._group.server_ids:
-                rows += self._group.reset_server(env_id, kwargs.get("seed"), kwargs.get("options"))
-        except EnvFault as fault:
-            if fault.results is not None:
-                rows += self._group.rows_of(fault.results)
-            fault.results, _ = self._batch_and_flags(rows)
-            raise
-        except BaseException:
-            self._group.keep(rows)
-            raise
-        return self._batch_and_flags(rows)
+        while self._local_pending():
+            with contextlib.suppress(EnvFault):
+                self._await(self._local)
+        with contextlib.suppress(EnvFault):
+            if not self._servers:  # A call that Ctrl-C has left may still run.
+                self._group.drain(deadline=_PATIENCE_SECONDS)
+        self._kept = [row for row in self._kept if self._core_id_of[row.batch_id] in self._servers]
+        rows: list[_Row] = []
+        with self._own_ids(rows):
+            if self._local:
+                options = {ARGUMENTS: (args, kwargs)} if args or kwargs else None
+                rows += self._rows(self._group.reset(options=options, env_ids=self._local)[0])
+            for core_id in self._servers:
+                seed, options = kwargs.get("seed"), kwargs.get("options")
+                found: Any = self._group[core_id].reset(seed, options)
+                rows += [self._row_of_client(core_id, ret) for ret in found]
+        return _batch_and_flags(rows)
 
-    @_one_call
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:
         """Step the envs of a batch and wait for them. Return the results in the batch's order.
 
@@ -197,96 +161,136 @@ class EnvGroup:
         """
         ids = batched_policy_resp.ids()
         for env_id in ids:
-            if env_id in self.env_ids and env_id not in self._local_ids:
+            if self._core_id_of.get(env_id) in self._servers:
                 raise NotImplementedError(
                     f"{env_id} is an env_server; use step_async and collect_async"
                 )
-        self._group.settle()
-        self._send(batched_policy_resp)
-        rows = self._results_of(ids)
-        self.throughput.record("env_throughput_sync", self._num_steps(ids))
-        batch, flags = self._batch_and_flags(rows)
-        return batch, flags if self._in_auto_reset_context else None
+        steps, due = self._requests(batched_policy_resp)
+        rows: list[_Row] = []
+        with self._own_ids(rows):
+            if steps is not None:
+                rows += self._rows(self._group.step(steps)[0])
+            if due:
+                rows += self._rows(self._group.reset(env_ids=due)[0])
+        self._num_steps["sync"] += len(rows)
+        if due:
+            places = {env_id: place for place, env_id in enumerate(ids)}
+            rows.sort(key=lambda row: places[row.batch_id])
+        batch, flags = _batch_and_flags(rows)
+        return batch, None if self.step_counter is None else flags
 
-    def _results_of(self, ids: Sequence[str]) -> list[ResultRow]:
-        """Wait for results of local envs. An error has the results of the other envs."""
-        rows, faults = self._group.results_of(ids)
-        if faults:
-            faults[0].results, faults[0].others = self._batch_and_flags(rows)[0], tuple(faults[1:])
-            raise faults[0]
-        return rows
-
-    @_one_call
     def step_async(self, batched_policy_resp: Any) -> None:
         """Send a step to the envs of a batch; `collect_async` returns the results."""
-        if not self._group.pending.isdisjoint(batched_policy_resp.ids()):
-            self._group.settle()
-        self._send(batched_policy_resp)
+        steps, due = self._requests(batched_policy_resp)
+        # Steps come first: if they are refused, nothing was sent.
+        if steps is not None:
+            self._group.step_async(steps)
+        if due:
+            self._group.reset_async(env_ids=due)
 
-    @_one_call
     def collect_async(
         self, timeout: float | None = None, wait_all: bool = False
     ) -> tuple[Any, list[bool]]:
         """Wait for results of `step_async`, and return those that are ready with the first.
 
         Args:
-            timeout: seconds from now during which more results may join the first.
+            timeout: seconds after the first result during which more may join it.
             wait_all: wait for all results.
 
         If nothing was sent, return an empty batch and log a warning.
         """
         if timeout is not None and timeout <= 0:
             raise ValueError(f"timeout must be a positive number of seconds, not {timeout!r}")
-        if wait_all and timeout is not None:
-            warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=5)
-            timeout = None
-        end = time.monotonic() + (timeout or 0.0)
-        self._group.end_calls()
-        rows = self._group.take_kept()
-        if not rows and not self._group.pending and not self.env_servers:
-            _log.warning("collect_async: nothing was sent, so there is nothing to collect")
-            return self._batch_and_flags([])
-        try:
-            rows = rows or self._group.collected()
-            while wait_all and self._group.pending:
-                rows += self._group.collected(wait_all=True)
-            while self._group.pending and (left := end - time.monotonic()) > 0:
-                rows += self._within(left)
-        except BaseException:
-            self._group.keep(rows)
-            raise
-        self.throughput.record(
-            "env_throughput_async", self._num_steps(row.batch_id for row in rows)
-        )
-        return self._batch_and_flags(rows)
+        rows, in_flight = self._kept, bool(self._group.pending)
+        if not rows or (wait_all and in_flight):
+            if not in_flight and not self._servers:  # Whose clients may come by themselves.
+                _log.warning("collect_async: nothing was sent, so there is nothing to collect")
+                return _batch_and_flags([])
+            rows = [*rows, *self._collected(timeout=timeout, wait_all=wait_all and in_flight)]
+        self._kept = []
+        self._num_steps["async"] += len(rows)
+        return _batch_and_flags(rows)
 
-    def _num_steps(self, ids: Any) -> int:
-        return sum(self.id_to_num_envs[env_id] for env_id in ids)
+    def _requests(self, batch: Any) -> tuple[BatchedData | None, list[str]]:
+        """Return the steps of a batch, and the envs that the counter has at their limit instead.
 
-    def _send(self, batch: Any) -> None:
-        """Step the envs of `batch`, and reset those that the counter has at their limit."""
-        for env_id in batch.ids():
-            if env_id not in self.id_to_env:
-                raise UnknownEnv(f"no env of this group has the id {env_id!r}; nothing was sent")
-        counter = self.step_counter
-        due: list[str] = []
-        steps: list[tuple[str, Any]] = []
+        Envs that still owe a result are awaited.
+        """
+        counter, due = self.step_counter, list[str]()
+        steps: list[tuple[str, PolicyResponse]] = []
         for env_id, response in batch.items():
-            if env_id not in self._local_ids:
-                steps.append((env_id, self._group.for_client(env_id, response)))
-            elif counter is not None and counter.is_reached_max_steps(env_id):
-                due.append(env_id)
+            core_id = self._core_id_of.get(env_id)
+            if core_id is None:
+                raise UnknownEnv(f"no env of this group has the id {env_id!r}; nothing was sent")
+            if core_id in self._servers:
+                steps.append((core_id, _for_client(core_id, response)))
+                continue
+            if core_id in self._local_pending():
+                self._await([core_id])
+            if counter is not None and counter.is_reached_max_steps(env_id):
+                due.append(core_id)
             else:
-                steps.append((env_id, off_device(response)))
-        # Steps come first: if they are refused, nothing was sent.
-        if steps:
-            self._group.send_steps(steps)
-        self._group.send_resets(due)
+                steps.append((core_id, PolicyResponse(core_id, off_device(response))))
+        ids, responses = [core_id for core_id, _ in steps], [response for _, response in steps]
+        return (BatchedData(ids, responses) if steps else None), due
 
-    def _batch_and_flags(self, rows: list[ResultRow]) -> tuple[Any, list[bool]]:
-        """Return the batch of `rows`, and a flag for each env at its limit."""
-        batch = self._names.BatchedData([row.batch_id for row in rows], [row.ret for row in rows])
-        return batch, [row.at_limit for row in rows]
+    # -- results
+
+    def _local_pending(self) -> set[str]:
+        return set(self._group.pending).intersection(self._local)
+
+    def _await(self, core_ids: Iterable[str]) -> None:
+        """Wait for what envs owe, and keep it for `collect_async`."""
+        while not self._local_pending().isdisjoint(core_ids):
+            self._kept += self._collected()
+
+    def _collected(self, **how: Any) -> list[_Row]:
+        with self._own_ids([]):
+            return self._rows(self._group.collect_async(**how)[0])
+
+    def _rows(self, batch: BatchedData) -> list[_Row]:
+        """Translate results of our group, and count them."""
+        restarted, is_reset = batch.restarted.tolist(), batch.is_reset.tolist()
+        ours = batch.values() if self._servers else []  # They cost more than their columns.
+        rets: Any = [one.observation for one in ours] if self._servers else batch.observation
+        rows: list[_Row] = []
+        for k, (core_id, ret) in enumerate(zip(batch.ids(), rets, strict=True)):
+            if core_id in self._servers:
+                rows.append(self._row_of_client(core_id, ours[k]))
+                continue
+            if restarted[k]:
+                info = {**ret.info, **batch.info()[k]}
+                ret = dataclasses.replace(ret, last_truncated=True, info=info)  # noqa: PLW2901
+            env_id, counter = self._id_of[core_id], self.step_counter
+            at_limit = counter is not None and counter.count(env_id, is_reset=is_reset[k])
+            rows.append(_Row(env_id, ret, at_limit))
+        return rows
+
+    def _row_of_client(self, core_id: str, ours: Any) -> _Row:
+        env_id = self._own_id(ours.env_id)
+        fields: dict[str, Any] = {**vars(ours), "env_id": env_id, "_extra": ours._extra}
+        return _Row(self._id_of[core_id], named("EnvRet")(**fields))
+
+    def _own_id(self, core_id: str) -> str:
+        if core_id in self._id_of:
+            return self._id_of[core_id]
+        server_id, _, client = core_id.rpartition("/")
+        return f"{self._id_of[server_id]}/{client}"
+
+    @contextlib.contextmanager
+    def _own_ids(self, rows: list[_Row]) -> Generator[None]:
+        """Name envs in errors by RLightning's ids; their results are `rows` and their own."""
+        try:
+            yield
+        except EnvFault as fault:
+            if fault.results is not None:
+                rows += self._rows(fault.results)
+            fault.results = _batch_and_flags(rows)[0] if rows else None
+            for one in (fault, *fault.others):
+                one.env_id = self._own_id(one.env_id)
+                if isinstance(one, WorkerDied):
+                    one.env_ids = tuple(map(self._own_id, one.env_ids))
+            raise
 
     @contextlib.contextmanager
     def auto_reset(self, max_episode_steps: int | None = None) -> Generator[None]:
@@ -301,44 +305,45 @@ class EnvGroup:
         Raises:
             ValueError: the limit isn't a positive int, or it is None and an env has none.
         """
-        own: list[int | None] = self._group.call_all("of_env", "get_max_episode_steps", (), {})
-        limits = _limits(own, max_episode_steps)
-        self._group.begin_counting(EnvStepCounter(self._group.local_ids, limits))
+        limits = _limits(self.call_all("get_max_episode_steps"), max_episode_steps)
+        self.step_counter = EnvStepCounter([self._id_of[one] for one in self._local], limits)
         try:
             yield
         finally:
-            self._group.counter = None
+            self.step_counter = None
 
     # -- methods of the envs
 
-    def results_within(self, seconds: float | None) -> tuple[Any, ...]:
-        """Return results that arrive within `seconds`, for an env_server on its own."""
-        return tuple(row.ret for row in self._within(seconds))
-
-    def _within(self, seconds: float | None) -> list[ResultRow]:
-        """Return the first results that arrive within `seconds`."""
-        try:
-            return self._group.collected(deadline=seconds)
-        except EnvFault:
-            raise  # Among them those of envs that raised `TimeoutError`.
-        except TimeoutError:
+    def call_all(self, name: str) -> list[Any]:
+        """Call a method of all local envs at once. Return the values in the group's order."""
+        if not self._local:
             return []
+        self._await(self._local)
+        with self._own_ids([]):
+            return self._group.call("of_env", name, (), {}, env_ids=self._local)
+
+    def call_env(self, env_id: str, name: str, *args: Any) -> Any:
+        """Call a method of our env around a local env."""
+        core_id = self._core_id_of[env_id]
+        self._await([core_id])
+        with self._own_ids([]):
+            return self._group[core_id].call(name, *args)
 
     def offload(self) -> None:
         """Make every env free its device memory."""
-        self._group.call_all("of_env", "offload", (), {})
+        self.call_all("offload")
 
     def reload(self) -> None:
         """Make every env allocate its device memory again."""
-        self._group.call_all("of_env", "reload", (), {})
+        self.call_all("reload")
 
     def apply_evaluate_cfg(self) -> None:
         """Make every env apply its ``evaluate_cfg``."""
-        self._group.call_all("of_env", "apply_evaluate_cfg", (), {})
+        self.call_all("apply_evaluate_cfg")
 
     def restore_evaluate_cfg(self) -> None:
         """Make every env undo `apply_evaluate_cfg`."""
-        self._group.call_all("of_env", "restore_evaluate_cfg", (), {})
+        self.call_all("restore_evaluate_cfg")
 
     def close(self) -> None:
         """Close all envs and end their workers; idempotent."""
@@ -347,8 +352,9 @@ class EnvGroup:
     # -- statistics
 
     def get_stats(self) -> dict[str, float]:
-        """Return env steps per second of all groups: ``env_throughput_sync``, ``…_async``."""
-        return self.throughput.get_stats()
+        """Return results per second since the group was built, of `step` and of `collect_async`."""
+        seconds = time.monotonic() - self._began
+        return {f"env_throughput_{how}": n / seconds for how, n in self._num_steps.items() if n}
 
     def get_env_stats(self, reset: bool = False) -> dict[str, float]:
         """Return the mean of each metric in ``info["episode_info"]``; `reset` clears them."""
@@ -365,9 +371,95 @@ class EnvGroup:
         return {name: part / count for name, (part, count) in total.items() if count > 0}
 
     def print_timing_summary(self, reset: bool = False) -> None:
-        """Print the group's timing, and make each env log its own."""
+        """Print the group's timing."""
+        del reset  # Of RLightning's timers of methods.
         self._group.print_timing_summary()
-        self._group.call_all("of_env", "print_timing_summary", (reset,), {})
+
+
+class EnvStepCounter:
+    """Steps of each env's episode: -1 before the first reset, 0 after it.
+
+    Args:
+        env_ids: of all envs.
+        max_steps_list: the limit of each.
+    """
+
+    def __init__(self, env_ids: Sequence[str], max_steps_list: Sequence[int]) -> None:
+        self._limits = dict(zip(env_ids, max_steps_list, strict=True))
+        self._steps = dict.fromkeys(env_ids, -1)
+
+    def count(self, env_id: str, *, is_reset: bool) -> bool:
+        """Count one result of an env, at most to its limit; return True if that is reached."""
+        if is_reset:
+            self._steps[env_id] = -1
+        if not self.is_reached_max_steps(env_id):
+            self._steps[env_id] += 1
+        return self.is_reached_max_steps(env_id)
+
+    def get_steps(self, env_id: str) -> int:
+        """Return the count of an env."""
+        return self._steps[env_id]
+
+    def __getitem__(self, env_id: str) -> int:
+        return self._steps[env_id]
+
+    def is_reached_max_steps(self, env_id: str) -> bool:
+        """Return True if an env has reached its limit."""
+        return self._steps[env_id] == self._limits[env_id]
+
+
+class EnvHandle:
+    """A handle on an env: its methods are called, and its attributes read, in its worker."""
+
+    def __init__(self, group: EnvGroup, env_id: str) -> None:
+        self._group = group
+        self._env_id = env_id
+
+    def __getattr__(self, name: str) -> Any:
+        # `copy` and `pickle` look for special methods, which must not be found in the worker.
+        if name.startswith("__") or "_group" not in vars(self):
+            raise AttributeError(name)
+        is_method, value = self._group.call_env(self._env_id, "look", name)
+        if not is_method:
+            return value
+
+        def method(*args: Any, **kwargs: Any) -> Any:
+            return self._group.call_env(self._env_id, "of_env", name, args, kwargs)
+
+        return method
+
+
+class ServerHandle:
+    """A handle on an env_server, without access to its clients' envs."""
+
+    def __init__(self, ours: Any, env_id: str) -> None:
+        self._ours = ours
+        self.env_id = env_id
+
+    def get_address_port(self) -> tuple[str, int]:
+        """Return the host and port for clients."""
+        host, _, port = self._ours.address.removeprefix("tcp://").rpartition(":")
+        return host, int(port)
+
+    def get_env_stats(self, reset: bool = False) -> dict[str, list[float]]:
+        """Return no statistics: clients keep their own."""
+        del reset
+        return {}
+
+    def finish_rollout(self) -> None:
+        """Do nothing."""
+
+
+def _for_client(core_id: str, response: Any) -> PolicyResponse:
+    """Return `response` with arrays for tensors, addressed to our client."""
+    data = {name: as_numpy(value) for name, value in response.to_dict().items()}
+    return PolicyResponse(f"{core_id}/{response.env_id.rpartition('/')[2]}", **data)
+
+
+def _batch_and_flags(rows: list[_Row]) -> tuple[Any, list[bool]]:
+    """Return the batch of `rows`, and a flag for each env at its limit."""
+    batch = named("BatchedData")([row.batch_id for row in rows], [row.ret for row in rows])
+    return batch, [row.at_limit for row in rows]
 
 
 def _action_shape(meta: Any) -> tuple[int, ...] | None:
@@ -383,10 +475,6 @@ def _limits(own: list[int | None], given: int | None) -> list[int]:
         return [limit for limit in own if limit is not None]
     if not isinstance(given, int) or given <= 0:  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ValueError(f"max_episode_steps must be a positive int, not {given!r}")
-    if any(limit not in (None, given) for limit in own):
-        warnings.warn(
-            f"auto_reset(max_episode_steps={given}) overrides the envs' own limits", stacklevel=4
-        )
     return [given] * len(own)
 
 
@@ -394,14 +482,20 @@ def build_env_group(env_cfgs: Any, preprocess_fn: Any = default_env_preprocess_f
     """Build the configured envs and return their group.
 
     Args:
-        env_cfgs: one `EnvConfig`, or a list of them; each makes ``num_workers`` envs.
+        env_cfgs: one `EnvConfig` or mapping, or a list of them; each makes ``num_workers`` envs.
         preprocess_fn: one for all, or a list with one for each config.
     """
-    configs = listed_configs(env_cfgs)
-    fns = repeated(preprocess_fn, len(configs))
+    given = _listed(env_cfgs, 1)
+    configs = [one if hasattr(one, "backend") else EnvConfig.from_dict(one) for one in given]
     copies: list[Any] = []
     own_fns: list[Any] = []
-    for config, fn in zip(configs, fns, strict=True):
-        copies += define_env_instance_cfgs(config, config.num_workers)
+    for config, fn in zip(configs, _listed(preprocess_fn, len(configs)), strict=True):
+        # Copied, so that a config that is given twice makes two entries.
+        copies += [config.model_copy(deep=True)] * config.num_workers
         own_fns += [fn] * config.num_workers
     return EnvGroup(copies, own_fns)
+
+
+def _listed(value: Any, count: int) -> list[Any]:
+    """Return `value` if it is a list, else a list that repeats it."""
+    return cast("list[Any]", value) if isinstance(value, list) else [value] * count

@@ -8,30 +8,32 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import re
+import itertools
+import uuid
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio import Anything, BaseEnv, EnvConfig, EnvRet
-from rlightning_aio.plugins.legacy.names import names_in_use
-from rlightning_aio.plugins.legacy.tensors import on_cpu
-from rlightning_aio.trees import holds_tensor
+from rlightning_aio import ENVS, Anything, BaseEnv, EnvConfig, EnvRet
+from rlightning_aio.plugins.legacy.names import make_importable, named
+from rlightning_aio.trees import converted, holds_tensor, is_tensor
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rlightning_aio import PolicyResponse
 
-__all__ = ["ARGUMENTS", "EnvMaker", "HostedEnv", "off_device"]
+__all__ = ["ARGUMENTS", "SERVER", "EnvMaker", "HostedEnv", "entries_of", "off_device"]
 
 ARGUMENTS: Final = "rlightning"
 """Key in a reset's options for the arguments of RLightning's `reset`."""
+SERVER: Final = "env_server"
+_PASSED_ON: Final = (
+    "placement", "envs_per_process", "step_timeout", "reset_timeout", "start_timeout",
+    "close_timeout", "on_worker_death", "on_env_error", "max_restarts", "imports", "interpreter",
+    "env_vars",
+)  # fmt: skip
+"""Fields of our entries that RLightning lacks and that its entries may have here, too."""
 
-_MADE_ID: Final = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}-")
-
-
-class _Finder:
-    """Makes ``import rlightning`` work where it is unpickled."""
-
-    def __reduce__(self) -> Any:
-        return names_in_use, ()
+make_importable()  # Unpickling an `EnvMaker` imports this module before it needs those names.
 
 
 @dataclasses.dataclass
@@ -43,7 +45,7 @@ class EnvMaker:
         config: the entry, an `EnvConfig` of RLightning's.
         worker_index: the env's position in its group.
         preprocess_fn: the preprocess function, or None.
-        env_id: the id that `BaseEnv` made, to be kept after a restart.
+        env_id: of the env, also after a restart.
         computes: its steps are known to keep a core busy.
     """
 
@@ -59,18 +61,8 @@ class EnvMaker:
         env = self.kind(
             self.config, worker_index=self.worker_index, preprocess_fn=self.preprocess_fn
         )
-        if _MADE_ID.match(str(env.env_id)):
-            env.env_id = self.env_id
+        env.env_id = self.env_id
         return HostedEnv(env)
-
-    def __reduce__(self) -> Any:
-        # The first argument is unpickled first, and the others may need RLightning's names.
-        values = tuple(getattr(self, field.name) for field in dataclasses.fields(self))
-        return _unpickled, (_Finder(), *values)
-
-
-def _unpickled(_names: Any, *values: Any) -> EnvMaker:
-    return EnvMaker(*values)
 
 
 class HostedEnv(BaseEnv):
@@ -91,8 +83,6 @@ class HostedEnv(BaseEnv):
     def get_action_space(self) -> Anything:
         return Anything()
 
-    # -- steps
-
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
@@ -102,8 +92,6 @@ class HostedEnv(BaseEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         return EnvRet(env_id=self.env_id, observation=self.env._step(policy_resp.action))  # noqa: SLF001
-
-    # -- other calls
 
     def look(self, name: str) -> tuple[bool, Any]:
         """Return (True, None) if RLightning's env has a method `name`, else (False, its value)."""
@@ -119,11 +107,71 @@ class HostedEnv(BaseEnv):
 
 
 def off_device(response: Any) -> Any:
-    """Return `response`, or a copy of it with its tensors on the CPU."""
+    """Return `response`, or a copy of it with its tensors on the CPU, where they can be pickled."""
     data: dict[str, Any] = response.__dict__
     if not holds_tensor(data):
         return response
     moved = copy.copy(response)
     for name, value in data.items():
-        setattr(moved, name, on_cpu(value))
+        on_cpu = converted(lambda one: one.detach().cpu() if is_tensor(one) else one, value)
+        setattr(moved, name, on_cpu)
     return moved
+
+
+def entries_of(
+    configs: Sequence[Any], preprocess_fns: Sequence[Any]
+) -> list[tuple[EnvConfig, list[str]]]:
+    """Turn RLightning's configs, one for each env, into entries of ours and ids of RLightning's.
+
+    Local envs come first, then env_servers. Equal neighbours of one config are one entry.
+    """
+    registry, taken = named("ENVS"), set[str]()
+    found: list[tuple[EnvConfig, list[str]]] = []
+    makers = [
+        EnvMaker(registry.get(config.backend), config, k, preprocess_fns[k], f"{uuid.uuid4()}-{k}")
+        for k, config in enumerate(configs)
+        if config.backend != SERVER
+    ]
+    # Replicas of an entry are one object in RLightning.
+    for _, alike in itertools.groupby(makers, lambda maker: id(maker.config)):
+        replicas = list(alike)
+        entry = _local_entry(_new_name(replicas[0].config.name, taken), replicas)
+        found.append((entry, [maker.env_id for maker in replicas]))
+    for k, config in enumerate(config for config in configs if config.backend == SERVER):
+        arguments: dict[str, Any] = config.env_kwargs.to_dict()
+        port = config.get("zmq_port")
+        if port is not None:
+            arguments.setdefault("port", int(port))
+        name, fields = _new_name(config.name, taken), _passed_on(config)
+        entry = EnvConfig(name=name, backend=SERVER, env_kwargs=arguments, **fields)
+        found.append((entry, [f"{uuid.uuid4()}-{len(makers) + k}"]))
+    return found
+
+
+def _local_entry(name: str, replicas: list[EnvMaker]) -> EnvConfig:
+    backend = ENVS.described(replicas[0].config.backend)
+    fields = _passed_on(replicas[0].config)
+    if fields.get("placement") != "inline":
+        if backend is None or not backend.cpu_bound:
+            fields.setdefault("envs_per_process", 1)
+        for maker in replicas:
+            maker.computes = backend is not None and backend.cpu_bound
+        if backend is not None and backend.hardware:
+            fields.setdefault("on_worker_death", "raise")
+    return EnvConfig(name=name, backend="callable", task=tuple(replicas), **fields)
+
+
+def _new_name(wanted: str, taken: set[str]) -> str:
+    """Return an entry's name, made unique, because RLightning's entries may share one."""
+    name = f"{wanted}~{len(taken) + 1}" if wanted in taken else wanted
+    taken.add(name)
+    return name
+
+
+def _passed_on(config: Any) -> dict[str, Any]:
+    given = {name: config.get(name) for name in _PASSED_ON}
+    return {
+        name: value.to_dict() if hasattr(value, "to_dict") else value
+        for name, value in given.items()
+        if value is not None
+    }

@@ -1,4 +1,4 @@
-"""RLightning's client and server of remote envs, over our own wire format, without pickle.
+"""RLightning's client of an env_server, over our own wire format, without pickle.
 
 Both ends must run this code: RLightning's own client uses another format.
 """
@@ -15,19 +15,16 @@ import numpy as np
 
 from rlightning_aio import BaseEnv as OurEnv
 from rlightning_aio import EnvConfig, EnvRet, PolicyResponse
-from rlightning_aio.plugins.legacy.env import BaseEnv
-from rlightning_aio.plugins.legacy.group import EnvGroup
-from rlightning_aio.plugins.legacy.names import names_in_use
-from rlightning_aio.plugins.legacy.registry import ENVS
+from rlightning_aio.plugins.legacy.names import named
 from rlightning_aio.remote import RemoteEnvClient as OurClient
 from rlightning_aio.trees import as_numpy
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-__all__ = ["RemoteEnvClient", "RemoteEnvServer"]
+__all__ = ["RemoteEnvClient"]
 
 _ANY_ACTION: Final = gym.spaces.Box(-np.inf, np.inf, (), np.float32)
 """Announced by an env without an action space."""
@@ -68,7 +65,8 @@ class _DialledEnv(OurEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         data = {"action": policy_resp.action, **policy_resp.extras}
-        return self._as_ours(self.env._step(_response(self.env.env_id, **data)))  # noqa: SLF001
+        response = named("PolicyResponse")(self.env.env_id, **data)
+        return self._as_ours(self.env._step(response))  # noqa: SLF001
 
     def _as_ours(self, ret: Any) -> EnvRet:
         return EnvRet(
@@ -93,10 +91,6 @@ class _DialledEnv(OurEnv):
         """Do nothing: RLightning's client leaves its env open, to serve again."""
 
 
-def _response(env_id: str, **data: Any) -> Any:
-    return names_in_use().PolicyResponse(env_id, **data)
-
-
 def _space_around(observation: Any) -> gym.Space[Any]:
     """Return an unbounded space for observations like this one."""
     if isinstance(observation, dict):
@@ -119,16 +113,11 @@ class RemoteEnvClient:
     Args:
         env: stepped on the caller's thread.
         hostname, port: of the env_server.
-
-    Attributes:
-        zmq_identity: its name on the server; None before `connect`.
     """
 
     def __init__(self, env: Any, hostname: str, port: int) -> None:
         self.env = env
-        self.hostname = hostname
-        self.port = int(port)
-        self.zmq_identity: str | None = None
+        self._address = hostname, int(port)
         self._name = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
         self._client: OurClient | None = None
 
@@ -139,10 +128,7 @@ class RemoteEnvClient:
         result in `run`, and its `reset` waits for that.
         """
         if self._client is None:
-            self._client = OurClient(
-                _DialledEnv(self.env), self.hostname, self.port, name=self._name
-            )
-        self.zmq_identity = self._client.name
+            self._client = OurClient(_DialledEnv(self.env), *self._address, name=self._name)
         self._client.connect()
 
     def run(self) -> None:
@@ -160,67 +146,3 @@ class RemoteEnvClient:
         client, self._client = self._client, None
         if client is not None:
             client.close()
-
-
-class RemoteEnvServer(BaseEnv):
-    """An env_server on its own, without a group."""
-
-    max_envs = 32
-
-    def __init__(
-        self,
-        config: Any,
-        worker_index: int | None = 0,
-        preprocess_fn: Any = None,
-        **kwargs: Any,
-    ) -> None:
-        del kwargs  # Accepted so that subclasses can pass on all their arguments.
-        super().__init__(config, worker_index, preprocess_fn)
-        self._group: EnvGroup | None = None
-
-    @property
-    def _listening(self) -> EnvGroup:
-        if self._group is None:
-            raise RuntimeError("this env_server is not listening yet; call init() first")
-        return self._group
-
-    def init(self) -> None:
-        """Start listening."""
-        self._group = EnvGroup([self.config])
-        self.env_id = self._group.env_ids[0]
-
-    def get_address_port(self) -> tuple[str, int]:
-        """Return the host and port for clients."""
-        return self._listening.env_servers[0].get_address_port()
-
-    def reset(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Wait for clients, and return the first result of each."""
-        batch, _ = self._listening.reset(*args, **kwargs)
-        return batch.values()
-
-    def step(self, policy_resp: Any) -> Any:
-        raise NotImplementedError("an env_server has no synchronous step; use step_async")
-
-    def step_async(self, policy_resp_list: Sequence[Any]) -> None:
-        """Send each response to its client."""
-        responses = list(policy_resp_list)
-        batch = names_in_use().BatchedData([self.env_id] * len(responses), responses)
-        self._listening.step_async(batch)
-
-    def collect_async(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Return results; wait for the first, at most `timeout` seconds."""
-        return self._listening.results_within(timeout)
-
-    def get_observation_space(self) -> Any:
-        """Return None: only its clients' envs have spaces."""
-
-    def get_action_space(self) -> Any:
-        """Return None: only its clients' envs have spaces."""
-
-    def close(self) -> None:
-        group, self._group = self._group, None
-        if group is not None:
-            group.close()
-
-
-ENVS.provide("env_server", RemoteEnvServer)
