@@ -1,8 +1,8 @@
 """Groups of attempts: agents that are coroutines play each task several times.
 
 Rule: it uses only the public `EnvGroup`. An attempt that fails has no reward, but an `Outcome`.
-`queue` decides which env plays what next, and `waiting` of which task; `evaluation` plays the same
-queue with a policy in place of an agent.
+`queue` decides which env plays what next; `evaluation` plays the same queue with a policy in place
+of an agent.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import numpy as np
 
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
-from rlightning_aio.errors import EnvFault, GroupClosed, WorkerDied
+from rlightning_aio.errors import EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
@@ -118,9 +118,8 @@ class PolicyPlay:
 
     def abandon(self) -> Procedure[None]:
         """End what was sent, after an error: the group is idle then."""
-        with contextlib.suppress(EnvFault, GroupClosed):  # Those envs' episodes are lost anyway.
-            if self._group.pending:
-                yield partial(self._group.drain, _PATIENCE_SECONDS)
+        with contextlib.suppress(RLightningError):  # Of envs whose episodes are lost anyway.
+            yield partial(self._group.drain, _PATIENCE_SECONDS)
 
     def close(self) -> None:
         """Delete the films of episodes that have no end."""
