@@ -1,4 +1,4 @@
-"""What adapters to other interfaces need of a group: calls in two halves, several calls in one.
+"""What adapters to other interfaces need of a group: calls in two halves, and which resets are due.
 
 Users have `group.call`, which sends and waits. Left out: which methods envs have.
 """
@@ -6,30 +6,19 @@ Users have `group.call`, which sends and waits. Left out: which methods envs hav
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.group.api.facade import check_seconds
-from rlightning_aio._core.group.api.sync import driver_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.sync import EnvGroup
 
-__all__ = ["collect_calls", "due_for_reset", "in_one_call", "send_calls"]
-
-T = TypeVar("T")
-
-
-def in_one_call(group: EnvGroup, function: Callable[[], T]) -> T:
-    """Call a function that calls methods of a synchronous group, as one call of the group.
-
-    Ctrl-C interrupts it only where it waits, so that it takes no result.
-    """
-    return driver_of(group).call(function)
+__all__ = ["collect_calls", "due_for_reset", "send_calls"]
 
 
 def send_calls(
