@@ -224,13 +224,61 @@ class AwaitedCasting(Awaitable):
         super().__init__(Casting)
 
 
-class Narrow(Plays):
-    """Returns one array of float64 where its space has float32."""
+class Beyond(Plays):
+    """Counts its steps, although its space ends at 1."""
 
-    observation_space = gym.spaces.Box(-1, 1, (2,))
+    observation_space = gym.spaces.Box(0, 1, (1,))
 
     def observed(self) -> Any:
-        return np.full(2, 0.5)
+        return np.full(1, min(self.steps, 2), np.float32)
+
+
+class Exclusive(Plays):
+    """Only one of them may be open."""
+
+    observation_space = gym.spaces.Discrete(9)
+
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        self._lock = Path(folder, "lock")
+        self._lock.mkdir()
+
+    def observed(self) -> Any:
+        return self.steps
+
+    def close(self) -> None:
+        self._lock.rmdir()
+
+
+class Masked(Plays):
+    """Allows one action at a time, and refuses all others."""
+
+    def __init__(self, where: str = "info", render_mode: str | None = None) -> None:
+        super().__init__()
+        self.render_mode = render_mode
+        self.action_space = gym.spaces.Discrete(4, start=1)
+        mask = gym.spaces.MultiBinary(4)
+        number = gym.spaces.Discrete(9)
+        self._in_info = where == "info"
+        self.observation_space = (
+            number if self._in_info else gym.spaces.Dict({"n": number, "action_mask": mask})
+        )
+
+    def _mask(self) -> Any:
+        return np.eye(4, dtype=np.int8)[self.steps % 4]
+
+    def does(self, action: Any) -> float:
+        assert action == 1 + self.steps % 4, "a forbidden action"
+        return 1.0
+
+    def observed(self) -> Any:
+        return self.steps if self._in_info else {"n": self.steps, "action_mask": self._mask()}
+
+    def told(self) -> dict[str, Any]:
+        return {"action_mask": self._mask()} if self._in_info else {}
+
+
+gym.register("cli/Masked-v0", Masked)
 
 
 class Careless(Plays):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cli.command import invoke, invoke_json, write_config
 
-from rlightning_aio.cli.bench import settings
+from rlightning_aio.cli import settings
 from rlightning_aio.config import load_config
 from rlightning_aio.spaces import Anything
 

@@ -1,8 +1,9 @@
-"""``check`` tries a config's envs; ``tasks`` lists tasks of a backend."""
+"""``check`` tries a config's envs."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import json
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
@@ -45,15 +46,11 @@ def test_check_fails_if_an_env_fails(tmp_path: Path) -> None:
     assert "the floor is missing" in done.stderr
 
 
-def test_tasks_lists_the_tasks_of_a_backend() -> None:
-    """A backend without a list, and an unknown one, raise an error."""
-    assert "CartPole-v1" in invoke("backends", "gymnasium").stdout.splitlines()
-    assert "HalfCheetah-v5" in invoke_json("backends", "mujoco")
-    assert "HalfCheetah-v5" not in invoke_json("backends", "gymnasium")
-    for name, said in (("callable", "has no list"), ("mujuco", "did you mean 'mujoco'")):
-        done = invoke("backends", name)
-        assert done.exit_code == 2
-        assert said in done.stderr
+def failed(*words: object) -> Any:
+    """Run the command, which finds something; return its document."""
+    done = invoke("check", *words, "--json")
+    assert done.exit_code == 1, done.stderr
+    return json.loads(done.stdout)["entries"]
 
 
 def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
@@ -61,19 +58,26 @@ def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
     careless = {"name": "bad", "backend": "callable", "task": "cli.stub_envs:Careless"}
     config = write_config(tmp_path, INLINE, {**careless, "placement": "inline"})
     try:
-        found = invoke_json("check", config, "--steps", "80")["entries"]
+        good, bad = failed(config, "--steps", "80")
         text = invoke("check", config, "--steps", "80").stdout
     finally:
         while Careless.files:
             Careless.files.pop().close()
-    good, bad = [each["trial"] for each in found]
     assert good["problems"] == []
     assert bad["episodes"] >= 10
-    rewards, seed, *leaks = bad["problems"]
+    rewards, *leaks, seed = bad["problems"]
     assert "rewards are NaN" in rewards
     assert "differ from the reset on" in seed
     assert any("more open descriptors after" in leak for leak in leaks)
     assert "problem: none found" in text
+    assert "placement" not in text
+
+
+def test_a_sound_env_is_code_0(tmp_path: Path) -> None:
+    """The document has the time of a step."""
+    (found,) = invoke_json("check", write_config(tmp_path, INLINE), "--steps", "80")["entries"]
+    assert found["step_us"] > 0
+    assert invoke_json("check", write_config(tmp_path, INLINE))["entries"][0]["step_us"] is None
 
 
 @pytest.mark.parametrize(
@@ -83,25 +87,23 @@ def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
 def test_check_names_observations_that_are_cast(env: str, placement: str, tmp_path: Path) -> None:
     """It says which part, from what to what, and whether numbers were rounded."""
     entry = {"name": "c", "backend": "callable", "task": f"cli.stub_envs:{env}"}
-    config = write_config(tmp_path, {**entry, "placement": placement})
-    (found,) = invoke_json("check", config, "--steps", "20")["entries"]
-    casts = {cast.pop("part"): cast for cast in found["trial"]["casts"]}
-    narrow = {"found": "float64", "expected": "float32", "rounds": True}
-    assert casts == {
-        "observation['pose']": narrow,
-        "observation['count']": {"found": "int64", "expected": "int32", "rounds": False},
-        "observation['list']": {"found": "list", "expected": "float32", "rounds": False},
-    }
-    assert found["trial"]["problems"] == []
+    (found,) = failed(write_config(tmp_path, {**entry, "placement": placement}), "--steps", "20")
+    said = [problem.partition(";")[0] for problem in found["problems"]]
+    free = "no number changes, but it takes time"
+    assert said == [
+        f"observation['count'] is converted from int64 to int32: {free}",
+        f"observation['list'] is converted from list to float32: {free}",
+        "observation['pose'] is converted from float64 to float32: numbers are rounded",
+    ]
 
 
-def test_check_says_casts_in_words(tmp_path: Path) -> None:
-    """An env whose dtypes are right has no such line."""
-    entry = {"name": "c", "backend": "callable", "task": "cli.stub_envs:Narrow"}
-    narrow = {**entry, "placement": "inline", "max_episode_steps": 5}
-    lines = invoke("check", write_config(tmp_path, INLINE, narrow), "--steps", "9").stdout
-    (line,) = [line for line in lines.splitlines() if "cast" in line]
-    assert line == (
-        "  cast: observation from float64 to float32: no number changes, but it takes time; "
-        "return arrays of float32, or declare a space of another dtype"
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_check_names_numbers_outside_of_the_space(tmp_path: Path, placement: str) -> None:
+    """As the env returns them."""
+    entry = {"name": "c", "backend": "callable", "task": "cli.stub_envs:Beyond"}
+    (found,) = failed(write_config(tmp_path, {**entry, "placement": placement}), "--steps", "20")
+    (problem,) = found["problems"]
+    assert problem == (
+        "an observation holds 2.0, and the space goes from 0.0 to 1.0: clip it, or declare a "
+        "wider space"
     )

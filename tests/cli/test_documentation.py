@@ -7,7 +7,7 @@ import shlex
 from typing import TYPE_CHECKING
 
 import pytest
-from cli.command import TESTS, invoke
+from cli.command import TESTS, invoke, run
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -48,8 +48,13 @@ def test_every_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     # Shorter runs with fewer envs save time.
     short = SHORT.get(shlex.split(line)[1], [])
-    done = invoke(*shlex.split(line)[1:], *short)
-    assert done.exit_code == 0, done.stderr
+    words = [*shlex.split(line)[1:], *short]
+    if words[0] == "bench":  # It forks, which is for a process of its own.
+        done = run(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    else:
+        done = invoke(*words)
+        assert done.exit_code == 0, done.stderr
 
 
 def test_commands_that_cannot_run_are_console_blocks() -> None:

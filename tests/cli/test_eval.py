@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
-from timelines import Seen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -145,26 +143,16 @@ def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
     assert len(invoke_json("eval", config, "--episodes", 60, "--resume", file)["attempts"]) == 180
 
 
-def test_eval_draws_films_and_traces(tmp_path: Path) -> None:
-    """The timeline has each episode from its reset on."""
+def test_eval_draws_and_films(tmp_path: Path) -> None:
+    """The film is that of the first episode."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2})
-    plot, films, trace = tmp_path / "plot.png", tmp_path / "films", tmp_path / "run.json"
-    drawing = ("--plot", plot, "--trace", trace, "--json")
+    plot, films = tmp_path / "plot.png", tmp_path / "films"
     # In a process of its own, because matplotlib keeps its fonts open.
-    done = run("eval", config, "--episodes", 3, "--seed", 0, *drawing, "--video", films)
+    done = run("eval", config, "--episodes", 3, "--seed", 0, "--plot", plot, "--video", films)
     assert done.returncode == 0, done.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
     (film,) = films.iterdir()
     assert film.name.endswith("-seed-0-judged-0-episode-0.mp4")
-    seen = Seen(trace)
-    played = Counter(one["env_id"] for one in json.loads(done.stdout)["attempts"])
-    for env_id, count in played.items():
-        lasted = [one.name for one in seen.of(env_id)]
-        assert lasted[0] == "reset"
-        assert lasted.count("reset") >= count == 3
-    assert seen.called("policy")
-    absent = tmp_path / "absent" / "run.json"
-    assert "there is no folder" in refused(config, "--trace", absent)
 
 
 def refused(*words: object) -> str:
@@ -177,13 +165,9 @@ def refused(*words: object) -> str:
 def test_wrong_options_are_refused_at_once(tmp_path: Path) -> None:
     """The message names the option and the fix."""
     config = write_config(tmp_path, POLE)
-    assert "there is no such file" in refused(config, "--policy", "absent.zip")
-    assert "--algo is for a model" in refused(config, "--algo", "PPO")
     assert "can't be written" in refused(config, "--resume", tmp_path / "absent" / "file")
-    (tmp_path / "zip.zip").write_text("nothing")
-    assert "name it with --algo" in refused(config, "--policy", tmp_path / "zip.zip")
     server = write_config(tmp_path, {"name": "robots", "backend": "env_server"})
-    assert "'robots'), backend: clients of an env_server come and go" in refused(server)
+    assert "robots-0 is an env_server" in refused(server)
 
 
 def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:
@@ -199,38 +183,6 @@ def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:
         file.write_text(text)
         assert "is not a file of results" in refused(config, "--resume", file)
         assert file.read_text() == text
-
-
-@pytest.mark.simulators
-@pytest.mark.parametrize(("algorithm", "together"), [("PPO", False), ("A2C", False), ("DQN", True)])
-def test_a_model_of_stable_baselines3(tmp_path: Path, algorithm: str, together: bool) -> None:
-    """Its algorithm is found in the file, and episodes equal those of the model alone."""
-    sb3 = pytest.importorskip("stable_baselines3")
-    import gymnasium as gym
-
-    model = getattr(sb3, algorithm)("MlpPolicy", "CartPole-v1", seed=1, device="cpu")
-    model.save(tmp_path / "model.zip")
-    lengths = []
-    for seed in range(3):
-        env = gym.make("CartPole-v1")
-        observation, _ = env.reset(seed=seed)
-        done, steps = False, 0
-        while not done:
-            action, _ = model.predict(observation, deterministic=True)
-            observation, _, terminated, truncated, _ = env.step(action)
-            done, steps = terminated or truncated, steps + 1
-        lengths.append(steps)
-    poles = {"name": "poles", "task": "cli.judged_env:poles", "placement": "inline"}
-    config = write_config(tmp_path, poles if together else POLE)
-    asked = ("--policy", tmp_path / "model.zip", "--episodes", 1, "--seed", 0)
-    found = invoke_json("eval", config, *asked)["attempts"]
-    found.sort(key=lambda one: (one["env_id"], one["sub_env"]))
-    assert [one["length"] for one in found] == lengths
-    pendulum = {**POLE, "name": "pendulum", "task": "Pendulum-v1"}
-    other = write_config(tmp_path, pendulum)
-    assert "those of env 'pendulum-0' are Box" in refused(other, *asked)
-    assert "no such algorithm" in refused(config, *asked, "--algo", "PQN")
-    assert "can't be loaded as SAC" in refused(config, *asked, "--algo", "SAC")
 
 
 # -- a queue of episodes ----------------------------------------------------------------
@@ -256,29 +208,6 @@ def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
         (task, seed) for task in "abc" for seed in range(4)
     ]
     assert (document["by"], document["episodes"], document["failed"]) == ("task", 12, 0)
-
-
-def test_a_file_names_the_episodes(tmp_path: Path) -> None:
-    """Without a task it is the entry's; with several entries each names its own. JSON may hold
-    what Unicode calls the end of a line.
-    """
-    config = write_config(tmp_path, JUDGED, STUB)
-    file = tmp_path / "episodes.jsonl"
-    odd = '{"entry": "stub", "seed": 1, "options": {"note": "a\u2028b"}}'
-    file.write_text(f'{{"entry": "judged", "seed": 2}}\n\n{odd}\n', encoding="utf-8")
-    document = invoke_json("eval", config, "--episodes-file", file)
-    played = {(one["entry"], one["task"], one["seed"]) for one in document["attempts"]}
-    assert played == {("judged", JUDGED["task"], 2), ("stub", "any", 1)}
-    both = invoke_json("eval", config, "--seeds", "5,7")["attempts"]
-    assert len(both) == 4
-    for text, words in (
-        ("[1]\n", "line 1: "),
-        ('\n{"task": "any"}\n', "line 2: "),
-        ('{"seed": "1"}\n', "the seed must be an int"),
-        ("", "has no episodes"),
-    ):
-        file.write_text(text)
-        assert words in refused(config, "--episodes-file", file)
 
 
 def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
@@ -312,7 +241,9 @@ def test_a_film_that_cannot_be_kept_ends_it_with_one_message(tmp_path: Path) -> 
     asked = ("--tasks", "a,b", "--seeds", 1, "--video", films, "--json")
     done = run("eval", config, *asked)
     assert done.returncode == 2
-    assert f"error: --video {films}: can't be written: it is no regular file" in done.stderr
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
+    assert "it is no regular file" in line
+    assert str(films) in line
     assert "Traceback" not in done.stderr
     assert [one["task"] for one in json.loads(done.stdout)["attempts"]] == ["a"]
 
@@ -325,8 +256,7 @@ def test_wrong_options_of_a_queue_are_refused(tmp_path: Path) -> None:
         (("--seeds", "3:1"), "should look like 0:50 or 1,2,5"),
         (("--seeds", "a"), "should look like 0:50 or 1,2,5"),
         (("--seeds", 2**62), "should look like 0:50 or 1,2,5"),
-        (("--seeds", "0:2", "--episodes", 3), "--episodes is for a number of episodes"),
-        (("--seeds", "0:2", "--episodes-file", config), "leave --tasks and --seeds out"),
+        (("--seeds", "0:2", "--episodes", 3), "--episodes and --seed are for a number"),
         (("--seeds", "1,1"), "the queue has"),
     ):
         assert text in refused(config, *words)

@@ -97,7 +97,7 @@ def test_ctrl_c_while_results_are_always_ready(tmp_path: Path, placement: str) -
         stdout, _ = interrupt(child)
     document = json.loads(stdout)
     assert document["interrupted"]
-    assert document["steps"] == document["entries"][0]["steps"]
+    assert document["steps"] == document["metrics"]["envs/steps"]
 
 
 @pytest.mark.parametrize("calls", [300, 50_000, 150_000])

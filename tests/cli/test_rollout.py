@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
 
 
-def test_rollout_prints_a_line_for_each_entry(tmp_path: Path) -> None:
+def test_rollout_prints_the_numbers_of_each_entry(tmp_path: Path) -> None:
     """It collects exactly the given number of steps, from workers."""
     config = write_config(
         tmp_path,
@@ -26,10 +26,14 @@ def test_rollout_prints_a_line_for_each_entry(tmp_path: Path) -> None:
     done = run("rollout", config, "--steps", 1234)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("1,234 steps in ")
-    lines = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
-    assert int(lines["pole"][2]) + int(lines["short"][2]) == 1234
-    assert lines["pole"][1] == "3"
-    assert float(lines["short"][6]) <= 7
+    assert done.stdout.splitlines()[1].split() == ["all", "pole", "short"]
+    lines = [line.split() for line in done.stdout.splitlines()[2:]]
+    numbers = {line[0]: line[1:] for line in lines}
+    whole, pole, short = (int(text.replace(",", "")) for text in numbers["steps"])
+    assert pole + short == whole == 1234
+    assert numbers["envs"] == ["5", "3", "2"]
+    assert float(numbers["episode_length_mean"][2]) <= 7
+    assert "outcomes_env_died" not in numbers
     assert "Traceback" not in done.stderr
 
 
@@ -38,11 +42,14 @@ def test_stdout_is_one_json_document(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
     done = run("rollout", config, "--steps", 500, "--json")
     document = json.loads(done.stdout)
-    (entry,) = document["entries"]
+    numbers = document["metrics"]
     assert (document["steps"], document["interrupted"]) == (500, False)
-    assert (entry["name"], entry["envs"], entry["steps"]) == ("pole", 2, 500)
-    assert entry["mean_return"] == entry["mean_length"] > 1
-    assert entry["step_us"]["p50"] <= entry["step_us"]["p99"]
+    assert (numbers["envs/steps"], numbers["envs/pole/steps"], numbers["envs/envs"]) == (
+        500,
+        500,
+        2,
+    )
+    assert numbers["envs/episode_return_mean"] == numbers["envs/episode_length_mean"] > 1
     assert document["steps_per_second"] == pytest.approx(500 / document["seconds"])
     assert "collecting 500 steps" in done.stderr
 
@@ -74,7 +81,7 @@ def test_overrides_change_the_config(tmp_path: Path) -> None:
     """They follow the file on the command line."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
     document = invoke_json("rollout", config, "envs.0.num_workers=5", "--steps", 50)
-    assert document["entries"][0]["envs"] == 5
+    assert document["metrics"]["envs/envs"] == 5
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
@@ -92,7 +99,7 @@ def test_resets_are_not_counted_as_steps(
     assert document["steps"] == 90
     # Steps that were sent but not collected may have been executed or not.
     assert 90 <= Stub.steps <= 90 + 3 * num_envs
-    assert document["entries"][0]["episodes"] <= 90 // episode_length
+    assert document["metrics"]["envs/outcomes_terminated"] <= 90 // episode_length
 
 
 def test_configured_step_limits_end_episodes(tmp_path: Path) -> None:
@@ -111,8 +118,8 @@ def test_a_seed_repeats_a_rollout(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 3, "placement": "inline"})
 
     def episodes(seed: int) -> tuple[int, float]:
-        (entry,) = invoke_json("rollout", config, "--steps", 600, "--seed", seed)["entries"]
-        return entry["episodes"], entry["mean_return"]
+        numbers = invoke_json("rollout", config, "--steps", 600, "--seed", seed)["metrics"]
+        return numbers["envs/outcomes_terminated"], numbers["envs/episode_return_mean"]
 
     assert episodes(3) == episodes(3)
     assert episodes(3) != episodes(4)
@@ -126,8 +133,7 @@ def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
         *("rollout", config, "imports=[]", "--steps", 200, "--policy", "one_sided:left", "--json"),
         cwd=tmp_path,
     )
-    (entry,) = json.loads(done.stdout)["entries"]
-    assert 8 <= entry["mean_length"] <= 11
+    assert 8 <= json.loads(done.stdout)["metrics"]["envs/episode_length_mean"] <= 11
 
 
 def test_a_policy_may_return_a_batch_of_responses(tmp_path: Path) -> None:
@@ -182,4 +188,23 @@ def test_random_actions_fit_entries_with_different_spaces(tmp_path: Path) -> Non
         {**pendulum, "placement": "inline", "num_workers": 2},
     )
     document = invoke_json("rollout", config, "--steps", 300)
-    assert all(entry["steps"] > 50 for entry in document["entries"])
+    numbers = document["metrics"]
+    assert min(numbers[f"envs/{name}/steps"] for name in ("pole", "pendulum")) > 50
+
+
+@pytest.mark.parametrize("name", ["model", "by_entry"])
+def test_a_policy_may_be_what_evaluate_takes(tmp_path: Path, name: str) -> None:
+    """A model with `predict`, or a dict with one policy for each entry."""
+    words = ("--policy", f"cli.stub_policies:{name}", "--json")
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "placement": "inline"})
+    numbers = json.loads(invoke("rollout", config, "--steps", 100, *words).stdout)["metrics"]
+    assert 8 <= numbers["envs/episode_length_mean"] <= 11
+    found = json.loads(invoke("eval", config, "--episodes", 2, *words).stdout)
+    assert 8 <= found["length"]["mean"] <= 11
+
+
+def test_an_entry_without_a_policy_is_named(tmp_path: Path) -> None:
+    config = write_config(tmp_path, {**CARTPOLE, "name": "other", "placement": "inline"})
+    done = invoke("rollout", config, "--policy", "cli.stub_policies:by_entry")
+    assert done.exit_code == 2
+    assert "the dict has no policy for entry 'other'" in done.stderr

@@ -43,8 +43,8 @@ def test_rollout_collects_from_clients(tmp_path: Path) -> None:
         document = finish(child)
         for client in clients:
             client.join()
-    (entry,) = document["entries"]
-    assert (document["steps"], entry["steps"], entry["envs"]) == (60, 60, 2)
+    numbers = document["metrics"]
+    assert (document["steps"], numbers["envs/robots/steps"], numbers["envs/envs"]) == (60, 60, 2)
     # Steps in flight at the end are not counted.
     assert 60 <= sum(client.env.steps for client in clients) <= 62
 
@@ -59,6 +59,6 @@ def test_rollout_collects_from_clients_and_local_envs_together(tmp_path: Path) -
         document = finish(child)
         for client in clients:
             client.join()
-    steps = {entry["name"]: entry["steps"] for entry in document["entries"]}
-    assert sum(steps.values()) == 400
-    assert min(steps.values()) > 0
+    steps = [document["metrics"][f"envs/{name}/steps"] for name in ("pole", "robots")]
+    assert sum(steps) == 400
+    assert min(steps) > 0

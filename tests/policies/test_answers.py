@@ -12,7 +12,7 @@ from kit.scripted import Counts
 
 import rlightning_aio as rl
 from rlightning_aio import BatchedData, sync
-from rlightning_aio.cli.policies.policies import Responder
+from rlightning_aio.cli.policies import Responder
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import BadAction
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
@@ -120,8 +120,7 @@ def test_one_policy_serves_all(make_env: Any, policy: Callable[[BatchedData], An
         check(found)
         async with rl.build_env_group(entry(make_env)) as group:
             batch, _ = await group.reset()
-            space = group.get_action_spaces()[0]
-            (response,) = await Responder(awaitable, lambda _: space, separate=False)(batch)
+            (response,) = await Responder(group, awaitable, None)(batch)
             batch, _ = await group.step(response)
             assert (batch.reward == 4).all()
 

@@ -10,13 +10,12 @@ import typer
 
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
-from rlightning_aio.cli.bench.bench import bench
+from rlightning_aio.cli.bench import bench
 from rlightning_aio.cli.check import check
-from rlightning_aio.cli.playing.evaluating import evaluation
-from rlightning_aio.cli.playing.rollout import rollout
+from rlightning_aio.cli.evaluating import evaluation
 from rlightning_aio.cli.remote import client, keygen
+from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.terminal import guarded
-from rlightning_aio.cli.trace import trace
 from rlightning_aio.protocol import kernel
 
 __all__ = ["app"]
@@ -69,7 +68,7 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, check, trace, backends, client, keygen):
+for command in (rollout, bench, check, backends, client, keygen):
     app.command()(guarded(command))
 # Named after what Python has a function of that name for.
 app.command("eval")(guarded(evaluation))

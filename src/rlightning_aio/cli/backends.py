@@ -1,23 +1,14 @@
-"""``rlightning-aio backends``: lists the simulators and how to install them, or tasks of one."""
+"""``rlightning-aio backends``: lists the simulators and how to install them."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from operator import attrgetter
-from typing import Annotated
 
-import typer
 from rich.text import Text
 
 from rlightning_aio.cli.options import AsJson
-from rlightning_aio.cli.tasks import names_of_tasks
-from rlightning_aio.cli.terminal import (
-    named_columns,
-    out,
-    print_json,
-    print_result,
-    print_table,
-)
+from rlightning_aio.cli.terminal import named_columns, print_json, print_table
 from rlightning_aio.registry import BACKENDS, Backend, plugins
 
 __all__ = ["backends"]
@@ -32,15 +23,8 @@ class _Row:
     install: str
 
 
-def backends(
-    backend: Annotated[
-        str | None, typer.Argument(help="List the tasks of this backend.", show_default=False)
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
+def backends(as_json: AsJson = False) -> None:
     """List all backends: whether the package they need is installed here, and how to install it.
-
-    With the name of one, list the tasks of its simulator, as installed here, one per line.
 
     Backends of plug-ins (entry points of the group rlightning_aio.backends) are listed after
     the built-in ones. Simulators that exclude each other need separate virtual environments;
@@ -50,18 +34,12 @@ def backends(
 
         rlightning-aio backends
         rlightning-aio backends --json
-        rlightning-aio backends gymnasium | grep Cart
     """
-    if backend is not None:
-        names = names_of_tasks(backend)
-        print_json(names) if as_json else print_result("\n".join(names))
-        return
     rows = [_row(backend) for backend in (*BACKENDS.values(), *_plugged_in())]
     if as_json:
         print_json([asdict(row) for row in rows])
         return
-    table = named_columns("Backends", "backend", "package", "install")
-    table.columns[1].justify = table.columns[2].justify = "left"
+    table = named_columns("Backends", "backend", "package", "install", texts=["package", "install"])
     for row in rows:
         # Texts, because Rich would take an extra's brackets for markup.
         table.add_row(
@@ -69,13 +47,12 @@ def backends(
             Text(f"{row.package} {row.version or 'not installed'}", "" if row.version else "dim"),
             Text(row.install, "dim" if row.version else ""),
         )
-    print_table(out(), table)
+    print_table(table)
 
 
 def _row(backend: Backend) -> _Row:
     version = backend.installed_version()
-    package, command = backend.module, backend.install
-    return _Row(backend.name, version is not None, package, version, command)
+    return _Row(backend.name, version is not None, backend.module, version, backend.install)
 
 
 def _plugged_in() -> list[Backend]:

@@ -1,32 +1,63 @@
-"""``rlightning-aio check`` builds and steps one env of each entry and prints its spaces."""
+"""``rlightning-aio check`` builds and steps one env of each entry and prints its spaces.
+
+With ``--steps`` it plays episodes with random actions, and looks for what is wrong with an env:
+rewards that are no numbers, observations that don't fit their space, results that a seed doesn't
+repeat, and what each episode leaves behind. Left out: what a group refuses anyway, such as
+observations of another shape.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final
+import os
+import pickle
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
+import gymnasium as gym
+import numpy as np
 import typer
 
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
-from rlightning_aio.cli.options import Config, Overrides
-from rlightning_aio.cli.policies.collecting import Roster, respond_to_all, responder
-from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
-from rlightning_aio.cli.trial import Trial, try_out
+from rlightning_aio.cli.options import AsJson, Config, Overrides
+from rlightning_aio.cli.policies import Responder, respond_to_all
+from rlightning_aio.cli.terminal import (
+    counted,
+    duration,
+    print_json,
+    print_lines,
+    run_interruptible,
+)
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.json_text import json_of
+from rlightning_aio.protocol.bounds import out_of_bounds
 from rlightning_aio.registry import ENVS, load
+from rlightning_aio.trees import as_numpy, tree_of, walked
+from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from rlightning_aio._core.hosts.running.casts import Cast
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["check"]
 
 _STEPS: Final = 3
+_REPEATED: Final = 100
+"""Most steps that are done twice with the same seed."""
+_LOOKED_AT: Final = 20
+"""Most results whose observations are compared with their space."""
+_SLACK_MB: Final = 16.0
+"""Memory that caches may take between the second episode and the last."""
+_NUMBERS: Final[Any] = (
+    gym.spaces.Box, gym.spaces.Discrete, gym.spaces.MultiBinary, gym.spaces.MultiDiscrete,
+)  # fmt: skip
 
 
 @dataclass
@@ -37,7 +68,9 @@ class _Finding:
         skipped: the reason why it was not started.
         steps: how many steps it made; none if only a policy can choose its actions.
         offers: what the envs' own server says of them.
-        trial: what whole episodes have shown.
+        episodes: number that have ended, with ``--steps``; step_us: median time of a step in its
+            env.
+        problems: in words, each with what to do.
     """
 
     name: str
@@ -51,7 +84,9 @@ class _Finding:
     skipped: str | None = None
     steps: int = 0
     offers: dict[str, Any] | None = None
-    trial: Trial | None = None
+    episodes: int = 0
+    step_us: float | None = None
+    problems: list[str] = field(default_factory=list[str])
 
 
 def check(
@@ -60,14 +95,13 @@ def check(
     steps: Annotated[
         int, typer.Option(min=0, help="Play so many steps with random actions, and look closely.")
     ] = 0,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the text.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check a config: build one env of each entry, step it a few times, print its spaces.
 
     Errors in the file are reported first, before anything is started. Robots are not
-    started, and neither are env_servers, whose envs live elsewhere.
+    started, and neither are env_servers, whose envs live elsewhere. If --steps finds anything
+    wrong with an env, the exit code is 1.
 
     For example:
 
@@ -81,10 +115,10 @@ def check(
     run_interruptible(_look(configs, findings, steps))
     if as_json:
         print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
-        return
-    for found in findings:
-        for line in _lines(found):
-            out().print(line, soft_wrap=True, markup=False)
+    else:
+        print_lines(line for found in findings for line in _lines(found))
+    if any(found.problems for found in findings):
+        raise typer.Exit(1)
 
 
 async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: int) -> None:
@@ -112,17 +146,20 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
         found.action_space = str(meta.action_space)
         found.num_envs = meta.num_envs
         found.max_episode_steps = config.max_episode_steps or meta.max_episode_steps
-        respond = responder(group, Roster(group), None, 0)
         batch, _ = await group.reset(seed=0)
         if _has_no_samples(meta.action_space):
             return
+        respond = Responder(group, None, 0)
         with ensure_auto_reset(group):
             for _ in range(_STEPS):
                 await respond_to_all(group, respond, batch)
                 batch, _ = await group.collect_async()
-        found.steps = _STEPS
+            found.steps = _STEPS
+            if steps:
+                await _play(group, steps, found)
+                await _repeat(group, min(steps, _REPEATED), found)
         if steps:
-            found.trial = await try_out(group, steps)
+            await _compare_spaces(group, min(steps, _LOOKED_AT), found)
 
 
 def _has_no_samples(space: Any) -> bool:
@@ -134,40 +171,160 @@ def _has_no_samples(space: Any) -> bool:
     return False
 
 
-def _lines(found: _Finding) -> list[str]:
+# -- what is wrong with an env ----------------------------------------------------------
+
+
+async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
+    """Play so many steps, and look at rewards, at times, and at what episodes leave behind."""
+    (worker,) = group.get_workers()
+    pid, samples, bad, times = worker["pid"] or "self", list[dict[str, float]](), 0, list[int]()
+    respond = Responder(group, None, 0)
+    batch, _ = await group.reset(seed=0)
+    for _ in range(steps):
+        await respond_to_all(group, respond, batch)
+        batch, _ = await group.collect_async()
+        bad += int(np.count_nonzero(~np.isfinite(batch.reward)))
+        times += [] if batch.is_reset.any() else batch.busy_ns.tolist()
+        samples += [_held(pid)] * int(np.count_nonzero(batch.done & ~batch.is_reset))
+    found.episodes = len(samples)
+    found.step_us = float(np.median(times)) / 1e3 if times else None
+    if bad:
+        found.problems.append(f"{bad} of {steps} rewards are NaN or infinite")
+    found.problems += _leaks(samples)
+
+
+def _held(pid: int | str) -> dict[str, float]:
+    """Return what a process holds: open descriptors, threads, children, memory in MB."""
+    process = Path(f"/proc/{pid}")
+    if not process.exists():
+        return {}
+    children = sum(len(one.read_text().split()) for one in process.glob("task/*/children"))
+    pages = int((process / "statm").read_text().split()[1])
+    return {
+        "open descriptors": len([*(process / "fd").iterdir()]),
+        "threads": len([*(process / "task").iterdir()]),
+        "child processes": children,
+        "MB of memory": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+    }
+
+
+def _leaks(samples: list[dict[str, float]]) -> list[str]:
+    """Say what has grown from the second episode to the last; the first loads and compiles."""
+    if len(samples) < 4:
+        return []
+    count, found = len(samples) - 2, list[str]()
+    for name, before in samples[1].items():
+        more = samples[-1].get(name, before) - before
+        if more >= max(count / 2, 2) if name != "MB of memory" else more > _SLACK_MB:
+            found.append(
+                f"{more:.0f} more {name} after {count} episodes: close or drop in reset what the "
+                "episode before has opened"
+            )
+    return found
+
+
+async def _repeat(group: EnvGroup, steps: int, found: _Finding) -> None:
+    """Play twice with the same seed and actions."""
+    first, again = [await _played(group, steps) for _ in range(2)]
+    differs = next((k for k in range(steps + 1) if first[k] != again[k]), None)
+    if differs is not None:
+        where = "the reset" if differs == 0 else f"step {differs}"
+        found.problems.append(
+            f"two episodes with the same seed and actions differ from {where} on: draw random "
+            "numbers from a generator that reset(seed=…) seeds, such as gymnasium's np_random"
+        )
+
+
+async def _played(group: EnvGroup, steps: int) -> list[bytes]:
+    """Return what a reset with a seed and steps with actions of the same seed show."""
+    respond = Responder(group, None, 0)
+    batch, _ = await group.reset(seed=1)
+    results = [_contents(batch)]
+    for _ in range(steps):
+        await respond_to_all(group, respond, batch)
+        batch, _ = await group.collect_async()
+        results.append(_contents(batch))
+    return results
+
+
+def _contents(batch: BatchedData) -> bytes:
+    parts: tuple[Any, ...] = batch.observation, batch.reward, batch.terminated, batch.truncated
+    return pickle.dumps(parts)
+
+
+async def _compare_spaces(group: EnvGroup, steps: int, found: _Finding) -> None:
+    """Compare observations as the env returns them, before any is converted, with their space."""
+    (meta,) = group.metas
+    env, space = group[meta.env_id], cast("gym.Space[Any]", meta.observation_space)
+    actions = cast("gym.Space[Any]", meta.action_space)
+    actions.seed(0)
+    said = dict[str, str]()
+    result = await env.call("reset", seed=2)
+    for step in range(steps + 1):
+        said |= _casts(space, result.observation)
+        if (words := out_of_bounds(space, result.observation, "an observation")) is not None:
+            said.setdefault("bounds", f"{words}: clip it, or declare a wider space")
+        if step == steps or any(np.any(as_numpy(flag)) for flag in _ends(result)):
+            break
+        response = PolicyResponse(meta.env_id, action=actions.sample())
+        result = await env.call("step", response)
+    found.problems += said.values()
+
+
+def _ends(result: Any) -> list[Any]:
+    each: list[Any] = [result.last_terminated, result.last_truncated]
+    return [flag for one in each for _, flag in walked(one)]
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, (np.ndarray, list, tuple))
+
+
+def _casts(space: gym.Space[Any], observation: Any) -> dict[str, str]:
+    """Say which parts of an observation have another dtype than their space."""
+    said = dict[str, str]()
+    for path, part in walked(tree_of(space)):
+        value: Any = observation
+        name = "observation"
+        for key in path:
+            # An agent that takes no part has no observation.
+            value, name = None if value is None else value.get(key), f"{name}[{key!r}]"
+        kind = str(getattr(value, "dtype", type(value).__name__))
+        # Numbers of Python have no dtype of their own.
+        if not isinstance(part, _NUMBERS) or kind == str(part.dtype) or not _is_array(value):
+            continue
+        array: NDArray[Any] = np.asarray(value)
+        with np.errstate(all="ignore"):
+            converted = array.astype(part.dtype)
+        same = np.array_equal(converted, array, equal_nan=array.dtype.kind == "f")
+        loss = "no number changes, but it takes time" if same else "numbers are rounded"
+        said[name] = (
+            f"{name} is converted from {kind} to {part.dtype}: {loss}; return arrays of "
+            f"{part.dtype}, or declare a space of another dtype"
+        )
+    return said
+
+
+# -- output -----------------------------------------------------------------------------
+
+
+def _lines(found: _Finding) -> Iterator[str]:
     each = "" if found.num_envs == 1 else f", {found.num_envs} sub-environments in each"
     head = f"{found.name}: {counted(found.num_workers, 'env')}{each} ({found.backend}"
-    head += f", {found.task})" if found.task else ")"
+    yield head + (f", {found.task})" if found.task else ")")
     if found.skipped is not None:
-        return [head, f"  not started: {found.skipped}"]
+        yield f"  not started: {found.skipped}"
+        return
     if found.offers is not None:
-        return [head, *json_of(found.offers, indent=2).splitlines()]
-    limit = found.max_episode_steps
-    trial = found.trial
-    return [
-        head,
-        f"  observation  {found.observation_space}",
-        f"  action       {found.action_space}",
-        f"  step limit   {limit or 'none'}",
-        f"  reset and stepped {found.steps} times"
-        if found.steps
-        else "  reset; not stepped: only a policy can choose its actions",
-        *([] if trial is None else _lines_of(trial)),
-    ]
-
-
-def _lines_of(trial: Trial) -> list[str]:
-    return [
-        f"  {counted(trial.episodes, 'episode')}; a step takes {trial.step_us:.0f} µs",
-        *[f"  cast: {_words_of(cast)}" for cast in trial.casts],
-        *[f"  problem: {problem}" for problem in trial.problems or ["none found"]],
-        f"  {trial.advice}",
-    ]
-
-
-def _words_of(cast: Cast) -> str:
-    loss = "numbers are rounded" if cast.rounds else "no number changes, but it takes time"
-    return (
-        f"{cast.part} from {cast.found} to {cast.expected}: {loss}; return arrays of "
-        f"{cast.expected}, or declare a space of another dtype"
-    )
+        yield from json_of(found.offers, indent=2).splitlines()
+        return
+    yield f"  observation  {found.observation_space}"
+    yield f"  action       {found.action_space}"
+    yield f"  step limit   {found.max_episode_steps or 'none'}"
+    if not found.steps:
+        yield "  reset; not stepped: only a policy can choose its actions"
+        return
+    yield f"  reset and stepped {found.steps} times"
+    if found.step_us is not None:
+        yield f"  {counted(found.episodes, 'episode')}; a step takes {duration(found.step_us)}"
+        yield from (f"  problem: {problem}" for problem in found.problems or ["none found"])

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Figures",
-    "cpu_seconds",
     "family",
     "in_turns",
     "machine_facts",
@@ -33,10 +32,6 @@ __all__ = [
 
 C = TypeVar("C")
 _ALWAYS_USED: Final = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
-
-_TICKS: Final = os.sysconf("SC_CLK_TCK")
-_USER_TICKS: Final = 11
-"""Position of user time behind a process's name; kernel time follows it."""
 
 
 def in_turns(contenders: Sequence[C], rounds: int) -> Iterator[tuple[int, C]]:
@@ -66,27 +61,10 @@ class Figures:
         """Ratios to the figures of the same rounds."""
         return Figures([a / b for a, b in zip(self.values, others.values, strict=True)])
 
-    def minus(self, others: Figures) -> Figures:
-        """Differences from the figures of the same rounds."""
-        return Figures([a - b for a, b in zip(self.values, others.values, strict=True)])
-
     def as_json(self) -> dict[str, Any]:
         """Return all for JSON."""
         values = list(self.values)
         return {"median": self.median, "low": min(values), "high": max(values), "values": values}
-
-
-def cpu_seconds(pids: Sequence[int]) -> float:
-    """Return the CPU time of the processes so far; one that has ended counts as 0."""
-    return sum(map(_cpu_seconds, pids))
-
-
-def _cpu_seconds(pid: int) -> float:
-    if pid == os.getpid():
-        used = os.times()
-        return used.user + used.system
-    text = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
-    return sum(map(int, text[_USER_TICKS : _USER_TICKS + 2])) / _TICKS
 
 
 def memory_bytes(pids: Sequence[int]) -> int:

@@ -9,17 +9,7 @@ import typer
 
 from rlightning_aio.errors import ConfigError
 
-__all__ = [
-    "AsJson",
-    "Config",
-    "MeasuringSeconds",
-    "Overrides",
-    "PlotFile",
-    "PolicyName",
-    "Rounds",
-    "TraceFile",
-    "check_seed",
-]
+__all__ = ["AsJson", "Config", "Overrides", "PlotFile", "PolicyName", "Seed", "check_seed"]
 
 _LAST_SEED: Final = 2**61
 """Further seeds count up from a given one, and all must be below 2**62."""
@@ -29,19 +19,20 @@ Overrides: TypeAlias = Annotated[
     list[str] | None,
     typer.Argument(help="Dotted overrides: envs.0.num_workers=8 (envs)", show_default=False),
 ]
-Rounds: TypeAlias = Annotated[int, typer.Option(min=1, help="Number of turns for each contender.")]
-MeasuringSeconds: TypeAlias = Annotated[
-    float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
-]
 PolicyName: TypeAlias = Annotated[
-    str | None, typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions.")
+    str | None,
+    typer.Option(
+        metavar="MODULE:NAME|openpi://HOST:PORT",
+        help="A callable that takes a batch and returns actions, or a model with predict(), or a "
+        "dict with one for each entry; or the address of a policy server.",
+        show_default="random actions",
+    ),
 ]
 PlotFile: TypeAlias = Annotated[
     Path | None, typer.Option(help="Also draw the figures (PNG, SVG or PDF; needs matplotlib).")
 ]
-TraceFile: TypeAlias = Annotated[
-    Path | None,
-    typer.Option("--trace", metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
+Seed: TypeAlias = Annotated[
+    int | None, typer.Option(min=0, help="Seed of the first resets and of random actions.")
 ]
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print one JSON document instead of the table.")

@@ -14,14 +14,12 @@ import typer
 
 from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio._core.hosts.running.build_env import build_env
-from rlightning_aio.cli.live_line import LiveLine
 from rlightning_aio.cli.terminal import (
     connections_logged,
     count,
     counted,
     interruptible,
-    out,
-    print_json,
+    print_lines,
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
@@ -56,9 +54,6 @@ def client(
         str | None,
         typer.Option(help="Name, unique at the server.", show_default="host name and process id"),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the last line.")
-    ] = False,
 ) -> None:
     """Lend an env of this machine to the env_server of a trainer elsewhere.
 
@@ -75,19 +70,17 @@ def client(
         raise ConfigError(f"--connect {connect!r}: should look like tcp://127.0.0.1:5555")
     entry = _the_entry(config, load_config(config, overrides or ()))
     served: RemoteEnvClient | None = None
-    interrupted = False
     try:
         with interruptible(), _faults_of(entry):
             env = build_env(entry)
             served = _client_of(env, connect, keys, name)
-            with served, _status(served, connect):
+            with served, connections_logged():
+                typer.echo(f"{served.name} connects to {connect}", err=True)
                 served.run()
-    except KeyboardInterrupt:
-        interrupted = True
-        raise
     finally:
         if served is not None:
-            _report(served, interrupted=interrupted, as_json=as_json)
+            steps, sessions = count(served.num_steps), counted(served.num_sessions, "session")
+            print_lines([f"{served.name}: {steps} steps in {sessions}"])
 
 
 def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
@@ -144,48 +137,9 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
         raise fault from fault.__cause__
 
 
-@contextlib.contextmanager
-def _status(served: RemoteEnvClient, address: str) -> Generator[None]:
-    """Show a live line on stderr, or a plain line for each change if it is no terminal."""
-
-    def parts(_now: float) -> list[str]:
-        return [f"{served.name}: {served.state}", _figures(served)]
-
-    line = LiveLine(parts, by_thread=True)
-    if line.is_live:
-        with line:
-            yield
-        return
-    line.say(f"{served.name} connects to {address}")
-    with connections_logged():
-        yield
-
-
-def _figures(served: RemoteEnvClient) -> str:
-    sessions = served.num_sessions
-    return f"{count(served.num_steps)} steps in {counted(sessions, 'session')}"
-
-
-def _report(served: RemoteEnvClient, *, interrupted: bool, as_json: bool) -> None:
-    if as_json:
-        print_json(
-            {
-                "name": served.name,
-                "interrupted": interrupted,
-                "steps": served.num_steps,
-                "sessions": served.num_sessions,
-            }
-        )
-        return
-    out().print(f"{served.name}: {_figures(served)}", soft_wrap=True, markup=False)
-
-
 def keygen(
     directory: Annotated[Path, typer.Argument(help="Created if missing.", show_default=False)],
     names: Annotated[list[str], typer.Argument(help="Names of the clients.", show_default=False)],
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the advice.")
-    ] = False,
 ) -> None:
     """Make the CURVE keys of an env_server and of the clients that it lets in.
 
@@ -200,11 +154,6 @@ def keygen(
     """
     made = make_keys(directory, names)
     server = directory / "server"
-    if as_json:
-        print_json(
-            {"server": str(server), "clients": dict(zip(names, map(str, made), strict=True))}
-        )
-        return
     lines = [
         f"{server}: stays with the trainer; name it in the env_server's env_kwargs.keys",
         *(
@@ -214,5 +163,4 @@ def keygen(
             for name, path in zip(names, made, strict=True)
         ),
     ]
-    for line in lines:
-        out().print(line, soft_wrap=True, markup=False)
+    print_lines(lines)

@@ -1,4 +1,4 @@
-"""Output of every command: the two streams, messages of errors, formats of figures.
+"""Output of every command: the two streams, messages of errors, progress, formats of figures.
 
 Rule: stdout gets results and nothing else, even if other code prints. An error is one message on
 stderr and an exit code, never a traceback; for the user's own code (a policy) it has the place.
@@ -6,20 +6,21 @@ stderr and an exit code, never a traceback; for the user's own code (a policy) i
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import logging
 import math
-import os
 import re
 import signal
 import sys
-from typing import TYPE_CHECKING, Any, TextIO
+import time
+from typing import TYPE_CHECKING, Any, Final, Self, TextIO
 
 import typer
+from rich import progress
 from rich.console import Console
-from rich.measure import Measurement
-from rich.table import Column, Table
+from rich.table import Table
 
 import rlightning_aio
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
@@ -30,127 +31,61 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
 
 __all__ = [
-    "ResultStream",
+    "INTERRUPTED",
+    "Progress",
     "connections_logged",
     "count",
     "counted",
     "duration",
-    "err",
-    "fitted",
+    "exit_code_of",
     "guarded",
+    "handling",
     "in_words",
     "interruptible",
     "named_columns",
     "notes_on_returns",
     "number",
-    "out",
     "print_json",
-    "print_result",
+    "print_lines",
     "print_table",
     "run_interruptible",
 ]
 
-_INTERRUPTED = 130
+INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as in shells."""
-
-
-@contextlib.contextmanager
-def connections_logged() -> Generator[None]:
-    """Write one line on stderr for each change of a client's connection, on either side."""
-    handler = logging.StreamHandler(err().file)
-    level = LOG.level
-    LOG.addHandler(handler)
-    LOG.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        LOG.removeHandler(handler)
-        LOG.setLevel(level)
-
-
-_NATURAL = 10_000
-"""Width in which every table fits."""
-_WIDE = 160
+_WIDE: Final = 160
 """Width of a table in a file, whose readers wrap lines themselves."""
-
-
-_NAMED = 8
+_NAMED: Final = 8
 """Number of envs that a message names; further ones are counted."""
-_LONG = 1e12
+_LONG: Final = 1e12
 """Smallest number that is written with a power of ten."""
-
+_REFRESH_SECONDS: Final = 0.25
 
 _results: list[TextIO] = []
 """The stream for results while a command runs; stdout itself leads to stderr then."""
 
 
-def out() -> Console:
-    """Return the console for results."""
-    return _console(_results[-1] if _results else sys.stdout)
-
-
-def err() -> Console:
-    """Return the console for all other messages."""
-    return _console(sys.stderr)
+# -- results --------------------------------------------------------------------------
 
 
 def _console(file: TextIO) -> Console:
     return Console(file=file, highlight=False, width=None if file.isatty() else _WIDE)
 
 
-def print_result(text: str) -> None:
-    """Print `text` on stdout, unchanged."""
-    typer.echo(text, file=_results[-1] if _results else None)
+def print_table(table: Table) -> None:
+    """Print `table` on stdout."""
+    _console(_results[-1]).print(table)
+
+
+def print_lines(lines: Iterable[str]) -> None:
+    """Print lines on stdout, unchanged."""
+    for line in lines:
+        typer.echo(line, file=_results[-1])
 
 
 def print_json(value: Any) -> None:
     """Print `value` as the one JSON document on stdout."""
-    print_result(json_of(value, indent=2))
-
-
-def notes_on_returns(env_ids: Iterable[str]) -> list[str]:
-    """Return a note on envs whose returns are not finite, or an empty list."""
-    named = sorted(set(env_ids))
-    if not named:
-        return []
-    more = f" and {count(len(named) - _NAMED)} more" if len(named) > _NAMED else ""
-    note = f"returns of {', '.join(named[:_NAMED])}{more} are NaN, infinite or too large to add up"
-    return [f"{note}; figures with them are left out"]
-
-
-class ResultStream:
-    """Stdout that turns a full disk into one `ConfigError`. Click handles a closed pipe."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-        self._is_lost = False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        return self._try(self._stream.write, text) or 0
-
-    def flush(self) -> None:
-        self._try(self._stream.flush)
-
-    def _try(self, method: Callable[..., Any], *args: Any) -> Any:
-        if self._is_lost:
-            return None
-        try:
-            return method(*args)
-        except OSError as error:
-            self._discard_rest()
-            if isinstance(error, BrokenPipeError):
-                raise
-            self._is_lost = True
-            raise ConfigError(f"stdout: results can't be written: {error.strerror}") from error
-
-    def _discard_rest(self) -> None:
-        """Let the stream's end, which writes what it still holds, succeed."""
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, self._stream.fileno())
-        os.close(null)
+    print_lines([json_of(value, indent=2)])
 
 
 @contextlib.contextmanager
@@ -164,22 +99,61 @@ def _prints_on_stderr() -> Generator[None]:
         _results.pop().flush()
 
 
+def named_columns(title: str, *names: str, texts: Sequence[str] = ()) -> Table:
+    """Return an empty table: the first column and `texts` are text, all others are figures."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for position, name in enumerate(names):
+        is_text = position == 0 or name in texts
+        table.add_column(
+            name, justify="left" if is_text else "right", overflow="fold", vertical="bottom"
+        )
+    return table
+
+
+def notes_on_returns(env_ids: Iterable[str]) -> list[str]:
+    """Return a note on envs whose returns are not finite, or an empty list."""
+    named = sorted(set(env_ids))
+    if not named:
+        return []
+    more = f" and {count(len(named) - _NAMED)} more" if len(named) > _NAMED else ""
+    note = f"returns of {', '.join(named[:_NAMED])}{more} are NaN, infinite or too large to add up"
+    return [f"{note}; figures with them are left out"]
+
+
+# -- errors and signals ---------------------------------------------------------------
+
+
+def exit_code_of(command: Callable[[], None]) -> int:
+    """Run a command. Return its exit code, after a message on stderr if it has failed."""
+    try:
+        command()
+    except RLightningError as error:
+        typer.echo(f"error: {in_words(error)}", err=True)
+        return 2 if isinstance(error, ConfigError) else 1
+    except TimeoutError as error:  # A group's clients have not connected in time.
+        typer.echo(f"error: {error}", err=True)
+        return 1
+    except BrokenPipeError:
+        raise  # Click ends the command: who reads its results has gone.
+    except OSError as error:  # Of a file that an option names.
+        typer.echo(f"error: can't be written: {error}", err=True)
+        return 2
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except typer.Exit as end:
+        return end.exit_code
+    return 0
+
+
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
     """Return `command` with the library's errors and Ctrl-C turned into messages and exit codes."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
-        try:
-            with _prints_on_stderr():
-                command(*args, **kwargs)
-        except RLightningError as error:
-            typer.echo(f"error: {in_words(error)}", err=True)
-            raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
-        except TimeoutError as error:  # A group's clients have not connected in time.
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(1) from None
-        except KeyboardInterrupt:
-            raise typer.Exit(_INTERRUPTED) from None
+        with _prints_on_stderr():
+            code = exit_code_of(functools.partial(command, *args, **kwargs))
+        if code:
+            raise typer.Exit(code)
 
     return run
 
@@ -192,15 +166,22 @@ def interruptible() -> Generator[None]:
     a robot's client; SIGHUP, sent when a terminal or SSH session closes (unless it is ignored, as
     under nohup); and SIGQUIT. Outside this context they end the command at once (see `cli.main`).
     """
+    with handling(signal.default_int_handler):
+        yield
+
+
+@contextlib.contextmanager
+def handling(handler: Callable[[int, Any], Any]) -> Generator[None]:
+    """Call `handler` for the signals that end a command, inside this context."""
     numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         numbers.append(signal.SIGHUP)
-    before = [signal.signal(number, signal.default_int_handler) for number in numbers]
+    before = [signal.signal(number, handler) for number in numbers]
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
+        for number, handler_before in zip(numbers, before, strict=True):
+            signal.signal(number, handler_before)
 
 
 def run_interruptible(command: Coroutine[Any, Any, None]) -> None:
@@ -221,50 +202,68 @@ def in_words(error: RLightningError) -> str:
     return text
 
 
-def named_columns(title: str, *names: str, texts: Sequence[str] = ()) -> Table:
-    """Return an empty table: the first column and `texts` are text, all others are figures."""
-    table = _empty(title)
-    for position, name in enumerate(names):
-        is_text = position == 0 or name in texts
-        table.add_column(
-            name, justify="left" if is_text else "right", overflow="fold", vertical="bottom"
+# -- progress -------------------------------------------------------------------------
+
+
+class Progress:
+    """How far a command is, on stderr: a bar if that is a terminal, else a line for each stage."""
+
+    def __init__(self) -> None:
+        self._console = _console(sys.stderr)
+        self._bar = progress.Progress(
+            progress.SpinnerColumn(),
+            progress.BarColumn(20),
+            progress.TextColumn("{task.description}", markup=False),
+            progress.TimeRemainingColumn(compact=True),
+            console=self._console,
+            transient=True,
+            refresh_per_second=1 / _REFRESH_SECONDS,
+            disable=not self._console.is_terminal,
         )
-    return table
+        self._task = self._bar.add_task("", total=None)
+        self._next_at = 0.0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def begin(self, words: str, total: float | None = None) -> None:
+        """Say what begins, and how much there is to do."""
+        if self._bar.disable:
+            self.say(words)
+        self._bar.reset(self._task, description=words, total=total)
+
+    def say(self, words: str) -> None:
+        """Print a line that stays."""
+        self._console.print(words, soft_wrap=True, markup=False)
+
+    async def show(self, done: float, words: Callable[[], str]) -> None:
+        """Show how much is done, now and then, and let other tasks and Ctrl-C take effect."""
+        if time.monotonic() >= self._next_at:
+            self._next_at = time.monotonic() + _REFRESH_SECONDS
+            if not self._bar.disable:
+                self._bar.update(self._task, completed=done, description=words())
+            await asyncio.sleep(0)
 
 
-def _empty(title: Any, *columns: Column) -> Table:
-    return Table(
-        *columns, title=title, title_justify="left", title_style="bold", box=None, pad_edge=False
-    )
+@contextlib.contextmanager
+def connections_logged() -> Generator[None]:
+    """Write one line on stderr for each change of a client's connection, on either side."""
+    handler = logging.StreamHandler(sys.stderr)
+    level = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.setLevel(level)
 
 
-def fitted(console: Console, table: Table, expendable: Sequence[str]) -> tuple[Table, list[str]]:
-    """Return `table` without the columns that don't fit the console, and their names.
-
-    Args:
-        console: the console to print on.
-        table: a table of `named_columns`.
-        expendable: names of columns that may be left out, the least important first.
-    """
-    wide = console.options.update(max_width=_NATURAL, width=_NATURAL)
-    left_out: list[str] = []
-    for name in expendable:
-        if Measurement.get(console, wide, table).maximum <= console.width:
-            break
-        rows = table.rows
-        table = _empty(table.title, *(c for c in table.columns if c.header != name))
-        table.rows = rows
-        left_out.append(name.replace("\n", " ").strip())
-    return table, left_out
-
-
-def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) -> None:
-    """Print `table`, without some of its `expendable` columns if it is too wide."""
-    table, left_out = fitted(console, table, expendable)
-    console.print(table)
-    if left_out:
-        words = f"(too narrow for {', '.join(left_out)}; --json has all)"
-        console.print(words, style="dim", markup=False)
+# -- figures --------------------------------------------------------------------------
 
 
 def count(value: float) -> str:

@@ -1,13 +1,12 @@
 """Steps a config's envs without this package: in a plain loop, and in Gymnasium's vector envs.
 
-Rule: the same simulations with the same random actions, and none of our code in a step.
+Rule: the same simulations with random actions, which obey action masks, and none of our code in a
+step.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -15,24 +14,29 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.cli.bench.measuring import Costs, Limits, Round, Rule, as_round
-from rlightning_aio.cli.measurement import cpu_seconds, memory_bytes
+from rlightning_aio.cli.measuring import Round, Rule, as_round
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
+from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.registry import ENVS
+from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
-    from pathlib import Path
 
+    from rlightning_aio.cli.measuring import Stand
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Baseline", "BaselineStand", "baselines_of", "opened_baseline"]
+__all__ = ["Baseline", "baselines_of", "opened_baseline"]
 
 _PLAIN: Final = ("gymnasium", "mujoco")
 """Backends whose envs are those of `gymnasium.make`, unchanged."""
 _MANY: Final = 128
 """Above this number, AsyncVectorEnv is left out: it starts a process for each env."""
+
+
+_CLOSE_SECONDS: Final = 2.0
+"""Time for AsyncVectorEnv to end a step that Ctrl-C has interrupted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +49,6 @@ class Baseline:
 
     words: str
     config: EnvConfig
-
-    @property
-    def configs(self) -> tuple[EnvConfig, ...]:
-        """Return its only entry."""
-        return (self.config,)
-
-    @property
-    def steps_here(self) -> bool:
-        """Return True: an env of it, which has the spaces, is always in this process."""
-        return True
 
     @property
     def num_sims(self) -> int:
@@ -81,48 +75,44 @@ def baselines_of(configs: Sequence[EnvConfig]) -> list[Baseline]:
 
 
 @contextlib.contextmanager
-def opened_baseline(baseline: Baseline, seed: int) -> Generator[BaselineStand]:
+def opened_baseline(baseline: Baseline, seed: int | None) -> Generator[Stand]:
     """Build and reset its envs.
 
     Raises what the simulator raises.
     """
-    before = memory_bytes([os.getpid()])
-    began = time.monotonic()
     envs = _made(baseline)
     try:
-        started = time.monotonic()
-        envs.reset(seed)
-        reset = time.monotonic()
-        grown = max(0, memory_bytes([os.getpid()]) - before)
-        memory = memory_bytes(envs.pids) or grown
-        yield BaselineStand(envs, Costs(started - began, reset - started, memory), seed)
+        yield _BaselineStand(envs, seed)
     finally:
         envs.close()
 
 
-class BaselineStand:
-    """A baseline whose envs are built; a `measuring.Measurable`."""
+class _BaselineStand:
+    """A baseline whose envs are built; see `Stand`."""
 
-    def __init__(self, envs: _Loop | _Vector, costs: Costs, seed: int) -> None:
-        self.costs = costs
-        self._envs = envs
-        self._sample = sampler_of(envs.action_space, np.random.default_rng(seed))
+    def __init__(self, envs: _Loop | _Vector, seed: int | None) -> None:
+        self._envs, self._rng = envs, np.random.default_rng(seed)
+        self._sample = sampler_of(envs.action_space, self._rng)
+        envs.reset(seed)
+        self._is_masked = can_be_masked(envs.action_space) and has_masks(envs.newest())
 
-    async def measure(self, rule: Rule, limits: Limits, trace: Path | None = None) -> Round:
-        """Measure it; `rule` and `trace` have no effect."""
-        del rule, trace
-        self._round(Limits(limits.steps, limits.seconds / 10))
-        return self._round(limits)
+    async def measure(self, rule: Rule, seconds: float) -> Round:
+        del rule
+        self._round(seconds / 10)
+        return self._round(seconds)
 
-    def _round(self, limits: Limits) -> Round:
-        envs, latencies = self._envs, list[float]()
-        pids = [os.getpid(), *envs.pids]
-        busy, steps = cpu_seconds(pids), 0
+    def _round(self, seconds: float) -> Round:
+        envs, latencies, steps = self._envs, list[float](), 0
         began = now = time.monotonic()
-        while limits.not_reached(steps, now - began):
-            steps += envs.step(self._sample(envs.num_envs), latencies)
+        while not steps or now - began < seconds:
+            actions = self._sample(envs.num_envs)
+            if self._is_masked:
+                actions = allowed_action(envs.action_space, actions, envs.newest(), self._rng)
+            sent_at = time.monotonic()
+            steps += envs.step(actions)
             now = time.monotonic()
-        return as_round(steps, now - began, cpu_seconds(pids) - busy, np.array(latencies))
+            latencies.append(now - sent_at)
+        return as_round(steps, now - began, np.array(latencies))
 
 
 class _Loop:
@@ -132,22 +122,29 @@ class _Loop:
         self._envs = [make() for make in makers]
         self.num_envs = len(self._envs)
         self.action_space: Any = self._envs[0].action_space
-        self.pids: list[int] = []
         self._actions = gym.vector.utils.batch_space(self.action_space, self.num_envs)
+        self._results: list[tuple[Any, dict[str, Any]]] = [(None, {})] * self.num_envs
 
-    def reset(self, seed: int) -> None:
+    def reset(self, seed: int | None) -> None:
         for k, env in enumerate(self._envs):
-            env.reset(seed=seed + k)
+            self._results[k] = env.reset(seed=None if seed is None else seed + k)
 
-    def step(self, actions: Any, latencies: list[float]) -> int:
+    def newest(self) -> EnvRet:
+        """Return the masks of the newest results, as of one vectorised env."""
+        masks = [
+            (info if "action_mask" in info else observation)["action_mask"]
+            for observation, info in self._results
+            if has_masks(EnvRet(env_id="", observation=observation, info=info))
+        ]
+        info = {"action_mask": np.stack(masks)} if masks else {}
+        return EnvRet(env_id="", observation=None, info=info)
+
+    def step(self, actions: Any) -> int:
         """Step each env. Return the number of steps."""
         rows: Any = gym.vector.utils.iterate(self._actions, actions)
-        for env, action in zip(self._envs, rows, strict=True):
-            sent_at = time.monotonic()
-            _, _, terminated, truncated, _ = env.step(action)
-            latencies.append(time.monotonic() - sent_at)
-            if terminated or truncated:
-                env.reset()
+        for k, (env, action) in enumerate(zip(self._envs, rows, strict=True)):
+            observation, _, terminated, truncated, info = env.step(action)
+            self._results[k] = env.reset() if terminated or truncated else (observation, info)
         return self.num_envs
 
     def close(self) -> None:
@@ -163,17 +160,20 @@ class _Vector:
         self._close = close
         self.num_envs = int(envs.num_envs)
         self.action_space: Any = envs.single_action_space
-        self.pids = [process.pid for process in getattr(envs, "processes", ())]
         self._done = np.zeros(self.num_envs, np.bool_)
+        self._result: tuple[Any, Any] = (None, None)
 
-    def reset(self, seed: int) -> None:
-        self._envs.reset(seed=seed)
+    def reset(self, seed: int | None) -> None:
+        self._result = self._envs.reset(seed=seed)
 
-    def step(self, actions: Any, latencies: list[float]) -> int:
+    def newest(self) -> EnvRet:
+        """Return the newest results, as of one vectorised env."""
+        return EnvRet(env_id="", observation=self._result[0], info=self._result[1])
+
+    def step(self, actions: Any) -> int:
         """Step all envs. Return the number of steps that were no resets."""
-        sent_at = time.monotonic()
-        _, _, terminated, truncated, _ = self._envs.step(actions)
-        latencies.append(time.monotonic() - sent_at)
+        observation, _, terminated, truncated, info = self._envs.step(actions)
+        self._result = observation, info
         resets = int(self._done.sum())
         self._done = terminated | truncated
         return self.num_envs - resets
@@ -200,19 +200,4 @@ def _made(baseline: Baseline) -> _Loop | _Vector:
         return _Loop(makers)
     if baseline.words == _SYNC:
         return _Vector(gym.vector.SyncVectorEnv(makers))
-    with _deaf():
-        return _Vector(gym.vector.AsyncVectorEnv(makers), terminate=True)
-
-
-@contextlib.contextmanager
-def _deaf() -> Generator[None]:
-    """Make processes that start in this context ignore Ctrl-C and end silently on SIGTERM; the
-    command ends them.
-    """
-    ways = {signal.SIGINT: signal.SIG_IGN, signal.SIGTERM: signal.SIG_DFL}
-    before = {number: signal.signal(number, way) for number, way in ways.items()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    return _Vector(gym.vector.AsyncVectorEnv(makers), timeout=_CLOSE_SECONDS)

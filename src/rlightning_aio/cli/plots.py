@@ -7,27 +7,25 @@ import importlib.util
 import io
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio.cli.option_files import check_option_file, naming_option
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import write_file
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
-    from rlightning_aio.cli.bench.measuring import Contender
-    from rlightning_aio.cli.rollout_statistics import Course
+    from rlightning_aio.cli.measuring import Contender
     from rlightning_aio.evaluation import Estimate, Evaluation
 
-__all__ = ["check_plot", "draw_contenders", "draw_evaluation", "draw_rollout"]
+__all__ = ["check_plot", "draw_contenders", "draw_evaluation"]
 
 _KINDS: Final = (".png", ".svg", ".pdf")
 
 
 def check_plot(path: Path | None) -> None:
-    """Check before the measurement that a plot can be drawn and written to `path`, if there is one.
+    """Check before the measurement that a plot can be drawn, if there is to be one.
 
     Raises:
         ConfigError: it can't, with the reason.
@@ -36,7 +34,6 @@ def check_plot(path: Path | None) -> None:
         return
     if path.suffix.lower() not in _KINDS:
         raise ConfigError(f"--plot {path}: should end in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
-    check_option_file("--plot", path)
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--plot needs matplotlib: pip install matplotlib")
 
@@ -52,26 +49,25 @@ def _save(plt: Any, figure: Any, path: Path) -> None:
         figure.savefig(picture, dpi=150, format=path.suffix[1:].lower())
     finally:
         plt.close(figure)
-    with naming_option("--plot", path):
-        write_file(path, picture.getvalue())
+    write_file(path, picture.getvalue())
 
 
 def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) -> None:
     """Draw bars of steps per second with the rounds' spread, grouped by place.
 
     Raises:
-        ConfigError: the plot can't be written.
+        OSError: the plot can't be written.
     """
     plt = _pyplot()
     measured = [contender for contender in contenders if contender.rounds]
     rules = list(dict.fromkeys(contender.rule.words for contender in measured))
-    places = list(dict.fromkeys(contender.setting.words for contender in measured))
+    places = list(dict.fromkeys(contender.place.words for contender in measured))
     figure, axes = plt.subplots(figsize=(8, 1.4 + 0.22 * len(measured)), layout="constrained")
     height = 0.8 / len(rules)
     for index, rule in enumerate(rules):
         own = [contender for contender in measured if contender.rule.words == rule]
         axes.barh(
-            [places.index(c.setting.words) + index * height for c in own],
+            [places.index(c.place.words) + index * height for c in own],
             [c.steps_per_second for c in own],
             height,
             xerr=[c.spread * c.steps_per_second for c in own],
@@ -82,30 +78,6 @@ def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) ->
     axes.invert_yaxis()
     axes.set(xlabel="env steps per second", title=f"{config}, {counted(num_cores(), 'core')}")
     figure.legend(loc="outside lower center", ncols=len(rules))
-    _save(plt, figure, path)
-
-
-def _axes_of(points: Iterable[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    listed = list(points)
-    return [x for x, _ in listed], [y for _, y in listed]
-
-
-def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
-    """Draw steps per second over time, and returns of episodes over steps, by entry.
-
-    Raises:
-        ConfigError: the plot can't be written.
-    """
-    plt = _pyplot()
-    figure, (rates, returns) = plt.subplots(2, figsize=(8, 6), layout="constrained")
-    for course in courses:
-        rates.plot(*_axes_of(course.rates), label=course.name)
-        returns.plot(*_axes_of(course.returns), ".", ms=3, label=course.name)
-    rates.set(xlabel="seconds", ylabel="env steps per second", title=config)
-    rates.set(xlim=(0, None), ylim=(0, None))
-    returns.set(xlabel="env steps of the entry", ylabel="return of an episode")
-    for axes in (rates, returns):
-        axes.legend(loc="upper left")
     _save(plt, figure, path)
 
 
@@ -121,7 +93,7 @@ def draw_evaluation(
         path: the file.
 
     Raises:
-        ConfigError: the plot can't be written.
+        OSError: the plot can't be written.
     """
     plt = _pyplot()
     judged = any(found.success is not None for _, found, _ in groups)

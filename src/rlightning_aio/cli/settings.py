@@ -53,11 +53,6 @@ class Setting:
         return " + ".join(dict.fromkeys(config.placement for config in self.configs))
 
     @property
-    def steps_here(self) -> bool:
-        """Return True if some of the envs are in the process of the group."""
-        return any(config.placement != "process" for config in self.configs)
-
-    @property
     def has_workers(self) -> bool:
         """Return True if some of the envs are in worker processes."""
         return any(PLACEMENTS[config.placement].spreads for config in self.configs)
@@ -67,6 +62,16 @@ class Setting:
         """Return the total number of worker processes."""
         counts = zip(self.configs, nums_hosts(self.configs, num_cores()), strict=True)
         return sum(count for config, count in counts if PLACEMENTS[config.placement].spreads)
+
+    def overrides(self) -> str:
+        """Return the arguments of a command that make this setting of the config."""
+        fields = ["placement", "num_workers", "num_envs"]
+        fields += ["envs_per_process"] if self.has_workers else []
+        return " ".join(
+            f"envs.{k}.{name}={getattr(config, name)}"
+            for k, config in enumerate(self.configs)
+            for name in fields
+        )
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that define it, for JSON."""
@@ -113,7 +118,7 @@ def swept_settings(
     Args:
         path: the config's file.
         overrides: of its fields.
-        sweeps: the values of each field. A field without a dot is that of all entries.
+        sweeps: the values of each field. Without ``envs.0.`` it is that of all entries.
 
     Raises:
         ConfigError: a combination is no config, or an entry's envs live elsewhere.
@@ -127,7 +132,7 @@ def swept_settings(
             [
                 *overrides,
                 *(
-                    f"{name if '.' in name else f'envs.{k}.{name}'}={value}"
+                    f"{name if name.startswith('envs.') else f'envs.{k}.{name}'}={value}"
                     for name, value in chosen.items()
                     for k in range(num_entries)
                 ),

@@ -1,1 +1,0 @@
-"""`rollout` and `eval`: play episodes, film them, and show what came of them."""

@@ -1,0 +1,188 @@
+"""What decides on actions in commands: chance, a policy of the user, or a policy server.
+
+Here are the parts of every command's loop over a group: responses to results, and counts of steps.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import traceback
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.api.aio import ServerHandle
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.data import parts_of
+from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.policies import ActionChunks
+from rlightning_aio.policies.answers import answers_of
+from rlightning_aio.policies.predicting import PredictPolicy
+from rlightning_aio.policies.random_actions import RandomPolicy
+from rlightning_aio.registry import plugins
+
+if TYPE_CHECKING:
+    import contextlib
+    from collections.abc import Sequence
+    from types import TracebackType
+
+    import gymnasium as gym
+
+    from rlightning_aio._core.group.api.aio import EnvGroup
+
+__all__ = ["PolicyRaised", "Responder", "load_policy", "respond_to_all", "steps_in"]
+
+Policy: TypeAlias = Callable[[BatchedData], Any]
+
+_PACKAGE: Final = str(Path(__file__).parents[1])
+
+
+class PolicyRaised(RLightningError):
+    """The user's policy raised an exception; the message has the traceback of its own code."""
+
+
+def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Policy | None]:
+    """Return the policy that ``module:name`` or the address of a policy server names.
+
+    The working directory is on the path. The client of a server is closed by `stack`.
+
+    Raises:
+        ConfigError: it can't be imported, is no policy, or a package is missing.
+    """
+    if "://" in name:
+        return _served(name, stack)
+    module_name, colon, path = name.partition(":")
+    if not (module_name and colon and path):
+        raise ConfigError(f"--policy {name!r}: should look like my_policies:greedy")
+    try:
+        found: Any = importlib.import_module(module_name)
+    except Exception as error:
+        words = traceback.format_exception_only(error)[-1].strip()
+        raise ConfigError(f"--policy {name!r}: importing {module_name} raised {words}") from error
+    for part in path.split("."):
+        if not hasattr(found, part):
+            raise ConfigError(f"--policy {name!r}: {module_name} has no {path!r}")
+        found = getattr(found, part)
+    if isinstance(found, Mapping):
+        named = cast("Mapping[str, Any]", found)
+        return {
+            entry: None if policy is None else _called(f"{name}[{entry!r}]", policy)
+            for entry, policy in named.items()
+        }
+    return _called(name, found)
+
+
+def _called(name: str, policy: Any) -> Policy:
+    """Return a policy as a function of a batch."""
+    if callable(policy):
+        return cast("Policy", policy)
+    if hasattr(policy, "predict"):
+        return PredictPolicy(policy)
+    kind = type(policy).__name__
+    raise ConfigError(f"--policy {name!r}: is a {kind}, neither a callable nor with a predict()")
+
+
+def _served(name: str, stack: contextlib.ExitStack) -> Policy:
+    """Return a client of the policy server at an address, as ``openpi://localhost:8000``.
+
+    The scheme is the name of an entry point.
+    """
+    scheme, _, place = name.partition("://")
+    found = plugins("policies").select(name=scheme)
+    if not found:
+        known = " or ".join(f"{kind}://" for kind in sorted(plugins("policies").names))
+        raise ConfigError(f"--policy {name}: should begin with {known}")
+    try:
+        client = found[scheme].load()(f"ws://{place}")
+    except (ImportError, ConfigError) as error:
+        raise ConfigError(f"--policy {name}: {error}") from error
+    return ActionChunks(stack.enter_context(client))
+
+
+class Responder:
+    """Makes the responses to a batch, with one call of the policy if results can be stacked.
+
+    Args:
+        group: an initialised group.
+        policy: called with a batch, or such by entry; None draws random actions.
+        seed: of the random actions.
+    """
+
+    def __init__(
+        self, group: EnvGroup, policy: Policy | dict[str, Policy | None] | None, seed: int | None
+    ) -> None:
+        self._known = {meta.env_id: meta.action_space for meta in group.metas}
+        handles = (group[env_id] for env_id in group.env_ids)
+        self._servers = [handle for handle in handles if isinstance(handle, ServerHandle)]
+        self._group = group
+        by_chance = RandomPolicy(self._space_of, seed)
+        self._any: Policy | None = None
+        self._policies: dict[str, Policy] = {}
+        if isinstance(policy, dict):
+            for entry, one in cast("dict[str, Policy | None]", policy).items():
+                self._policies[entry] = by_chance if one is None else one
+        else:
+            self._any = by_chance if policy is None else policy
+        self._separate = isinstance(policy, dict) or _differ(group.get_action_spaces())
+        self._separate |= policy is not None and _differ(group.get_observation_spaces())
+
+    def _space_of(self, env_id: str) -> gym.Space[Any] | None:
+        """Return the action space of an env, or of a client that has joined since."""
+        if env_id not in self._known:
+            for server in self._servers:
+                self._known.update((meta.env_id, meta.action_space) for meta in server.metas)
+        return self._known.get(env_id)
+
+    async def __call__(self, batch: BatchedData) -> list[BatchedData]:
+        """Return batches of responses that together answer `batch`.
+
+        Raises:
+            PolicyRaised: the policy raised an exception that is none of this package.
+        """
+        parts = batch.by_entry() if self._separate else {"": batch}
+        found: list[BatchedData] = []
+        with self._group.span("policy"):
+            for entry, part in parts.items():
+                found += await self._respond(entry, part)
+        return found
+
+    async def _respond(self, entry: str, batch: BatchedData) -> list[BatchedData]:
+        policy = self._policies.get(entry, self._any)
+        if policy is None:
+            raise ConfigError(f"--policy: the dict has no policy for entry {entry!r}")
+        try:
+            answer = policy(batch)
+            if inspect.isawaitable(answer):
+                answer = await answer
+        except RLightningError:
+            raise  # Random actions can't be drawn, a policy server is missing, and the like.
+        except Exception as error:
+            raise PolicyRaised(_raised(error)) from error
+        return answers_of(batch, answer, lambda: self._space_of(batch.env_ids()[0]))
+
+
+def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
+    return any(space != spaces[0] for space in spaces[1:])
+
+
+def _raised(error: Exception) -> str:
+    """Return the error for an exception of a policy, with the traceback from its own code on."""
+    trace: TracebackType | None = error.__traceback__
+    while trace is not None and trace.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+        trace = trace.tb_next
+    words = traceback.format_exception_only(error)[-1].strip()
+    return "".join([f"the policy raised {words}\n", *traceback.format_tb(trace)]).rstrip()
+
+
+async def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
+    """Send a step to every env of `batch`."""
+    for response in await respond(batch):
+        group.step_async(response)
+
+
+def steps_in(batch: BatchedData) -> int:
+    """Return the number of results that are no resets, sub-environments counted."""
+    return sum(int(np.count_nonzero(~part.is_reset)) for part in parts_of(batch))

@@ -1,1 +1,0 @@
-"""Policies of commands: by import path, from files of Stable-Baselines3, or random, with masks."""

@@ -1,0 +1,242 @@
+"""``rlightning-aio rollout`` collects steps asynchronously and prints the group's numbers.
+
+Rule: the numbers are those of `EnvGroup.metrics`, under the same names.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from dataclasses import dataclass
+
+# Typer reads annotations.
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+
+import typer
+
+import rlightning_aio
+from rlightning_aio._core.group.api.aio import ServerHandle
+from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
+from rlightning_aio.cli.options import AsJson, Config, Overrides, PolicyName, Seed, check_seed
+from rlightning_aio.cli.policies import Responder, load_policy, respond_to_all, steps_in
+from rlightning_aio.cli.terminal import (
+    Progress,
+    connections_logged,
+    count,
+    counted,
+    named_columns,
+    print_json,
+    print_lines,
+    print_table,
+    run_interruptible,
+)
+from rlightning_aio.config import load_config
+from rlightning_aio.errors import EnvFault, RLightningError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["rollout"]
+
+_ENDLESS: Final = 2**62
+_STEPS: Final = 10_000
+"""Default number of steps."""
+_LONG: Final = 1e15
+"""Smallest whole number that is written with a power of ten."""
+_BIAS: Final = (
+    "Mean return and length are those of the episodes that ended first, which favours short ones; "
+    "to measure a policy, use rlightning-aio eval."
+)
+
+_Steps: TypeAlias = Annotated[
+    int | None,
+    typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
+]
+
+_Seconds: TypeAlias = Annotated[
+    float | None,
+    typer.Option(min=0.001, help="Seconds to collect for.", show_default="no limit"),
+]
+
+_MinResults: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Results to wait for in each collect.", show_default="half of the envs"
+    ),
+]
+
+_Trace: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
+]
+
+
+@dataclass
+class _Rollout:
+    """A rollout: what was asked for, and what was done."""
+
+    configs: Sequence[EnvConfig]
+    most_steps: int | None
+    most_seconds: float | None
+    min_results: int | None
+    seed: int | None
+    steps: int = 0
+    began: float = 0.0
+    ended: float = 0.0
+
+    @property
+    def seconds(self) -> float:
+        """From the first step sent to the last result."""
+        return self.ended - self.began
+
+    @property
+    def rate(self) -> float:
+        """Steps per second."""
+        return self.steps / self.seconds if self.seconds else 0.0
+
+    def left(self) -> tuple[int, float | None] | None:
+        """Return the steps and seconds that are left, or None at the end."""
+        steps = _ENDLESS if self.most_steps is None else self.most_steps - self.steps
+        seconds = self.most_seconds
+        if seconds is not None:
+            seconds -= time.monotonic() - self.began
+        return None if steps <= 0 or (seconds is not None and seconds <= 0) else (steps, seconds)
+
+
+def rollout(
+    config: Config,
+    overrides: Overrides = None,
+    steps: _Steps = None,
+    seconds: _Seconds = None,
+    policy: PolicyName = None,
+    seed: Seed = None,
+    min_results: _MinResults = None,
+    trace: _Trace = None,
+    as_json: AsJson = False,
+) -> None:
+    """Collect steps from a config's envs and print the numbers of the group.
+
+    Actions are sampled at random from the envs' action spaces, or come from the policy that
+    --policy names. It gets a BatchedData (one for each entry, if their spaces differ) and
+    returns actions, one row for each result, or a dict of columns with 'action', or a batch made
+    with its respond() method.
+    Ctrl-C ends the collection early and prints the numbers so far.
+
+    For example:
+
+        rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
+        rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
+        rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
+        rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
+        rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
+    """
+    check_seed(seed)
+    configs = load_config(config, overrides or ())
+    limit = _STEPS if steps is None and seconds is None else steps
+    done = _Rollout(configs, limit, seconds, min_results, seed)
+    group = rlightning_aio.build_env_group(list(configs), mixed_actions=True)
+    interrupted = completed = False
+    with contextlib.ExitStack() as stack:
+        chosen = load_policy(policy, stack) if policy else None
+        try:
+            with Progress() as progress, connections_logged():
+                run_interruptible(_collect(group, done, chosen, trace, progress))
+            completed = True
+        except KeyboardInterrupt:
+            interrupted = True
+            raise
+        finally:
+            # After an error, too: the numbers until then may be useful.
+            if completed or interrupted or done.steps:
+                _report(str(config), group, done, interrupted=interrupted, as_json=as_json)
+    if not done.steps:
+        raise RLightningError("no step has ended in that time; allow more with --seconds")
+
+
+async def _collect(
+    group: EnvGroup, done: _Rollout, policy: Any, trace: Path | None, progress: Progress
+) -> None:
+    progress.begin(f"starting {counted(len(group), 'env')}")
+    timeline = contextlib.nullcontext() if trace is None else group.trace(trace)
+    async with group:
+        with timeline:
+            for server in (group[env_id] for env_id in group.env_ids):
+                if isinstance(server, ServerHandle):
+                    progress.say(f"{server.env_id} listens at {server.address}")
+            progress.begin("first reset")
+            batch, _ = await group.reset(seed=done.seed)
+            respond = Responder(group, policy, done.seed)
+            limits = [] if done.most_steps is None else [counted(done.most_steps, "step")]
+            limits += [] if done.most_seconds is None else [f"for {done.most_seconds:g} s"]
+            progress.begin(f"collecting {' '.join(limits)}", done.most_steps or done.most_seconds)
+            done.began = done.ended = time.monotonic()
+            with ensure_auto_reset(group):
+                await respond_to_all(group, respond, batch)
+                await _go_on(group, done, respond, progress)
+
+
+async def _go_on(group: EnvGroup, done: _Rollout, respond: Responder, progress: Progress) -> None:
+    sub_envs = max(config.num_envs for config in done.configs)
+    wanted = done.min_results or default_min_results(group)
+
+    def words() -> str:
+        return f"{count(done.steps)} steps, {count(done.rate)} steps/s"
+
+    while (left := done.left()) is not None:
+        most, seconds = -(-left[0] // sub_envs), left[1]
+        try:
+            batch, _ = await group.collect_async(
+                min_results=min(wanted, most), max_results=most, deadline=seconds
+            )
+        except EnvFault:
+            raise  # Among them those of envs that raised `TimeoutError`.
+        except TimeoutError:
+            done.ended = time.monotonic()  # The time limit has passed while waiting.
+            return
+        done.steps, done.ended = done.steps + steps_in(batch), time.monotonic()
+        await respond_to_all(group, respond, batch)
+        await progress.show(done.steps if done.most_steps else done.seconds, words)
+
+
+def _report(
+    config: str, group: EnvGroup, done: _Rollout, *, interrupted: bool, as_json: bool
+) -> None:
+    numbers = group.metrics(by_entry=True)
+    if as_json:
+        print_json(
+            {
+                "config": config,
+                "interrupted": interrupted,
+                "seconds": done.seconds,
+                "steps": done.steps,
+                "steps_per_second": done.rate,
+                "metrics": numbers,
+            }
+        )
+        return
+    title = (
+        f"{'Interrupted after ' if interrupted else ''}{count(done.steps)} steps in "
+        f"{done.seconds:.1f} s: {count(done.rate)} steps/s"
+    )
+    entries = [config.name for config in done.configs]
+    entries = entries if len(entries) > 1 else []
+    table = named_columns(title, "", "all" if entries else "", *entries)
+    table.show_header = bool(entries)
+    for name in (name for name in numbers if name.count("/") == 1):
+        short = name.removeprefix("envs/")
+        own = [numbers.get(f"envs/{entry}/{short}") for entry in entries]
+        if numbers[name] or any(own):  # Most counters of failures are 0.
+            table.add_row(short, *(_text(value) for value in (numbers[name], *own)))
+    print_table(table)
+    print_lines([_BIAS] if numbers.get("envs/episode_return_mean") is not None else [])
+
+
+def _text(value: float | None) -> str:
+    if value is None or not math.isfinite(value):
+        return "-"
+    return count(value) if float(value).is_integer() and abs(value) < _LONG else f"{value:,.6g}"
