@@ -207,7 +207,7 @@ $(OPENENV)/installed: | $(OPENENV)/bin/python
 $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	grep -vE '^(mujoco|numpy|opencv|pygame-ce)' constraints.txt > $(ROBOTS)/constraints.txt
 	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable . metaworld==3.0.0 'mujoco<3.17' 'gym-pusht<0.2' 'gym-aloha<0.2' \
-	    anyio hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
+	    hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
 	$(PIP_INSTALL) --no-deps openpi-client==0.1.2
 	@touch $@
 

@@ -216,7 +216,7 @@ class EnvGroup:
 
         Envs that still owe a result are awaited.
         """
-        counter, due = self.step_counter, list[str]()
+        counter, due, owing = self.step_counter, list[str](), self._local_pending()
         steps: list[tuple[str, PolicyResponse]] = []
         for env_id, response in batch.items():
             core_id = self._core_id_of.get(env_id)
@@ -225,7 +225,7 @@ class EnvGroup:
             if core_id in self._servers:
                 steps.append((core_id, _for_client(core_id, response)))
                 continue
-            if core_id in self._local_pending():
+            if core_id in owing:
                 self._await([core_id])
             if counter is not None and counter.is_reached_max_steps(env_id):
                 due.append(core_id)
