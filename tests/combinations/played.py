@@ -122,7 +122,6 @@ class Kind:
 KINDS = {
     "plain": Kind(0, "disabled"),
     "same step": Kind(0, "same_step"),
-    "one, next step": Kind(1, "next_step"),
     "three, next step": Kind(3, "next_step"),
     "three, same step": Kind(3, "same_step"),
     "three together": Kind(3, "disabled"),
