@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from faults.striking import hear_of_interrupt, struck
 from kit.scripted import Counts
 
 import rlightning_aio.sync
-from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvRaised, NothingPending
 
 if TYPE_CHECKING:
@@ -36,12 +34,9 @@ class Serial(Counts):
 
     serial = 0
 
-    def number(self) -> int:
-        self.serial += 1
-        return self.serial
-
     def observed(self) -> Any:
-        return np.array([float(self.number())])
+        self.serial += 1
+        return np.array([float(self.serial)])
 
 
 class Answers:
@@ -52,10 +47,8 @@ class Answers:
         self.last = dict.fromkeys(group.env_ids, 0)
 
     def take(self, answer: Any) -> None:
-        """Take results: a batch, a result of one env, or the values of a call of all envs."""
-        if isinstance(answer, list):
-            pairs = zip(self.group.env_ids, answer, strict=True)
-        elif isinstance(answer, tuple):
+        """Take results: a batch, or a result of one env."""
+        if isinstance(answer, tuple):
             pairs = zip(answer[0].ids(), answer[0].observation[:, 0].tolist(), strict=True)
         else:
             pairs = iter([(answer.env_id, int(answer.observation[0]))])
@@ -64,23 +57,18 @@ class Answers:
             self.last[env_id] = serial
 
     def fail(self, fault: EnvRaised) -> None:
-        """Take the error of an env that Ctrl-C has interrupted, before or after it counted; that of
-        a call comes without the values of others.
-        """
+        """Take the error of an env that Ctrl-C has interrupted, before or after it counted."""
         assert fault.exception_type == "KeyboardInterrupt"
-        of_call = "raised in the call of" in str(fault)
-        for env_id in self.group.env_ids if of_call else [fault.env_id]:
-            self.last[env_id] = self.group[env_id].get_attr("serial")
+        self.last[fault.env_id] = self.group[fault.env_id].get_attr("serial")
 
     def take_outstanding(self) -> None:
-        for collect in (self.group.collect_async, partial(collect_calls, self.group)):
-            while True:
-                try:
-                    self.take(collect())
-                except NothingPending:
-                    break
-                except EnvRaised as fault:
-                    self.fail(fault)
+        while True:
+            try:
+                self.take(self.group.collect_async())
+            except NothingPending:
+                break
+            except EnvRaised as fault:
+                self.fail(fault)
 
 
 def step(group: Any, batch: Any) -> Any:
@@ -104,12 +92,7 @@ def reset_one(group: Any, batch: Any) -> Any:
     return group[batch.ids()[-1]].reset()
 
 
-def call(group: Any, batch: Any) -> Any:
-    send_calls(group, "number")
-    return collect_calls(group)
-
-
-USES = [step, step_async, step_one, reset, reset_one, call]
+USES = [step, step_async, step_one, reset, reset_one]
 
 
 @pytest.mark.parametrize("place", PLACES)

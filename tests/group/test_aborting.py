@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 from group.sample_envs import Gate
 
-from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
+from rlightning_aio import (
+    BatchedData,
+    NothingPending,
+    PolicyResponse,
+    UnknownEnv,
+    build_env_group,
+)
 from rlightning_aio._core.group.state.conditions import ABORTING, DEATH, LOST_EPISODE
-from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import EnvRaised, EpisodeLost, GroupClosed
 
 if TYPE_CHECKING:
@@ -117,21 +122,21 @@ async def test_a_reset_can_be_aborted(start: Any, entry: Any) -> None:
     assert batch.restarted.tolist() == [False, True, False, False]
 
 
-@pytest.mark.one_driver_for_each_place
-async def test_a_call_can_be_aborted(start: Any, entry: Any) -> None:
-    """Its env is free, and `collect_calls` says so."""
-    group = await start(entry)
-    await group.reset(seed=3)
-    send_calls(group, "get_attr", "label", env_ids=IDS[:2])
-    await group.abort(IDS[:1])
-    batch, _ = await group.step(steps(IDS[0]))
-    (outcome,) = await asyncio.gather(collect_calls(group), return_exceptions=True)
-    if isinstance(outcome, EpisodeLost):
-        assert outcome.env_id == IDS[0]
-    else:
-        assert outcome == ["outer"] * 2  # It had ended before.
-    assert batch.restarted.tolist() == [isinstance(outcome, EpisodeLost)]
-    await group.step(steps(*IDS))
+async def test_a_call_can_be_aborted(entry: dict[str, Any]) -> None:
+    """Its env is free, and the call says so."""
+    async with build_env_group(entry) as group:
+        await group.reset(seed=3)
+        call = asyncio.create_task(group.call("get_attr", "label", env_ids=IDS[:2]))
+        await asyncio.sleep(0)
+        await group.abort(IDS[:1])
+        (outcome,) = await asyncio.gather(call, return_exceptions=True)
+        if isinstance(outcome, EpisodeLost):
+            assert outcome.env_id == IDS[0]
+        else:
+            assert outcome == ["outer"] * 2  # It had ended before.
+        batch, _ = await group.step(steps(IDS[0]))
+        assert batch.restarted.tolist() == [isinstance(outcome, EpisodeLost)]
+        await group.step(steps(*IDS))
 
 
 @pytest.mark.one_driver_for_each_place
@@ -170,18 +175,6 @@ async def test_a_drain_raises_errors_once_all_envs_are_idle(start: Any, entry: A
     }
     assert group.pending == []
     assert len((await group.drain())[0]) == 0
-
-
-@pytest.mark.one_driver_for_each_place
-async def test_a_drain_drops_the_values_of_calls(start: Any, entry: Any) -> None:
-    group = await start(entry)
-    await group.reset(seed=3)
-    send_calls(group, "get_attr", "label")
-    await group.drain()
-    assert group.pending == []
-    with pytest.raises(NothingPending):
-        await collect_calls(group)
-    await group.step(steps(*IDS))
 
 
 @pytest.mark.one_driver_for_each_place

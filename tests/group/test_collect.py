@@ -23,7 +23,6 @@ from rlightning_aio import (
     NothingPending,
     PolicyResponse,
 )
-from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import GroupClosed, RLightningError
 
 if TYPE_CHECKING:
@@ -155,17 +154,6 @@ def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gat
     assert batch.ids() == ["gated-0"]
     with opened(gates[1]):
         assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
-
-
-def test_a_call_is_collected_after_its_deadline(sync_group: Any, gates: list[Gate]) -> None:
-    """The next call returns its value, and the envs stay in step."""
-    send_calls(sync_group, "wait_at_gate")
-    with gates[0].held(), pytest.raises(TimeoutError, match="calls have not returned within"):
-        collect_calls(sync_group, deadline=0.02)
-    with pytest.raises(ValueError, match="deadline must be a positive"):
-        collect_calls(sync_group, deadline=0)
-    with opened(*gates[1:]):
-        assert collect_calls(sync_group) == [None] * len(gates)
 
 
 def test_a_collect_that_times_out_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:

@@ -350,7 +350,7 @@ def test_a_call_returns_what_it_has_before_an_abort_does(new_group: NewGroup, en
 
 
 @pytest.mark.parametrize("ordinary", [True, False])
-@pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot", "send_calls"])
+@pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot"])
 def test_requests_that_were_sent_in_part_disturb_no_other_call(
     new_group: NewGroup, ask: str, ordinary: bool
 ) -> None:
@@ -366,7 +366,6 @@ def test_requests_that_were_sent_in_part_disturb_no_other_call(
         "step_async": lambda: group.steps.step_async(both, group.now),
         "reset": lambda: group.begin(core.reset(group.now, None, None, ids)).result(),
         "snapshot": lambda: group.begin(core.snapshot(group.now, ids)).result(),
-        "send_calls": lambda: core.calls.send_calls(group.now, ids, ("who", (), {})),
     }
     host: Any = group.hosts[1]
     with pytest.MonkeyPatch.context() as patch:
@@ -381,12 +380,10 @@ def test_requests_that_were_sent_in_part_disturb_no_other_call(
     assert not stepping.done
     group.finish(2)
     assert ids_of(stepping) == ["fake-2"]
-    if ask in ("snapshot", "send_calls"):
+    if ask == "snapshot":
         group.steps.step_async(steps(0), group.now)
         group.finish(0)
     assert ids_of(collect(group)) == ["fake-0"]
-    with pytest.raises(NothingPending):
-        group.begin(core.calls.collect_calls(group.now, None)).result()
 
 
 def run(group: FakeGroup, procedure: Any) -> Any:

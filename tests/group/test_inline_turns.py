@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kit.driven import INLINE, INLINE_SYNC, Place
+from kit.driven import INLINE
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio.calling import collect_calls, send_calls
 
 
 def test_inline_entries_take_turns() -> None:
@@ -62,29 +61,19 @@ async def test_a_cancelled_call_that_still_waits_for_its_turn_delays_no_request(
 
 
 @pytest.mark.timeout(60)
-@pytest.mark.parametrize(
-    ("place", "calls"),
-    [(INLINE, "two halves"), (INLINE, "a handle"), (INLINE_SYNC, "two halves")],
-)
-async def test_a_call_delays_no_ordinary_step_on_one_core(
-    place: Place, calls: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_call_delays_no_ordinary_step_on_one_core(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is executed in its turn, though a trainer that has no core to spare never looks around."""
     monkeypatch.setattr("rlightning_aio._core.group.setup.build.num_cores", lambda: 1)
     entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
-    async with place.build(entry) as group:
+    async with INLINE.build(entry) as group:
         for _ in range(12):  # As many batches as are compared with their spaces, and more.
             batch, _ = await group.reset(seed=0)
         core: Any = getattr(group, "wrapped", group)._core
         assert not core.tables.conditions.unusual
         core.supervisor.look_by = math.inf
-        if calls == "two halves":
-            send_calls(group, "get_attr", "gravity", env_ids=["pole-0"])
-            values = None
-        else:
-            values = asyncio.create_task(group["pole-0"].get_attr("gravity"))
-            await asyncio.sleep(0)
+        value = asyncio.create_task(group["pole-0"].get_attr("gravity"))
+        await asyncio.sleep(0)
         group.step_async(batch.take([1]).respond(action=[0]))
         batch, _ = await group.collect_async()
         assert batch.ids() == ["pole-1"]
-        assert (await collect_calls(group) if values is None else [await values]) == [9.8]
+        assert await value == 9.8

@@ -22,7 +22,6 @@ from rlightning_aio import (
     UnknownEnv,
 )
 from rlightning_aio.batch import joined
-from rlightning_aio.calling import collect_calls, send_calls
 
 # For decisions before any wait, and for handling results that have come.
 one_driver = pytest.mark.one_driver_for_each_place
@@ -236,16 +235,14 @@ async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
 
 @one_driver
 async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -> None:
-    """Results, values and errors, before they arrive and after."""
+    """Results and errors, before they arrive and after."""
     group = await start(ENTRY)
     assert group.pending == []
     await group.reset()
-    send_calls(group, "double", 1, env_ids=["probe-3"])
     group.step_async(responses(["probe-2", "probe-0"], 1, RAISE))
-    assert group.pending == ["probe-0", "probe-2", "probe-3"]
+    assert group.pending == ["probe-0", "probe-2"]
     batch, _ = await group.step(responses(["probe-1"], 1))
-    assert group.pending == ["probe-0", "probe-2", "probe-3"]
-    await collect_calls(group)
+    assert group.pending == ["probe-0", "probe-2"]
     left = {"probe-0", "probe-2"}
     while left:
         assert {*group.pending} == left
@@ -280,7 +277,6 @@ async def test_an_env_whose_error_was_not_collected_is_busy(start: Any, is_read:
         for send in (
             lambda: group.step_async(responses(["probe-0", "probe-1"], 1, 2)),
             lambda: group.reset_async(env_ids=["probe-1"]),
-            lambda: send_calls(group, "double", 1, env_ids=["probe-1"]),
         ):
             with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first, with collect_async"):
                 send()
@@ -403,27 +399,6 @@ async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
     group.reset_async(options={"pose": 1})
     batch, _ = await group.collect_async(wait_all=True)
     assert batch.info() == [{"options": {"pose": 1}}] * 4
-
-
-@one_driver
-async def test_calls_of_methods_run_at_once_and_are_collected_together(start: Any) -> None:
-    """Values are in the order of sending; an error leaves none behind."""
-    group = await start(ENTRY)
-    with pytest.raises(NothingPending, match="no call is outstanding"):
-        await collect_calls(group)
-    send_calls(group, "double", 1, env_ids=["probe-3", "probe-1"])
-    send_calls(group, "double", "ab", times=3, env_ids=["probe-0"])
-    with pytest.raises(EnvBusy, match="probe-0"):
-        send_calls(group, "double", 1)
-    assert await collect_calls(group) == [2, 2, "ababab"]
-    send_calls(group, "double", "ab", times="ab")
-    with pytest.raises(
-        EnvRaised, match=r"in the call of double\(\): TypeError.*still usable"
-    ) as caught:
-        await collect_calls(group)
-    assert sorted(error.env_id for error in (caught.value, *caught.value.others)) == IDS
-    send_calls(group, "double", 4)
-    assert await collect_calls(group) == [8] * 4
 
 
 @one_driver

@@ -34,7 +34,6 @@ from simulator.session import Session, action_of, stacked
 from simulator.world import Faults
 
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio.calling import collect_calls, send_calls
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
@@ -60,14 +59,13 @@ class Play(Session):
     model: Model
 
     def begin(self) -> None:
-        # Results that may be answered again, states that may be put back, calls in flight.
+        # Results that may be answered again, and states that may be put back.
         self.batches: list[BatchedData] = []
         self.snapshots: list[tuple[bytes, list[tuple[Env, Any]]]] = []
-        self.calls: list[tuple[list[Env], int]] = []
         self.tasks: list[asyncio.Task[None]] = []
         self.context: Any = None
         self.trace: Any = None
-        self.collecting = self.collecting_calls = False
+        self.collecting = False
         self.kept: list[tuple[Any, Any]] = []
         self.unread: list[tuple[BatchedData, dict[str, Any]]] = []
         self.owners = 0
@@ -153,8 +151,6 @@ class Play(Session):
 
     async def finish(self) -> None:
         await self.look_at_tasks(wait=True)
-        while self.calls:
-            await self.interruptible(self.op_collect_calls(Random(0)))
         for client in self.clients:
             await self.interruptible(self.lose(client))
         while self.model.pending(COLLECTOR):
@@ -741,60 +737,6 @@ class Play(Session):
         require(shown in possible, "another state", shown, possible)
         require(tuple(echo) == (token,), "another call's arguments", echo)
 
-    async def op_send_calls(self, rng: Random) -> None:
-        envs = self.some(rng, self.local(self.model.idle()))
-        if not envs or self.collecting_calls:
-            return
-        token = rng.randrange(TOKENS)
-        requests = {env.env_id: Request("call") for env in envs}
-        self.send(requests, "calls")
-        try:
-            send_calls(self.group, "peek", token, env_ids=[*requests])
-        except WorkerDied as fault:
-            self.refuse_dead(fault, requests)
-        except EnvBusy:
-            self.refuse_busy(requests)
-        except KeyboardInterrupt:
-            if set(requests) <= set(self.group.pending):
-                self.calls.append((envs, token))
-            else:
-                self.withdraw(requests)
-            raise
-        else:
-            self.calls.append((envs, token))
-
-    async def op_collect_calls(self, rng: Random) -> None:
-        if self.collecting_calls:
-            with self.expected(RLightningError, "a second collect_calls"):
-                await self.done(collect_calls(self.group))
-            return
-        if not self.calls:
-            with self.expected(NothingPending, "a collect of no calls"):
-                await self.done(collect_calls(self.group))
-            return
-        self.collecting_calls = True
-        try:
-            values = await self.done(collect_calls(self.group, self.hang))
-        except EnvFault as fault:
-            self.note_faults(fault)
-            cut_off = any(env.request.interrupted for env in self.model.pending("calls"))
-            require(
-                isinstance(fault, WorkerDied) or (cut_off and "KeyboardInterrupt" in str(fault)),
-                "an error of a call that has none", repr(fault),
-            )  # fmt: skip
-            self.fail_values(
-                fault, {env.env_id: env.request for env in self.model.pending("calls")}
-            )
-            self.calls = []
-            return
-        finally:
-            self.collecting_calls = False
-        sent = [(env, token) for envs, token in self.calls for env in envs]
-        self.calls = []
-        require(len(values) == len(sent), "as many values as calls", values)
-        for (env, token), value in zip(sent, values, strict=True):
-            self.take_value(env, value, token)
-
     async def op_mark(self, rng: Random) -> None:
         envs = self.local(self.model.idle())
         if not envs:
@@ -1075,7 +1017,7 @@ class Play(Session):
     async def op_drain(self, rng: Random) -> None:
         """Take what is ready, and end the rest."""
         pending = self.model.pending()
-        if self.calls or not self.may_abort() or not all(map(self.is_abortable, pending)):
+        if not self.may_abort() or not all(map(self.is_abortable, pending)):
             return
         deadline = rng.choice([None, 1e-4, 0.2])
         try:
@@ -1160,7 +1102,6 @@ class Play(Session):
             for call in (
                 lambda: self.group.step_async(BatchedData(ids, values)),
                 lambda: self.group.reset_async(env_ids=ids),
-                lambda: send_calls(self.group, "peek", 0, env_ids=ids),
             ):
                 with self.expected(EnvBusy, kind):
                     call()

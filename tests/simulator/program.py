@@ -206,8 +206,6 @@ OPS: dict[str, tuple[int, str | None]] = {
     "enter": (4, "auto_reset"),
     "leave": (2, "auto_reset"),
     "call": (3, "calls"),
-    "send_calls": (3, "calls"),
-    "collect_calls": (3, "calls"),
     "mark": (2, "calls"),
     "handle": (4, "handles"),
     "episode": (2, "handles"),

@@ -163,7 +163,7 @@ class Session:
         try:
             return await doing
         except KeyboardInterrupt:
-            sends = name in ("step_async", "reset_async", "send_calls")
+            sends = name in ("step_async", "reset_async")
             self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
             self.say("   Ctrl-C was raised")
             self.note_interrupt()

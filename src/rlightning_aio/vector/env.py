@@ -15,10 +15,10 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
+from rlightning_aio._core.group.api.sync import due_for_reset
 from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import lost_rows, reported_infos
-from rlightning_aio.calling import due_for_reset
 from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.errors import BadAction, EnvFault, SnapshotError

@@ -22,11 +22,14 @@ from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from rlightning_aio._core.group.setup.plan import Plan
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "driver_of"]
+__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "driver_of", "due_for_reset"]
 
 T = TypeVar("T")
 A = TypeVarTuple("A")
@@ -177,6 +180,12 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
 def driver_of(group: EnvGroup) -> SyncDriver:
     """Return the driver of a group, for code that makes one call of several calls."""
     return group._driver  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
+
+
+def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:
+    """Return for each env whether its next step is a reset, while `auto_reset` is open."""
+    core = group._core  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
+    return core.tables.continuity.due.copy()
 
 
 def build_env_group(

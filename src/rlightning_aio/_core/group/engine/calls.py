@@ -5,15 +5,12 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
-
-from rlightning_aio._core.group.state.request_states import NOBODY
-from rlightning_aio.errors import EpisodeLost, NothingPending, RLightningError
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
@@ -21,7 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio.errors import EnvFault
 
 __all__ = ["Calls", "values_of"]
 
@@ -30,19 +26,15 @@ Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
 
 
 class Calls:
-    """Send method calls, and collect the returned values."""
+    """Call methods, and wait for the returned values."""
 
     def __init__(self, tables: Tables, dispatch: Dispatch, waiting: Waiting) -> None:
         self._observed = tables.observed
         self._envs = tables.envs
         self._requests = tables.requests
-        self._lifetime = tables.lifetime
         self._dispatch = dispatch
         self._intake = waiting.intake
         self._waiting = waiting
-        # Calls that `collect_calls` returns next.
-        self._sent: list[Ticket] = []
-        self._collecting = False
 
     def call_one(self, now: float, slot: int, call: Call) -> Procedure[Any]:
         """Call a method of one env and return its value."""
@@ -61,13 +53,6 @@ class Calls:
         send = partial(self._send_calls, now, slots, call)
         ticket, _ = yield from self._waiting.ask(now, slots, send, call[0])
         return values_of([ticket])
-
-    def send_calls(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
-        """Call a method without waiting; `collect_calls` returns the values."""
-        with self._observed.call("send_calls", now):
-            slots = self._slots(env_ids)
-            send = partial(self._send_calls, now, slots, call)
-            self._sent.append(self._waiting.begin(slots, send, call[0]))
 
     def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call, ticket: Ticket) -> None:
         what = f"the arguments of {call[0]}()"
@@ -102,53 +87,6 @@ class Calls:
         entries = self._requests.issue(slots, op, ticket.owner, now)
         self._requests.numbering.num_values[slots] += 1
         self._dispatch.hand_over(slots, entries, packed)
-
-    def drop(self) -> list[EnvFault]:
-        """Drop the calls of `send_calls`, all of which have ended; return errors of their envs."""
-        if self._collecting:
-            return []  # Whoever collects them gets what they led to.
-        tickets, self._sent = self._sent, []
-        for ticket in tickets:
-            self._requests.settle(ticket)
-        faults = [fault for ticket in tickets for fault in ticket.faults]
-        return [fault for fault in faults if not isinstance(fault, EpisodeLost)]
-
-    def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
-        """Wait for all calls of `send_calls`, and return their values in order of sending."""
-        with self._observed.call("collect_calls", now):
-            return (yield from self._collect(now, deadline))
-
-    def _collect(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
-        self._lifetime.check_open()
-        if self._collecting:
-            raise RLightningError(
-                "another collect_calls is already waiting on this group; one at a time"
-            )
-        if not self._sent:
-            raise NothingPending("no call is outstanding; send one with send_calls")
-        end = None if deadline is None else now + deadline
-        self._collecting = True
-        try:
-            yield from self._waiting.until(now, self._num_outstanding, end)
-        finally:
-            self._collecting = False
-        if remaining := self._num_outstanding():
-            raise TimeoutError(
-                f"{remaining} calls have not returned within {deadline} s; nothing is lost, the "
-                "next collect_calls gets their values"
-            )
-        tickets, self._sent = self._sent, []
-        for ticket in tickets:
-            self._requests.settle(ticket)
-        return values_of(tickets)
-
-    def await_cancelled(self, now: float) -> Procedure[None]:
-        """Wait until no call runs in any env that nobody waits for."""
-        owner = self._requests.owner
-        yield from self._waiting.until(now, lambda: int(np.count_nonzero(owner == NOBODY)))
-
-    def _num_outstanding(self) -> int:
-        return sum(ticket.remaining for ticket in self._sent)
 
 
 def values_of(tickets: Sequence[Ticket]) -> list[Any]:

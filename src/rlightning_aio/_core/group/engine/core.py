@@ -180,7 +180,6 @@ class Core:
             yield from self._aborts.end(self._all_slots, now)
         finally:
             self.steps.collecting = False
-        collector.note_faults(self.calls.drop())
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
             slots = collector.pop_ready(collector.num_ready)

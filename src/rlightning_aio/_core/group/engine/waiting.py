@@ -286,18 +286,6 @@ class Waiting:
             if self._tickets.parked:
                 self._hand_on()
 
-    def begin(
-        self, slots: NDArray[np.intp], send: Callable[[Ticket], object], method: str = ""
-    ) -> Ticket:
-        """Send requests, as `ask` does, and return their ticket."""
-        ticket = self._requests.tickets.open(slots, method=method)
-        try:
-            send(ticket)
-        except BaseException:
-            self._give_up(ticket)
-            raise
-        return ticket
-
     def _give_up(self, ticket: Ticket) -> None:
         """Close a ticket whose call no longer waits."""
         self._requests.give_up(ticket)
