@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.trees import Node, Tree
 
 __all__ = [
-    "Fit",
     "Leaf",
     "Misfit",
     "Rows",
@@ -160,20 +159,13 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
     return array
 
 
-Fit: TypeAlias = "Callable[[Any, Leaf, str], NDArray[Any]]"
-"""`fitted`, or a function that also notes what it converts."""
-
-
 def fitted_tree(
     space: gym.Space[Any],
     value: Any,
     what: str,
     path: tuple[str | int, ...] = (),
-    fit: Fit = fitted,
 ) -> Tree:
     """Convert `value` to arrays with the shapes and dtypes of `space`, without needless copies.
-
-    What isn't as in `space` goes through `fit`.
 
     Raises:
         Misfit: see `row_writer`.
@@ -183,15 +175,15 @@ def fitted_tree(
     if is_dict(space):
         check_keys(value, space.spaces.keys(), what, path)
         parts = space.spaces.items()
-        return {k: fitted_tree(inner, value[k], what, (*path, k), fit) for k, inner in parts}
+        return {k: fitted_tree(inner, value[k], what, (*path, k)) for k, inner in parts}
     if is_tuple(space):
         _check_length(value, len(space.spaces), what, path)
         return tuple(
-            fitted_tree(inner, part, what, (*path, position), fit)
+            fitted_tree(inner, part, what, (*path, position))
             for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
         )
     assert is_array(space)
-    return fit(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
+    return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
 
 
 def check_keys(
@@ -219,39 +211,35 @@ def row_writer(
     row: int,
     what: str,
     path: tuple[str | int, ...] = (),
-    fit: Fit = fitted,
 ) -> Callable[[Any], None]:
     """Make a function that copies a value of `space` into `row` of `tree`.
 
-    Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments. What isn't
-    an array as in `space` goes through `fit`.
+    Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments.
 
     Raises (from the function):
         Misfit: the value has another shape, structure or kind of dtype, or numbers out of range;
             a part of it may have been written.
     """
     if is_dict(space):
-        return _dict_writer(space, tree, row, what, path, fit)
+        return _dict_writer(space, tree, row, what, path)
     if is_tuple(space):
-        return _tuple_writer(space, tree, row, what, path, fit)
+        return _tuple_writer(space, tree, row, what, path)
     leaf = Leaf(path, tree.shape[1:], tree.dtype)
     if not leaf.shape:
-        return _number_writer(tree, row, leaf, what, fit)
+        return _number_writer(tree, row, leaf, what)
     view, shape, dtype = tree[row], leaf.shape, leaf.dtype
 
     def write(value: Any) -> None:
         if type(value) is not np.ndarray or value.shape != shape or value.dtype is not dtype:
-            value = fit(value, leaf, what)
+            value = fitted(value, leaf, what)
         view[...] = value
 
     return write
 
 
-def _number_writer(
-    column: NDArray[Any], row: int, leaf: Leaf, what: str, fit: Fit
-) -> Callable[[Any], None]:
+def _number_writer(column: NDArray[Any], row: int, leaf: Leaf, what: str) -> Callable[[Any], None]:
     def write(value: Any) -> None:
-        column[row] = fit(value, leaf, what)
+        column[row] = fitted(value, leaf, what)
 
     return write
 
@@ -262,10 +250,9 @@ def _dict_writer(
     row: int,
     what: str,
     path: tuple[str | int, ...],
-    fit: Fit,
 ) -> Callable[[Any], None]:
     writers = {
-        key: row_writer(inner, tree[key], row, what, (*path, key), fit)
+        key: row_writer(inner, tree[key], row, what, (*path, key))
         for key, inner in space.spaces.items()
     }
 
@@ -283,10 +270,9 @@ def _tuple_writer(
     row: int,
     what: str,
     path: tuple[str | int, ...],
-    fit: Fit,
 ) -> Callable[[Any], None]:
     writers = [
-        row_writer(inner, part, row, what, (*path, position), fit)
+        row_writer(inner, part, row, what, (*path, position))
         for position, (inner, part) in enumerate(zip(space.spaces, tree, strict=True))
     ]
 

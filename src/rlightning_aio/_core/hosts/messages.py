@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from rlightning_aio.types import ClientTraits, EnvMeta
 
 __all__ = [
-    "CASTS",
     "NO_ACTION",
     "STEP_IN_ROW",
     "AttachOrder",
@@ -72,11 +71,6 @@ NO_ACTION: Final = _Marker.NO_ACTION
 """Sent in place of an action if only its extras travel out of band."""
 STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 """The action and the extras of a step that has no arguments out of band."""
-CASTS: Final = "rlightning_aio.casts"
-"""The name of a call to the runner instead of the env, which no method can have. It returns the
-
-of observations that were noted since the first such call.
-"""
 OutOfBand: TypeAlias = dict[str, Any]
 """The part of a result that has no place in its row. Keys: ``observation``, ``info``, ``extra``
 (the result's ``_extra``), ``ret`` (the whole result)."""

@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["BRIEF_US", "HINT_AFTER_BATCHES", "TINY_US", "Hints", "Spent", "hint", "waits"]
+__all__ = ["HINT_AFTER_BATCHES", "Hints", "Spent", "hint", "waits"]
 
 HINT_AFTER_BATCHES: Final = 1000
 _FIRST_LOOK: Final = 8
 """Number of batches after which envs are past their first steps, which may compile and load."""
 _SHORT_US: Final = 1000.0
 """Limit of steps that compute, as in simulators; robots wait longer."""
-BRIEF_US: Final = 200.0
+_BRIEF_US: Final = 200.0
 """Limit of steps that are no longer than what it costs to wake the process of each."""
-TINY_US: Final = 30.0
+_TINY_US: Final = 30.0
 """Limit of steps that take less time than the way to a worker and back."""
 _ENOUGH_NS: Final = 20_000_000
 _ENOUGH_RESULTS: Final = 16
@@ -158,7 +158,7 @@ class Hints:
         if np.count_nonzero(own) < _ENOUGH_RESULTS:
             return
         step_us = float(np.median((done - begun)[own])) / 1e3
-        if step_us < BRIEF_US:
+        if step_us < _BRIEF_US:
             self._since[name] = None
             _log.warning("%s", _advice_to_share(name, len(records), self._num_cores, step_us))
 
@@ -255,7 +255,7 @@ def hint(
                 f"cores: several envs in each (envs_per_process: "
                 f"{-(-config.num_workers // num_cores)}) would be faster"
             )
-        if config.num_workers == 1 and workers == 1 and step < TINY_US and transfer > 2 * step:
+        if config.num_workers == 1 and workers == 1 and step < _TINY_US and transfer > 2 * step:
             return (
                 f"{measured}: entry {config.name!r} would be faster in this process "
                 "(placement: inline)"

@@ -19,7 +19,7 @@ import numpy as np
 from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
 from rlightning_aio.envs.base import result_of
 from rlightning_aio.protocol import kernel
-from rlightning_aio.protocol.columns import fitted, fitted_tree, row_reader, row_writer
+from rlightning_aio.protocol.columns import fitted_tree, row_reader, row_writer
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.trees import as_numpy, copied, holds_tensor
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput
     from rlightning_aio.envs.fast_path import BareResult, BareStep
-    from rlightning_aio.protocol.columns import Fit
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset, MultiAgentEnvRet
 
@@ -98,7 +97,11 @@ class RowWriter:
         self._stays_here = stays_here
         layout = slab.layout
         self._hands_over = layout.observations_out_of_band
-        self.convert_by(fitted)
+        self._write_observation: Callable[[Any], None] | None = None
+        if slab.observation is not None:
+            self._write_observation = row_writer(
+                layout.observation_space, slab.observation, row, "observation"
+            )
         self._infos = InfoWriter(memoryview(slab.info[row]), announce)
         self._last_out_of_band: OutOfBand = {}
         self.whole: Any = None
@@ -114,14 +117,6 @@ class RowWriter:
             slab.over[row, ...],
             autoreset,
         )
-
-    def convert_by(self, fit: Fit) -> None:
-        """Convert observations by `fit` from now on; call `short_stepper` again."""
-        self._fit = fit
-        self._write_observation: Callable[[Any], None] | None = None
-        space, column = self._slab.layout.observation_space, self._slab.observation
-        if column is not None:
-            self._write_observation = row_writer(space, column, self._row, "observation", fit=fit)
 
     def write_step(
         self,
@@ -322,7 +317,7 @@ class RowWriter:
             observation = as_numpy(observation)
         if self._hands_over:
             space = self._slab.layout.observation_space
-            observation = fitted_tree(space, observation, "observation", fit=self._fit)
+            observation = fitted_tree(space, observation, "observation")
             return self._kept({"observation": observation, "info": info}, is_fresh=is_fresh)
         out_of_band: OutOfBand = {}
         if self._write_observation is None:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 import numpy as np
 
 from rlightning_aio._core.hosts.messages import (
-    CASTS,
     NO_ACTION,
     STEP_IN_ROW,
     Attached,
@@ -27,7 +26,6 @@ from rlightning_aio._core.hosts.messages import (
     NewSchema,
     OutOfBand,
 )
-from rlightning_aio._core.hosts.running.casts import Casts
 from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.env_steps import step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
@@ -52,7 +50,6 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
-    from rlightning_aio._core.hosts.running.casts import Cast
     from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio._core.hosts.running.row_writer import ShownResult
     from rlightning_aio.envs.base import BaseEnv
@@ -130,7 +127,6 @@ class EnvRunner:
         self.begin_step: Callable[[], Execute] | None = None
         self._read_action: Callable[[], Any] = _no_action
         self._has_result = False
-        self._casts: Casts | None = None
         self._attach_again: Callable[[], None]
         self._adopt(env)
 
@@ -175,8 +171,6 @@ class EnvRunner:
             announce=announce,
             stays_here=self.inline,
         )
-        if self._casts is not None:
-            self._writer.convert_by(self._casts.fitted)
         self._has_result = False
         if slab.action is not None:
             self._read_action = row_reader(slab.action, row)
@@ -222,8 +216,6 @@ class EnvRunner:
             return self._snapshot, _outcome
         if op == Operation.RESTORE:
             return partial(self._restore, *arguments), self._finish_restore
-        if arguments[0] == CASTS:
-            return self._noted_casts, _outcome
         return partial(call_env, self.env, *arguments), _outcome
 
     def _snapshot(self) -> EnvState:
@@ -263,14 +255,6 @@ class EnvRunner:
         out_of_band = self._writer.write_shown(shown_result)
         self._note_reset()
         return out_of_band
-
-    def _noted_casts(self) -> list[Cast]:
-        """Return what was converted since the first call, which begins to note it."""
-        if self._casts is None:
-            self._casts = Casts()
-            self._writer.convert_by(self._casts.fitted)
-            self._bind()
-        return self._casts.found()
 
     def on_stepped(self, stepped: Callable[[], None]) -> bool:
         """Have the env call `stepped`, see `FastPath.on_stepped`; also one that is rebuilt."""
