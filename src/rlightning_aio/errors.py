@@ -13,6 +13,8 @@ import functools
 import traceback
 from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
+import gymnasium.error
+
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
@@ -33,6 +35,7 @@ __all__ = [
     "NothingPending",
     "PolicyServerError",
     "RLightningError",
+    "ResetNeeded",
     "SnapshotError",
     "StartFailed",
     "UnknownEnv",
@@ -44,7 +47,7 @@ class RLightningError(Exception):
     """Base of all errors of this package.
 
     It is the class of those that no program needs to tell from others: a group was used before
-    `init`, a replay can't follow its record.
+    `init`, or from another thread.
 
     They can be pickled and copied, with their attributes; a cause that is not an error of this
     package is converted to its text.
@@ -100,6 +103,13 @@ class NothingPending(RLightningError, RuntimeError):
 
 class PolicyServerError(RLightningError, ConnectionError):
     """A policy server is missing or silent, reports an error, or breaks its protocol."""
+
+
+class ResetNeeded(RLightningError, gymnasium.error.ResetNeeded):
+    """The episodes of a `Collector` were lost with a call that Ctrl-C has interrupted.
+
+    It is Gymnasium's error of that name, too.
+    """
 
 
 class GroupClosed(RLightningError, RuntimeError):

@@ -432,29 +432,6 @@ def test_a_bad_answer_of_a_policy_raises_and_the_policy_is_called_again(
         assert collector.collect().index.tolist() == [0, 0, 1, 1]
 
 
-@pytest.mark.parametrize("sent", [1, 2])
-def test_ctrl_c_after_a_step_was_sent_loses_nothing(sent: int) -> None:
-    """A synchronous group raises it when the requests are on their way."""
-    group = poles(2)
-    with group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=6, seed=3)
-        original, calls = group.step_async, []
-
-        def interrupted(batch: BatchedData) -> None:
-            original(batch)
-            calls.append(batch)
-            if len(calls) == sent:
-                raise KeyboardInterrupt
-
-        group.step_async = interrupted
-        with pytest.raises(KeyboardInterrupt):
-            collector.collect()
-        found = collector.collect()
-    with poles(2) as again, again.auto_reset():
-        expected = Collector(again, zeros, num_transitions=6, seed=3).collect()
-    np.testing.assert_array_equal(found.observation, expected.observation)
-
-
 def test_a_policy_must_give_the_same_columns_each_time() -> None:
     """With the same shape and kind of number: 0.5 is not an integer."""
     for more in (

@@ -1,4 +1,4 @@
-"""Collectors that are cut off, whose envs raise, or whose group others use in between.
+"""Collectors that are cancelled or begin anew, and whose envs raise.
 
 Nothing is lost or invented: each env's transitions are those that it must have made.
 """
@@ -27,6 +27,7 @@ from kit.scripted import Awaitable, Counts
 from patience import HANG
 
 import rlightning_aio as rl
+import rlightning_aio.sync
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import EnvRaised, NothingPending, RLightningError, WorkerDied
 from rlightning_aio.evaluation import evaluate
@@ -235,31 +236,23 @@ def steps_of(found: list[Rollout]) -> dict[int, list[tuple[int, int]]]:
     return made
 
 
-async def reset_it(group: Any, fault: EnvRaised) -> None:
-    await group.reset(env_ids=[fault.env_id])
-
-
-async def reset_it_for_a_task(group: Any, fault: EnvRaised) -> None:
-    await group.reset(options={"episode": 500}, env_ids=[fault.env_id])
-
-
 async def send_a_reset(group: Any, fault: EnvRaised) -> None:
     group.reset_async(env_ids=[fault.env_id])
 
 
-async def reset_it_by_its_handle(group: Any, fault: EnvRaised) -> None:
-    await group[fault.env_id].reset()
+async def send_a_reset_for_a_task(group: Any, fault: EnvRaised) -> None:
+    group.reset_async(options={"episode": 500}, env_ids=[fault.env_id])
 
 
 async def do_nothing(group: Any, fault: EnvRaised) -> None:
     """The collector resets it."""
 
 
-GO_ON = [reset_it, reset_it_for_a_task, send_a_reset, reset_it_by_its_handle, do_nothing]
+GO_ON = [send_a_reset, send_a_reset_for_a_task, do_nothing]
 RAISING = [
     *itertools.product([INLINE_SYNC], STYLES, GO_ON, [(1,)]),
     *itertools.product([LOOP, SEVERAL], STYLES[::3], GO_ON[:1], [(1,)]),
-    *itertools.product([INLINE_SYNC], STYLES[::3], [reset_it, do_nothing], [(0, 1, 2, 3)]),
+    *itertools.product([INLINE_SYNC], STYLES[::3], GO_ON[::2], [(0, 1, 2, 3)]),
 ]
 
 
@@ -280,7 +273,7 @@ async def test_an_env_that_raised_is_taken_back(
                     raised.append(fault.env_id)
                     await go_on(group, fault)
     assert len(raised) == len(numbers)
-    again = 500 if go_on is reset_it_for_a_task else 2
+    again = 500 if go_on is send_a_reset_for_a_task else 2
     for number, steps in steps_of(found).items():
         begun = 2 if number in numbers else len(steps)
         assert steps[:begun] == [(1, step) for step in range(begun)]
@@ -319,75 +312,100 @@ async def test_a_collector_begins_after_envs_have_raised_in_their_first_reset(
     assert all(steps_of(found).values())
 
 
-async def reset_two(group: Any) -> None:
-    await group.reset(options={"episode": 500}, env_ids=["a-1", "b-0"])
+async def nothing(group: Any, collector: Any) -> None:
+    collector.restart()
 
 
-async def reset_all(group: Any) -> None:
-    await group.reset(options={"episode": 500})
-
-
-async def send_resets(group: Any) -> None:
-    group.reset_async(options={"episode": 500}, env_ids=["a-1", "b-0"])
-
-
-async def reset_and_call(group: Any) -> None:
-    await reset_two(group)
-    await group["a-0"].get_attr("resets")
-    await group["a-1"].get_attr("resets")
-
-
-async def reset_twice(group: Any) -> None:
-    await group.reset(options={"episode": 400}, env_ids=["a-1", "b-0"])
-    await reset_two(group)
-
-
-async def step_all(group: Any) -> None:
-    batch, _ = await group.reset(options={"episode": 499})
+async def steps(group: Any, collector: Any) -> None:
+    batch, _ = await group.reset()
     await group.step(batch.respond(action=np.zeros(4, int)))
-    await group["b-1"].get_attr("resets")
+    collector.restart()
 
 
-async def restore(group: Any) -> None:
-    kept = await group.snapshot(env_ids=["a-1", "b-0"])
-    await group.reset(env_ids=["a-1", "b-0"])
-    await group.restore(kept, env_ids=["a-1", "b-0"])
+async def requests(group: Any, collector: Any) -> None:
+    """What they owe is dropped, be it a result or an error."""
+    batch, _ = await group.reset()
+    group.step_async(batch.respond(action=np.array([0, 1, 0, 0])))
+    collector.restart()
 
 
-async def only_call(group: Any) -> None:
-    for env_id in group.env_ids:
-        await group[env_id].get_attr("resets")
+async def a_reset(group: Any, collector: Any) -> None:
+    await group.reset()
+    collector.restart(batch=(await group.reset(options={"episode": 500}))[0])
+
+
+async def a_restore(group: Any, collector: Any) -> None:
+    kept = await group.snapshot()
+    await group.reset()
+    collector.restart(batch=(await group.restore(kept))[0])
 
 
 BETWEEN = {
-    reset_two: (1, 2), reset_all: (0, 1, 2, 3), send_resets: (1, 2), reset_and_call: (1, 2),
-    reset_twice: (1, 2), step_all: (0, 1, 2, 3), restore: (), only_call: (),
+    nothing: (2, 0), steps: (3, 0), requests: (3, 0), a_reset: (500, 0), a_restore: (1, 3),
 }  # fmt: skip
-"""What others do between two calls, and numbers of the envs that are in another episode then."""
+"""What a program does between two calls, and the episode and step with which they go on."""
 
 
-@pytest.mark.parametrize("place", [INLINE_SYNC])
+@pytest.mark.parametrize("place", [INLINE_SYNC, LOOP])
 @pytest.mark.parametrize("between", BETWEEN)
 @pytest.mark.parametrize("style", STYLES)
-async def test_a_collector_goes_on_from_where_others_have_left_the_envs(
+async def test_a_restarted_collector_begins_where_it_is_told_to(
     style: str, between: Any, place: Place
 ) -> None:
-    """Its own results from before are old, so no action answers them."""
+    """All episodes anew, or from a batch; it has forgotten its own results."""
     found: list[Rollout] = []
+    if place is LOOP and between is a_restore:
+        pytest.skip("such envs have no snapshots")
     async with numbered(place) as group:
         with group.auto_reset(math.inf):
             collector = collector_of(group, style, failing(), min_results=4)
             found += parts_of(await done(collector.collect()))
             assert not group.pending
-            await between(group)
+            await between(group, collector)
             for _ in range(2):
                 found += parts_of(await done(collector.collect()))
-    for number, steps in steps_of(found).items():
-        moved = number in BETWEEN[between]
-        assert steps[:3] == [(1, step) for step in range(3)]
-        again = [(500, step) if moved else (1, 3 + step) for step in range(len(steps) - 3)]
-        assert steps[3:] == again
+    episode, step = BETWEEN[between]
+    for steps in steps_of(found).values():
+        assert steps[:3] == [(1, k) for k in range(3)]
+        assert steps[3:] == [(episode, step + k) for k in range(len(steps) - 3)]
         assert len(steps) > 5
+
+
+async def test_a_restart_needs_all_envs_and_no_call_in_progress() -> None:
+    async with numbered(INLINE) as group:
+        collector: Any = Collector(group, failing(), num_transitions=4)
+        batch, _ = await group.reset(env_ids=["a-0", "b-0", "b-1"])
+        with pytest.raises(ValueError, match=r"no result of env 'a-1'"):
+            collector.restart(batch=batch)
+        with pytest.raises(ValueError, match="a seed is of a reset"):
+            collector.restart(3, batch=batch)
+        collecting = asyncio.create_task(collector.collect())
+        await asyncio.sleep(0)
+        with pytest.raises(RuntimeError, match="in progress"):
+            collector.restart()
+        await collecting
+
+
+def test_a_collect_after_ctrl_c_asks_for_a_restart() -> None:
+    """Also if the policy is interrupted; nothing of the interrupted call comes back."""
+    presses = [False, False, True]
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        if presses and presses.pop(0):
+            raise KeyboardInterrupt
+        return failing()(batch)
+
+    tasks = [lambda k=k: Numbered(k) for k in range(4)]
+    with rlightning_aio.sync.build_env_group(tasks, placement="inline") as group:
+        collector = Collector(group, policy, num_transitions=24, min_results=4)
+        with pytest.raises(KeyboardInterrupt):
+            collector.collect()
+        for kind in (rl.ResetNeeded, gym.error.ResetNeeded):
+            with pytest.raises(kind, match=r"restart\(seed=…\)"):
+                collector.collect()
+        collector.restart()
+        rollout = collector.collect()
+    assert all(own[0] == (2, 0) for own in steps_of([rollout]).values())
 
 
 @pytest.mark.parametrize("style", STYLES[2:])
@@ -399,6 +417,7 @@ async def test_an_evaluation_between_two_blocks_ends_their_chains(style: str) ->
             collector = collector_of(group, style, failing())
             found += parts_of(await collector.collect())
             await evaluate(group, lambda batch: failing()(batch)["action"], 1)
+            collector.restart()
             found += parts_of(await collector.collect())
     for steps in steps_of(found).values():
         assert steps == [(1, 0), (1, 1), (1, 2), (3, 0), (3, 1), (3, 2)]
@@ -455,23 +474,59 @@ async def test_envs_at_work_are_waited_for_after_others_were_given_up() -> None:
             assert {*rollout.index.tolist()} <= {2, 3}
 
 
-async def test_an_env_that_may_move_something_real_is_reset_by_nobody_else(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.fixture
+def moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All envs move something real."""
     monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+
+
+@pytest.mark.usefixtures("moving")
+async def test_an_env_that_may_move_something_real_is_reset_by_nobody_else() -> None:
+    """The others go on without it."""
     async with numbered(INLINE) as group:
         with group.auto_reset(math.inf):
             collector: Any = Collector(group, failing(1), num_transitions=12)
             with pytest.raises(EnvRaised) as raised:
                 await collector.collect()
+            found = [copied(await collector.collect()) for _ in range(2)]
+            assert 1 not in found[1].index
+            await send_a_reset(group, raised.value)
+            found += [copied(await collector.collect()) for _ in range(4)]
+            assert (2, 0) in steps_of(found)[1]
+
+
+@pytest.mark.usefixtures("moving")
+@pytest.mark.parametrize(("style", "numbers"), [("blocks", (1,)), ("chains", (0, 1, 2, 3))])
+async def test_an_env_that_may_move_something_real_is_asked_for_where_it_is_needed(
+    style: str, numbers: tuple[int, ...]
+) -> None:
+    """A block needs all envs, and a chain one of them."""
+    async with numbered(INLINE) as group:
+        with group.auto_reset(math.inf):
+            collector = collector_of(group, style, failing(*numbers))
+            for _ in numbers:
+                with pytest.raises(EnvRaised):
+                    await until_it_raises(collector)
+            asks = r"'a-\d'.*group\.reset_async\(env_ids=\['a-\d'\]"
             for _ in range(2):
-                with pytest.raises(
-                    RLightningError, match=r"'a-1'.*group\.reset\(env_ids=\['a-1'\]"
-                ):
+                with pytest.raises(RLightningError, match=asks):
                     await collector.collect()
-            await reset_it(group, raised.value)
-            found = [copied(await collector.collect()) for _ in range(4)]
-    assert (2, 0) in steps_of(found)[1]
+            group.reset_async(env_ids=["a-1"])
+            assert len(await collector.collect()) in (3, 12)
+
+
+@pytest.mark.usefixtures("moving")
+async def test_a_first_reset_of_what_moves_is_repeated_only_if_asked_for() -> None:
+    numbers = [lambda k=k: Reluctant(k) for k in range(2)]
+    async with INLINE.build([{"name": "a", "task": numbers, "num_workers": 2}]) as group:
+        collector: Any = Collector(group, failing(), num_transitions=4)
+        with pytest.raises(EnvRaised):
+            await collector.collect()
+        for _ in range(2):
+            with pytest.raises(RLightningError, match=r"'a-1'.*restart\(\)"):
+                await collector.collect()
+        collector.restart()
+        assert len(await collector.collect()) == 4
 
 
 class Leaving(CountingEnv):
@@ -501,9 +556,9 @@ async def test_clients_that_raised_or_came_back_are_taken_back(count: int) -> No
             found: list[Rollout] = []
             with pytest.raises(EnvRaised):
                 await until_it_raises(collector)
-            with pytest.raises(RLightningError, match=r"'robots-0/c0'.*reset it yourself"):
+            with pytest.raises(RLightningError, match=r"'robots-0/c0'.*group\.reset_async"):
                 await collector.collect()
-            await group.reset(seed=5, env_ids=["robots-0/c0"])
+            group.reset_async(seed=5, env_ids=["robots-0/c0"])
             for _ in range(1 if count == 5 else 3):
                 found += parts_of(await collector.collect())
             await asyncio.to_thread(client.join)

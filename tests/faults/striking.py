@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
 
-DRIVER = ("/group/api/sync.py", "/group/drivers/sync_driver.py")
+DRIVER = ("/group/api/sync.py", "/group/drivers/sync_driver.py", "/collecting/procedure.py")
 
 
 def press() -> None:

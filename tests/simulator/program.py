@@ -231,7 +231,13 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
     "group": (12, OPS),
     "training": (
         5,
-        {"rollout": (6, None), "learn": (2, None), "kill": (2, "die"), "client": (4, CLIENTS)},
+        {
+            "rollout": (6, None),
+            "learn": (2, None),
+            "restart": (1, None),
+            "kill": (2, "die"),
+            "client": (4, CLIENTS),
+        },
     ),
     "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
     "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls"), "state": (2, "snapshots")}),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import pickle
-from contextlib import nullcontext, suppress
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +18,13 @@ from simulator.trails import Trail, Transition
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import (
     EnvAway,
+    EnvBusy,
     EnvFault,
     EnvRaised,
     NothingPending,
+    ResetNeeded,
     RLightningError,
+    SnapshotError,
     WorkerDied,
 )
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
@@ -68,7 +71,9 @@ class InContext(Session):
             client.check_done()
 
     def enter(self) -> None:
-        self.context = nullcontext() if self.limit is None else self.group.auto_reset(self.limit)
+        self.context = (
+            contextlib.nullcontext() if self.limit is None else self.group.auto_reset(self.limit)
+        )
         self.context.__enter__()
 
     def drawn_limit(self, rng: Random) -> float | None:
@@ -120,6 +125,7 @@ class Training(InContext):
         self.raised = dict.fromkeys(self.by_id, 0)
         self.kept: list[tuple[Any, Any]] = []
         self.raised_deaths: set[int] = set()
+        self.begins = True
         rng = Random(self.program.seed)
         self.options = self._options(rng)
         self.trails: dict[tuple[int, int], Trail] = {}
@@ -173,12 +179,20 @@ class Training(InContext):
             else:
                 async with asyncio.timeout(seconds):
                     found = await self.collector.collect()
+        except KeyboardInterrupt:
+            with self.expected(ResetNeeded, "a collect after Ctrl-C"):
+                self.collector.collect()
+            await self.op_restart(rng)
+            raise
         except EnvFault as fault:
             self.count(fault)
             self.restore_order(fault)
         except NothingPending as error:
             self.count(error)
             require(all(env.gone for env in self.envs), "nothing to collect, and envs are there")
+        except EnvBusy as error:
+            self.count(error)
+            require("a call that was cancelled" in str(error), "busy", repr(error))
         except (PolicyFailed, TimeoutError):
             self.counts["disturbed rollouts"] += 1
         else:
@@ -219,10 +233,44 @@ class Training(InContext):
         dead = {id(env.host) for env in self.envs if env.gone}
         own = {id(self.by_id[env_id].host) for env_id in fault.env_ids}
         left = any(id(env.host) not in dead | own for env in self.envs)
-        needs_all = "wait_all" in self.options or not self.counts["rollouts"]
+        needs_all = "wait_all" in self.options or self.begins
         again = not own.isdisjoint(self.raised_deaths)
         require(needs_all or not (again and left), "a death is raised again", repr(fault))
         self.raised_deaths |= own
+
+    async def op_restart(self, rng: Random) -> None:
+        """Begin all episodes anew, or where the program has reset or restored the envs."""
+        for env_id in self.by_id:
+            self.raised[env_id] += 1
+        self.begins, batch = True, None
+        if rng.random() < 0.6 and not (self.clients or self.any_gone()):
+            batch = await self.interruptible(self.prepared(rng))
+        if batch is None:
+            self.collector.restart(rng.choice([None, 5]))
+        else:
+            self.collector.restart(batch=batch)
+        self.counts["restarts"] += 1
+
+    async def prepared(self, rng: Random) -> BatchedData | None:
+        """Reset all envs, and perhaps save and restore them; None if one fails."""
+        try:
+            while self.group.pending:
+                with contextlib.suppress(EnvRaised):
+                    await self.done(self.group.collect_async())
+            batch, _ = await self.done(self.group.reset(seed=rng.choice([None, 3])))
+            if rng.random() < 0.5 and "snapshots" in self.features:
+                batch, _ = await self.done(
+                    self.group.restore(await self.done(self.group.snapshot()))
+                )
+        except WorkerDied as fault:
+            self.lose(fault)
+        except EnvFault as fault:
+            self.count(fault)
+        except SnapshotError as error:
+            self.count(error)
+        else:
+            return batch
+        return None
 
     async def op_learn(self, rng: Random) -> None:
         """Time passes, and the policy is another one."""
@@ -243,6 +291,7 @@ class Training(InContext):
     def take(self, found: Any) -> None:
         """Check rollouts, and that the one before was left alone."""
         self.counts["rollouts"] += 1
+        self.begins = False
         parts = [found] if len(self.program.plans) == 1 else [found[name] for name in sorted(found)]
         total = sum(part.index.size for part in parts)
         require(total == self.options["num_transitions"], "the size of a rollout", total)
@@ -363,7 +412,7 @@ class Evaluations(InContext):
         """Check that an evaluation has left nothing, unless Ctrl-C was pressed twice."""
         if self.group.pending:
             require(self.num_interrupts > self.pressed + 1, "left in flight", self.group.pending)
-            with suppress(EnvFault):
+            with contextlib.suppress(EnvFault):
                 await self.done(self.group.drain(1.0))
         for env_id in self.given_up():
             self.by_id[env_id].gone = True

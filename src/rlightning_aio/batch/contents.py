@@ -14,7 +14,6 @@ from rlightning_aio.batch.data import (
     names_of,
     parts_of,
     slots_of,
-    slots_of_results,
 )
 from rlightning_aio.batch.endings import all_agents, summed_rewards
 from rlightning_aio.batch.parts import (
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "all_agents",
-    "any_reset",
     "are_over",
     "columns_of_responses",
     "ended_episodes",
@@ -45,7 +43,6 @@ __all__ = [
     "reported_info_list",
     "reported_infos",
     "slots_of",
-    "slots_of_results",
     "summed_rewards",
 ]
 
@@ -76,15 +73,6 @@ def ended_episodes(
 def are_over(batch: BatchedData) -> list[bool]:
     """Return for each result whether it ends the episodes of all agents and sub-environments."""
     return column_of_parts(parts_of(batch), _over_of_rows).tolist()
-
-
-def any_reset(batch: BatchedData) -> NDArray[np.bool_]:
-    """Return for each result whether the env, or one of its sub-environments, was reset."""
-    return column_of_parts(parts_of(batch), _resets_of_rows)
-
-
-def _resets_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
-    return np.logical_or.reduce(part.is_reset.reshape(len(part.slots), -1), axis=1)
 
 
 def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:

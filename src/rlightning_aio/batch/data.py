@@ -52,7 +52,6 @@ __all__ = [
     "parts_of",
     "plain_columns",
     "slots_of",
-    "slots_of_results",
     "sources_of",
     "with_repeats",
 ]
@@ -457,13 +456,6 @@ def slots_of(batch: BatchedData, issuer: object) -> NDArray[np.intp] | None:
     origin = batch._origin
     if origin is None or origin.issuer is not issuer or origin.repeats:
         return None
-    return origin.slots
-
-
-def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
-    """Slots of the envs of a batch of results, in order."""
-    origin = batch._origin
-    assert origin is not None
     return origin.slots
 
 

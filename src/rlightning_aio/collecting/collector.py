@@ -1,26 +1,33 @@
 """`Collector`: steps a group with a policy, and returns rollouts.
 
-It uses the public `EnvGroup`. If it is interrupted between a result and the next request (a
-policy raises, a task is cancelled, a rollout is full), it keeps the unanswered results, and the
-next `collect` continues there; `Newest` says which of them are old by then.
+It uses the public `EnvGroup`, and owns it while it is in use. If it stops between a result and the
+next request (a policy raises, a task is cancelled, a rollout is full), it keeps the unanswered
+results, and the next `collect` continues there. Ctrl-C may stop it at any point, so it costs all.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
+from contextlib import suppress
+from enum import Enum, auto
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
+from rlightning_aio._core.group.api.facade import (
+    asked,
+    default_min_results,
+    ensure_auto_reset,
+    is_resettable,
+)
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
-from rlightning_aio._core.group.engine.newest import newest_of
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
-from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
+from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.rollout import Rollout
-from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvFault, ResetNeeded, RLightningError, WorkerDied
 from rlightning_aio.policies.answers import parts_by_policy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
@@ -29,7 +36,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-    from rlightning_aio._core.group.engine.newest import Newest
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta
 
@@ -38,6 +44,15 @@ __all__ = ["Collector"]
 G = TypeVar("G", AsyncEnvGroup, SyncEnvGroup)
 H = TypeVar("H", AsyncEnvGroup, SyncEnvGroup)
 R = TypeVar("R", Rollout, dict[str, Rollout])
+
+
+class _State(Enum):
+    """What the newest call of `collect` has left."""
+
+    WHOLE = auto()
+    RUNNING = auto()
+    """It runs, or was cut off by Ctrl-C, as in synchronous code it can be at any point."""
+    CUT_OFF = auto()
 
 
 class Collector(Generic[G, R]):
@@ -56,12 +71,9 @@ class Collector(Generic[G, R]):
     sub-environment that waits for others to end are in no rollout.
 
     Envs whose episode is over are reset, at the limits of the `auto_reset` context that is open, or
-    else at their own, if they have any. Between two calls, envs may be reset, restored and called
-    by others: their chains end, and new ones begin with what `EnvGroup.reset` or `EnvGroup.restore`
-    returned last. Envs that others have stepped begin a new episode, and so do envs that raised an
-    error and were not reset. A robot's or a client's env does that only if you reset it. The first
-    call resets all envs, unless one call has reset or restored them all since the collector was
-    made; to resume, make the collector and then restore a snapshot.
+    else at their own, if they have any. The first call resets all envs with `seed`. From then on
+    the collector owns the group: call `restart` after steps or resets of your own, and after
+    Ctrl-C; snapshots and calls of methods disturb nothing.
 
         async with rl.build_env_group(config) as group:
             collector = Collector(group, policy, num_transitions=2048, min_results=4, seed=0)
@@ -156,23 +168,58 @@ class Collector(Generic[G, R]):
         self._quota = num_transitions
         self._min_results = min_results
         self._block = wait_all
-        self._num_steps = 0
         self._seed = seed
-        self._kinds: dict[str, EnvKind] = {}
-        self._started = self._start_cut_off = self._start_raised = False
-        self._start_fault: EnvFault | None = None
-        self._newest: Newest = newest_of(self._group)
-        self._newest.begin_keeping()
-        self._collecting = False
+        self._state = _State.WHOLE
         self._metas: dict[str, EnvMeta] = {}
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Forget all results and transitions."""
+        self._started = False
+        self._kinds: dict[str, EnvKind] = {}
+        self._num_steps = 0
         # Results in order of progress: received, not yet stored, not yet answered.
         # `_expecting`: wait for results next.
         self._received: BatchedData | None = None
         self._unstored: list[Part] = []
         self._unanswered: list[Part] = []
         self._expecting = False
-        # Envs of workers whose error was raised.
+        # Envs whose error was raised, and that have sent no result since.
+        self._failed: set[str] = set()
+        # Envs of workers that are not replaced, whose error was raised.
         self._was_raised: set[str] = set()
+
+    def restart(self, seed: Any = None, *, batch: BatchedData | None = None) -> None:
+        """Begin the episodes of all envs anew in the next `collect`.
+
+        What the envs owe then is awaited and dropped. Transitions that are in no rollout yet are
+        lost. Columns and spaces may be others.
+
+        Args:
+            seed: of the reset, and of random actions; see `EnvGroup.reset`.
+            batch: go on from these results in place of a reset: what `EnvGroup.reset` or
+                `EnvGroup.restore` of all envs has just returned.
+
+        Raises:
+            RuntimeError: a call of `collect` is in progress.
+            ValueError: `batch` and a seed are given, or `batch` lacks an env.
+        """
+        if batch is not None:
+            if seed is not None:
+                raise ValueError("restart: a seed is of a reset, and a batch is in place of one")
+            lacking = {meta.env_id for meta in self._group.metas if not _is_server(meta)}
+            lacking.difference_update(batch.env_ids())
+            if lacking:
+                raise ValueError(
+                    f"restart: the batch has no result of env {min(lacking)!r}; give what a reset "
+                    "or restore of all envs returned"
+                )
+        if self._state is _State.RUNNING and isinstance(self._group, AsyncEnvGroup):
+            raise RuntimeError("restart: a collect is in progress; cancel it first, or await it")
+        self._begin_anew()
+        self._seed = seed
+        self._received = batch
+        self._state = _State.WHOLE
 
     @overload
     def collect(self: Collector[SyncEnvGroup, R]) -> R: ...
@@ -183,115 +230,101 @@ class Collector(Generic[G, R]):
     def collect(self) -> Any:
         """Step the envs until a rollout is full, and return it; await it if the group is async.
 
-        The rollout owns its arrays until the second call after it. Cancellation, Ctrl-C and errors
-        lose nothing: the next call continues.
+        The rollout owns its arrays until the second call after it. Cancellation and errors lose
+        nothing: the next call continues. An env whose error was raised takes part again from a
+        reset that you have sent by `reset_async`, or else this resets it; but robots and clients
+        are reset only by you. Other envs go on.
 
         Raises:
+            ResetNeeded: an earlier call was interrupted by Ctrl-C; call `restart`.
             RuntimeError: a call is in progress.
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
                 for each entry; or these envs can't fill a block.
-            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
-                takes part again in the next call, and one whose worker is not replaced doesn't.
-            RLightningError: a robot's or a client's env has raised and was not reset since.
+            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env whose worker is
+                not replaced takes part no more.
+            RLightningError: only robots or clients are left that have raised.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """
-        return run_as_one_call(self._collect(), self._group)
+        return run(self._collect(), self._group)
 
     # -- the loop -----------------------------------------------------------------
 
     def _collect(self) -> Procedure[R]:
-        if self._collecting:
+        if self._state is _State.RUNNING and isinstance(self._group, AsyncEnvGroup):
             raise RuntimeError(
                 "this collector is already collecting; only one collect can run at a time"
             )
+        if self._state is not _State.WHOLE:
+            raise ResetNeeded(
+                "a collect was interrupted by Ctrl-C, and its results are lost; call "
+                "restart(seed=…) to begin all episodes anew, or restart(batch=…) with the results "
+                "of group.reset()"
+            )
         with ensure_auto_reset(self._group):
-            self._collecting = True
+            self._state = _State.RUNNING
             try:
-                if not self._started:
-                    yield from self._start()
-                is_resumed = False
-                while True:
-                    if self._received is not None:
-                        self._split_received(self._received)
-                        self._received = None
-                    if not self._store():
-                        yield BREAK  # After this, it would wait for the learner's next collect.
-                        return self._full()
-                    if not is_resumed:
-                        self._resume()
-                        is_resumed = True
-                    if self._block and not (self._unanswered or self._expecting):
-                        self._plan()
-                    while self._unanswered:
-                        yield from self._answer(self._unanswered[0])
-                    yield from self._wait()
-            finally:
-                self._collecting = False
+                rollout = yield from self._filled()
+            except (Exception, asyncio.CancelledError):
+                self._state = _State.WHOLE
+                raise
+            except BaseException:
+                self._state = _State.CUT_OFF
+                raise
+        self._state = _State.WHOLE
+        return rollout
+
+    def _filled(self) -> Procedure[R]:
+        """Step the envs until a rollout is full, and return it."""
+        if not self._started:
+            yield from self._start()
+        has_rejoined = False
+        while True:
+            if self._received is not None:
+                self._split_received(self._received)
+                self._received = None
+            if not self._store():
+                return self._full()
+            if self._failed and not has_rejoined:
+                self._rejoin()
+            has_rejoined = True
+            if self._block and not (self._unanswered or self._expecting):
+                self._plan()
+            while self._unanswered:
+                yield from self._answer(self._unanswered[0])
+            yield from self._wait()
 
     def _wait(self) -> Procedure[None]:
         """Wait for the next results."""
         self._expecting = True
         try:
             self._received, _ = yield self._receive
-        except WorkerDied as error:
-            if not self._was_raised_before(error):
-                raise
+        except EnvFault as fault:
+            self._note(fault)
             self._expecting = bool(self._group.pending)
+            if not (isinstance(fault, WorkerDied) and self._was_raised_before(fault)):
+                raise
             if self._block or not self._has_others():
                 raise
-            return
-        self._expecting = False
+        else:
+            self._expecting = False
 
     def _start(self) -> Procedure[None]:
-        """Reset all envs, and wait for all of them, unless the program has done so."""
-        try:
-            if not (self._start_cut_off or self._start_raised):
-                self._received = self._newest.take_all_returned()
-            if self._received is None:
+        """Reset all envs, and wait for all of them, unless there is a batch to go on from."""
+        if self._received is None:
+            for env_id in self._failed:
+                if not is_resettable(self._group, env_id):
+                    raise self._refusal(env_id, "restart() has the next collect reset all envs")
+            while asked(self._group):  # Of a start that was cancelled, or before `restart`.
+                with suppress(EnvFault):
+                    yield partial(self._group.collect_async, wait_all=True)
+            try:
                 self._received, _ = yield partial(self._group.reset, seed=self._seed)
-        except EnvBusy:
-            if self._start_cut_off:
-                yield from self._await_start()
-            elif self._start_raised:
-                yield from self._start_again()
-                return
-            else:
+            except EnvFault as fault:
+                self._note(fault)
                 raise
-        except BaseException as error:
-            self._start_cut_off = not isinstance(error, Exception)
-            self._start_raised = isinstance(error, EnvFault)
-            raise
         if self._min_results is None:
             self._min_results = default_min_results(self._group)
         self._started = True
-
-    def _start_again(self) -> Procedure[None]:
-        """Begin again where envs have raised, and the program has reset some of them meanwhile."""
-        yield partial(self._group.collect_async, wait_all=True)
-        self._start_raised = False
-        yield from self._start()
-
-    def _await_start(self) -> Procedure[None]:
-        """Wait for the results of a reset that was sent and then cancelled.
-
-        As with a reset that is not cancelled, there are results of all envs, or an error.
-        """
-        while True:
-            try:
-                batch, _ = yield partial(self._group.collect_async, wait_all=True)
-            except EnvFault as fault:
-                self._start_fault = self._start_fault or fault
-            except NothingPending:
-                if self._start_fault is None:
-                    raise
-                break
-            else:
-                self._received = batch
-                break
-        fault, self._start_fault = self._start_fault, None
-        if fault is not None:
-            self._received, self._start_cut_off, self._start_raised = None, False, True
-            raise fault
 
     def _receive(self) -> Any:
         if self._block:
@@ -299,7 +332,9 @@ class Collector(Generic[G, R]):
         return self._group.collect_async(min_results=self._min_results)
 
     def _split_received(self, batch: BatchedData) -> None:
-        self._unstored = self._parts(batch)
+        if self._failed:
+            self._failed.difference_update(batch.env_ids())
+        self._unstored = [kind.part(own) for kind, own in self._split(batch)]
         if not self._block:
             self._unanswered = list(self._unstored)
             return
@@ -307,11 +342,6 @@ class Collector(Generic[G, R]):
             part.kind.hold(part)
         if not self._num_steps:
             self._lay_out()
-
-    def _parts(self, batch: BatchedData) -> list[Part]:
-        """Split a batch by policy, as soon as it was received."""
-        marks = self._newest.marks
-        return [kind.part(own, marks(own)) for kind, own in self._split(batch)]
 
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
         policies = self._policies
@@ -341,58 +371,44 @@ class Collector(Generic[G, R]):
                 self._metas.update((meta.env_id, meta) for meta in group[server_id].metas)
         return self._metas.get(env_id)
 
-    # -- between two calls ----------------------------------------------------------
+    # -- after errors -----------------------------------------------------------------
 
-    def _resume(self) -> None:
-        """Go on from what has become of the envs since the last call.
+    def _note(self, fault: EnvFault) -> None:
+        """Note envs whose error was raised; clients that are away come back by themselves."""
+        for one in (fault, *fault.others):
+            if not isinstance(one, EnvAway):
+                self._failed.update(one.env_ids if isinstance(one, WorkerDied) else [one.env_id])
 
-        Drop results that are no longer the newest of their envs, which were reset, restored or
-        stepped otherwise. Take envs back that have no request: with the result of the reset that
-        the program has made, or else, after an error, with a new episode.
-        """
-        newest, parts = self._newest, self._unanswered
-        if self._block:
-            parts = [kind.held for kind in self._kinds.values() if kind.held is not None]
-        known = _newest_parts(parts, newest)
-        count = 0
-        for part in known:
-            count += len(part.marks)
-        if known == parts and not self._expecting and count == newest.num_idle():
-            return  # Nobody else has asked any env.
-        for part in parts:
-            part.cut(~part.is_newest(newest))
-        self._unanswered = _newest_parts(self._unanswered, newest)
-        pending = set(self._group.pending)
-        self._expecting = bool(pending) and (self._expecting or known != parts)
-        idle = [id_ for id_ in newest.idle(part.batch for part in known) if id_ not in pending]
-        for batch in newest.take_returned(idle):
-            self._take(batch)
-            idle = [id_ for id_ in idle if id_ not in batch.env_ids()]
-        if idle:
-            self._reset(idle)
-
-    def _take(self, batch: BatchedData) -> None:
-        """Go on from results that a reset has returned to the program."""
-        for part in self._parts(batch):
-            part.store(0)
-            if self._block:
-                part.kind.hold(part)
-            else:
-                self._unanswered.append(part)
-
-    def _reset(self, idle: list[str]) -> None:
-        """Begin episodes of idle envs, except of those that are given up.
+    def _rejoin(self) -> None:
+        """Begin episodes of envs whose error was raised, except of those that are given up.
 
         Raises:
             WorkerDied, EnvHung: all envs are given up, and no client can come.
-            RLightningError: an env may move something real.
+            RLightningError: only envs that may move something real are left, or a block needs one.
         """
+        pending = self._group.pending
+        self._expecting |= bool(pending)
+        idle = self._failed.difference(pending)
         gone = {env_id for worker in self._group.get_workers() for env_id in worker["given_up"]}
-        left = [env_id for env_id in idle if env_id not in gone]
-        self._newest.check_resettable(left)
-        if left or not self._has_others():
-            self._group.reset_async(env_ids=left or idle)
+        left = sorted(idle if self._block else idle - gone)
+        to_reset = [env_id for env_id in left if is_resettable(self._group, env_id)]
+        if len(to_reset) < len(left):  # The others are reset by the program alone.
+            if self._block or not (to_reset or self._expecting or self._unanswered):
+                env_id = next(env_id for env_id in left if env_id not in to_reset)
+                reset = f"group.reset_async(env_ids=[{env_id!r}])"
+                raise self._refusal(env_id, f"{reset}, whose result the next collect takes")
+        elif idle and not (to_reset or self._has_others()):
+            to_reset = sorted(idle)
+        if to_reset:
+            self._group.reset_async(env_ids=to_reset)
             self._expecting = True
+
+    @staticmethod
+    def _refusal(env_id: str, remedy: str) -> RLightningError:
+        return RLightningError(
+            f"env {env_id!r} has raised an error, and may move something real, so it is reset only "
+            f"if you ask for it: {remedy}"
+        )
 
     def _has_others(self) -> bool:
         """Return True if results are there or may come."""
@@ -457,20 +473,16 @@ class Collector(Generic[G, R]):
         """Call the policy for `part`, and send its actions."""
         version = self.policy_version
         with self._group.span("policy"):
-            answer = yield Interruptible(partial(part.kind.policy, part.batch))
+            answer = yield partial(part.kind.policy, part.batch)
         responses, columns = part.kind.columns_of(part, answer)
         # Copy before sending: the columns may be views of rows that envs will overwrite.
         part.kind.staging.begin(part.results.index, columns, version)
         try:
             self._group.step_async(responses)
-        except KeyboardInterrupt:
-            # A synchronous group raises it once the requests are sent.
-            if part.batch.env_ids()[0] in self._group.pending:
-                part.kind.staging.note_sent()
-            raise
         except WorkerDied as error:
             if self._block:  # It needs all envs.
                 raise
+            self._note(error)
             was_raised = self._was_raised_before(error)
             self._leave_out(part, error.env_ids)
             if not (was_raised and self._has_others()):
@@ -490,7 +502,6 @@ class Collector(Generic[G, R]):
     def _leave_out(self, part: Part, given_up: Sequence[str]) -> None:
         """Go on without envs that were given up."""
         is_left_out = np.isin(part.batch.env_ids(), given_up)
-        part.cut(is_left_out)
         left = part.only(~is_left_out)
         self._unanswered[:1] = [] if left is None else [left]
         self._expecting = bool(self._group.pending)
@@ -505,16 +516,6 @@ class Collector(Generic[G, R]):
             for name, kind in self._kinds.items()
         }
         return cast("R", found[""] if self._policies is None else found)
-
-
-def _newest_parts(parts: list[Part], newest: Newest) -> list[Part]:
-    """The parts with the envs whose newest results they are."""
-    found: list[Part] = []
-    for part in parts:
-        own = part.only(part.is_newest(newest))
-        if own is not None:
-            found.append(own)
-    return found
 
 
 def _is_server(meta: EnvMeta) -> bool:

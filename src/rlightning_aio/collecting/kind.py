@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.engine.newest import Newest
     from rlightning_aio.trees import Tree
     from rlightning_aio.types import EnvMeta
 
@@ -36,14 +35,12 @@ class Part:
     """The results of one batch from envs of one kind.
 
     Attributes:
-        marks: of its envs; see `Newest.marks`.
         unstored: rows of `results` whose transitions are not stored yet.
     """
 
     kind: EnvKind
     batch: BatchedData
     results: ResultRows
-    marks: NDArray[np.int64]
     unstored: NDArray[np.intp]
 
     def store(self, room: int) -> int:
@@ -77,17 +74,7 @@ class Part:
             return self
         if not len(rows):
             return None
-        return self.kind.part(self.batch.take(rows.tolist()), self.marks[rows])
-
-    def is_newest(self, newest: Newest) -> NDArray[np.bool_]:
-        """Mask of the envs whose newest results are here."""
-        return self.marks == newest.marks(self.batch)
-
-    def cut(self, chosen: NDArray[np.bool_]) -> None:
-        """End the chains of the envs in the mask `chosen`: nobody will answer their results."""
-        results = self.results
-        (rows,) = chosen.repeat(results.num_sub_envs).nonzero()
-        self.kind.staging.cut(results.index[rows], gather(results.observation, rows))
+        return self.kind.part(self.batch.take(rows.tolist()))
 
 
 class EnvKind:
@@ -123,16 +110,13 @@ class EnvKind:
         # Two sets, so that one rollout can be read while the next one is collected.
         self._sets: list[dict[str, Tree]] = [{}, {}]
 
-    def part(self, batch: BatchedData, marks: NDArray[np.int64]) -> Part:
-        """Convert a batch to rows, and make room for envs that are new.
-
-        `marks` are those that its envs had when it was received.
-        """
+    def part(self, batch: BatchedData) -> Part:
+        """Convert a batch to rows, and make room for envs that are new."""
         results = result_rows(batch)
         new = self.staging.newcomers(results.index)
         if len(new):
             self._meet(batch, results, new)
-        return Part(self, batch, results, marks, np.arange(len(results.index)))
+        return Part(self, batch, results, np.arange(len(results.index)))
 
     def _meet(self, batch: BatchedData, results: ResultRows, rows: NDArray[np.intp]) -> None:
         """Record the autoreset mode of envs that are in `rows` for the first time."""
@@ -158,8 +142,7 @@ class EnvKind:
         newer = part.results.index.reshape(len(part.batch), -1)[:, 0]
         rows = np.arange(count)
         rows[np.searchsorted(first, newer)] = count + np.arange(len(newer))
-        batch = joined([self.held.batch, part.batch]).take(rows.tolist())
-        self.held = self.part(batch, np.concatenate([self.held.marks, part.marks])[rows])
+        self.held = self.part(joined([self.held.batch, part.batch]).take(rows.tolist()))
 
     def columns_of(self, part: Part, answer: Any) -> tuple[BatchedData, dict[str, Tree]]:
         """Convert the policy's answer for `part` to a batch of responses, and to columns.

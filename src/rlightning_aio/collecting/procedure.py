@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio._core.group.api.sync import driver_of
 
-__all__ = ["BREAK", "Interruptible", "Procedure", "run", "run_as_one_call"]
+__all__ = ["Procedure", "run"]
 
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
-    from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 
 T = TypeVar("T")
 
@@ -26,40 +23,14 @@ Procedure: TypeAlias = Generator[Callable[[], Any], Any, T]
 """Yields functions to call, is sent their results (awaited if awaitable), returns its result."""
 
 
-@dataclass(frozen=True)
-class Interruptible:
-    """A call of the program's own code, such as a policy, which Ctrl-C may interrupt."""
-
-    function: Callable[[], Any]
-
-    def __call__(self) -> Any:
-        return self.function()
-
-
-BREAK: Final = Interruptible(lambda: None)
-"""Does nothing: if Ctrl-C was pressed, it is raised here."""
-
-
 def run(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
     """Run `procedure` to its end: synchronously, or as a coroutine if `group` is asynchronous."""
     if isinstance(group, AsyncEnvGroup):
         return _awaited(procedure)
-    return _called(procedure, driver_of(group))
+    return _called(procedure)
 
 
-def run_as_one_call(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
-    """Run `procedure` as `run` does, for procedures that go on where an earlier one was cut off.
-
-    In a synchronous group it is one call: Ctrl-C interrupts it only where the group waits, and in
-    calls that are `Interruptible`.
-    """
-    if isinstance(group, AsyncEnvGroup):
-        return _awaited(procedure)
-    driver = driver_of(group)
-    return driver.call(_called, procedure, driver)
-
-
-def _called(procedure: Procedure[T], driver: SyncDriver) -> T:
+def _called(procedure: Procedure[T]) -> T:
     """Run `procedure` to its end, synchronously.
 
     Raises:
@@ -69,7 +40,7 @@ def _called(procedure: Procedure[T], driver: SyncDriver) -> T:
         call = next(procedure)
         while True:
             try:
-                value = driver.interruptible(call) if type(call) is Interruptible else call()
+                value = call()
                 if hasattr(value, "__await__"):
                     _discard(value)
                     raise TypeError(

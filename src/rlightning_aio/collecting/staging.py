@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from rlightning_aio.batch.data import has_ended
 from rlightning_aio.collecting.trees import allocated, check_alike, grown, scattered
 from rlightning_aio.protocol.columns import gather
 from rlightning_aio.trees import mapped
@@ -188,6 +189,9 @@ class Staging:
         ending = self._place[index] >= 0
         if len(resets.nonzero()[0]):
             self._begin_chains(index[resets], ending[resets])
+            # A restored env may be at the end of its episode, and wait for a reset.
+            over = has_ended(results.batch).reshape(-1)[rows] & resets
+            self._over[index] |= over & ~self._resets_in_same_step[index]
             ending &= ~resets
         ending &= ~self._over[index]
         chosen = ending.nonzero()[0]
@@ -206,15 +210,6 @@ class Staging:
             self._note_ends(self._last[lost], before)
         self._fresh[index] = True
         self._over[index] = False
-
-    def cut(self, index: NDArray[np.int64], observation: Tree) -> None:
-        """End the chains of envs that have no step in flight; `observation` is their last."""
-        idle = self._place[index] < 0
-        ending = idle & ~self._fresh[index] & (self._last[index] >= 0)
-        (rows,) = ending.nonzero()
-        if len(rows):
-            self._note_ends(self._last[index[rows]], gather(observation, rows))
-        self._fresh[index[idle]] = True
 
     def _complete(self, results: ResultRows, index: NDArray[np.int64], rows: Rows) -> None:
         self._knows_results = True

@@ -19,6 +19,7 @@ from rlightning_aio._core.group.state.conditions import NO_SPAN
 from rlightning_aio._core.group.timeline.trace import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction
+from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "asked",
     "default_min_results",
     "ensure_auto_reset",
+    "is_resettable",
     "only_result",
     "response_to",
     "steps_of",
@@ -114,6 +116,13 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
 def asked(group: Any) -> list[str]:
     """Ids as in `EnvGroup.pending`, but for clients that have come and were asked nothing yet."""
     return group._driver.look(partial(group._core.pending, unasked=False))  # noqa: SLF001
+
+
+def is_resettable(group: Any, env_id: str) -> bool:
+    """Return False if an env may move something real, or is a client's, which may."""
+    envs = group._core.envs  # noqa: SLF001
+    slot = envs.find_one(env_id)
+    return slot < len(envs.all) and not ENVS.is_hardware(envs.configs[slot].backend)
 
 
 def default_min_results(group: Any) -> int:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "driver_of", "due_for_reset"]
+__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "due_for_reset"]
 
 T = TypeVar("T")
 A = TypeVarTuple("A")
@@ -175,11 +175,6 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
             return self._driver.run(procedure)[0].values()
 
         return self._driver.call(results)
-
-
-def driver_of(group: EnvGroup) -> SyncDriver:
-    """Return the driver of a group, for code that makes one call of several calls."""
-    return group._driver  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
 
 
 def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:

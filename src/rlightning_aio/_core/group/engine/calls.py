@@ -85,7 +85,6 @@ class Calls:
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
         entries = self._requests.issue(slots, op, ticket.owner, now)
-        self._requests.numbering.num_values[slots] += 1
         self._dispatch.hand_over(slots, entries, packed)
 
 

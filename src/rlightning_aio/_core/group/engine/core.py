@@ -53,7 +53,7 @@ class Core:
 
     Attributes:
         tables, supervisor: as given; envs, requests, continuity, observed, lifetime, stats: of the
-            tables; results, intake, waiting, metrics, steps, newest, agent_steps, calls: made here.
+            tables; results, intake, waiting, metrics, steps, agent_steps, calls: made here.
     """
 
     def __init__(
@@ -75,7 +75,6 @@ class Core:
         self.waiting = waiting = Waiting(tables, supervisor, poller, intake)
         dispatch = Dispatch(tables, supervisor, poller, waiting)
         self.steps = Steps(tables, supervisor, results, arrivals, dispatch, waiting)
-        self.newest = self.steps.newest
         self.calls = Calls(tables, dispatch, waiting)
         self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, results, waiting)
         self._resets = Resets(tables, supervisor, dispatch, results, waiting)

@@ -22,7 +22,6 @@ from rlightning_aio._core.group.engine.actions import (
     write_actions,
     write_column,
 )
-from rlightning_aio._core.group.engine.newest import Newest
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
@@ -77,7 +76,6 @@ class Steps:
         supervisor, results, arrivals, dispatch, waiting: of the group.
 
     Attributes:
-        newest: which results are the newest.
         collecting: a call of `collect` waits.
     """
 
@@ -108,7 +106,6 @@ class Steps:
         self._waiting = waiting
         self._intake = waiting.intake
         self._stats = tables.stats
-        self.newest = Newest(tables, supervisor.members)
         self.collecting = False
         # The host of the only env, which steps in the calls of a synchronous group.
         self._alone: Executing | None = None
@@ -428,23 +425,15 @@ class Steps:
             raise
         if observer is not None:
             observer.after_results(noted, parts)
-        if (
-            self._arrivals.held_back
-            or self.newest.keeps
-            or self._stats.num_batches >= self._hints.due
-        ):
-            self._note_returned(slots, batch, synchronous=synchronous)
+        if self._arrivals.held_back or self._stats.num_batches >= self._hints.due:
+            self._note_returned(slots)
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
 
-    def _note_returned(
-        self, slots: NDArray[np.intp], batch: BatchedData, *, synchronous: bool
-    ) -> None:
-        """Let envs join whose rows are free now, keep the newest results, and give hints."""
+    def _note_returned(self, slots: NDArray[np.intp]) -> None:
+        """Let envs join whose rows are free now, and give hints."""
         self._arrivals.admit(slots, self._intake.now)
         if self._stats.num_batches >= self._hints.due:
             self._hints.look()
-        if synchronous and self.newest.keeps:
-            self.newest.note_returned(batch)
 
     @staticmethod
     def _mark_cut(part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:

@@ -30,12 +30,10 @@ class Numbering:
 
     Attributes:
         entry: number, slot and operation, by slot.
-        num_values: by slot, the number of its requests that are answered by a value.
     """
 
     def __init__(self, size: int) -> None:
         self.entry = np.arange(size) << OP_BITS
-        self.num_values = np.zeros(size, np.int64)
 
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""
@@ -44,10 +42,6 @@ class Numbering:
     def numbers(self, slots: Any = ...) -> NDArray[np.int64]:
         """Numbers of the current requests."""
         return self.entry[slots] >> NUMBER_SHIFT
-
-    def of_results(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Return the number of requests of `slots` that are answered by a result."""
-        return (self.entry[slots] >> NUMBER_SHIFT) - self.num_values[slots]
 
     def op(self, slot: int) -> int:
         """Operation of the current request; 0 before the first."""
