@@ -21,7 +21,6 @@ def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
         done = invoke("eval", config, "--seeds", "0:2", "--video", folder)
         assert done.exit_code == 2
         (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-        assert line.startswith("error: can't be written: ")
         assert str(folder) in line
         assert "playing" not in done.stderr
 

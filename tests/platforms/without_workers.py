@@ -230,7 +230,7 @@ def command_line() -> None:
         ("rollout", *entry, "--steps", "200"),
         ("eval", *entry, "--episodes", "2", "--seed", "0"),
         ("check", *entry),
-        ("bench", *entry, "--steps", "200", "--rounds", "1"),
+        ("bench", *entry, "--seconds", "0.02", "--rounds", "1"),
     ):
         with contextlib.redirect_stdout(io.StringIO()) as output:
             code = app(list(words), standalone_mode=False)

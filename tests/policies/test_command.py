@@ -10,6 +10,8 @@ from cli.command import invoke, invoke_json, write_config
 from policies.counting import chunk_of
 from policies.servers import OpenPiServer, serving
 
+from rlightning_aio.policies import ActionChunks
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -18,9 +20,12 @@ ENTRY = {
 }  # fmt: skip
 
 
-def chunks(batch: Any) -> Any:
-    """A policy that the command names."""
+def _chunks(batch: Any) -> Any:
     return np.stack([chunk_of(observation) for observation in batch.observation])
+
+
+three_of_each = ActionChunks(_chunks, 3)
+"""A policy that the command names."""
 
 
 def check(document: Any) -> None:
@@ -39,13 +44,10 @@ def test_all_actions_of_openpi_s_chunks_are_played_by_default(tmp_path: Path) ->
 
 
 def test_a_policy_of_a_module_may_return_chunks(tmp_path: Path) -> None:
-    """The number of steps belongs to the subject of the results file."""
+    """If it plays them by itself."""
     config, file = write_config(tmp_path, ENTRY), tmp_path / "results.jsonl"
-    words = ("eval", config, "--policy", "policies.test_command:chunks", "--resume", file)
-    check(invoke_json(*words, "--action-steps", 3, "--seeds", "0:4"))
-    done = invoke(*words, "--action-steps", 2, "--seeds", "0:4")
-    assert done.exit_code == 2
-    assert "3 actions of each chunk" in done.stderr
+    words = ("eval", config, "--policy", "policies.test_command:three_of_each", "--resume", file)
+    check(invoke_json(*words, "--seeds", "0:4"))
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,6 @@ def test_a_policy_of_a_module_may_return_chunks(tmp_path: Path) -> None:
         (["--policy", "http://localhost:1"], 2, "should begin with openpi://"),
         (["--policy", "openpi://localhost:x"], 2, "should look like ws://localhost:8000"),
         (["--policy", "openpi://"], 2, "should look like ws://localhost:8000"),
-        (["--action-steps", 2], 2, "is for policies that return chunks, not 'random'"),
     ],
 )
 def test_what_is_no_policy_server_is_refused(

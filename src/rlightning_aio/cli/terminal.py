@@ -136,7 +136,7 @@ def exit_code_of(command: Callable[[], None]) -> int:
     except BrokenPipeError:
         raise  # Click ends the command: who reads its results has gone.
     except OSError as error:  # Of a file that an option names.
-        typer.echo(f"error: can't be written: {error}", err=True)
+        typer.echo(f"error: {error}", err=True)
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
