@@ -74,6 +74,19 @@ def test_envs_that_share_the_worker_lose_their_episodes_as_with_any_death(
 
 
 @on_one_driver
+def test_a_drain_returns_what_comes_by_the_deadline_and_ends_the_rest(start: Start) -> None:
+    group, tokens = start(entry(2, envs_per_process=1)), Tokens()
+    ids = group.group.env_ids
+    group.step_async(tokens.steps(ids, {ids[1]: "sleep"}))
+    batch, _ = group.collect_async()  # However long that takes on a busy machine.
+    group.step_async(tokens.steps(ids[:1]))
+    assert group.drain(0.001)[0].ids() in ([], ids[:1])
+    assert (batch.ids(), group.group.pending) == (ids[:1], [])
+    batch, _ = group.step(tokens.steps(ids))
+    assert batch.restarted[1]
+
+
+@on_one_driver
 @pytest.mark.parametrize("fields", [{"on_worker_death": "raise"}, {"max_restarts": 0}], ids=str)
 def test_an_abort_counts_for_no_limit(start: Start, fields: dict[str, Any]) -> None:
     """The worker is replaced as often as its caller wishes; its own deaths count."""

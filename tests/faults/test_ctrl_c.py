@@ -218,7 +218,7 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
         uses = uses_of(group, batch)
         with pytest.raises(KeyboardInterrupt):
             env.call("wait", *waits_for) if interrupted == "call" else group.snapshot()
-        with pytest.raises(EnvBusy, match="a call that was cancelled still runs in it"):
+        with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs in it"):
             uses[use]()
         assert group.pending == []
         go_on.touch()

@@ -154,7 +154,7 @@ def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str
     group.cancel(running)
     with pytest.raises(NothingPending):
         collect(group).result()
-    with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
+    with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs"):
         group.steps.step_async(steps(0), group.now)
     group.hosts[0].finish()
     group.hosts[0].on_readable()
@@ -333,22 +333,6 @@ def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
     assert not batch.restarted.any()
 
 
-@pytest.mark.parametrize("end", ["abort", "drain_requests"])
-def test_a_call_returns_what_it_has_before_an_abort_does(new_group: NewGroup, end: str) -> None:
-    """Its env is idle then, so it can be reset."""
-    group = new_group(1, 1)
-    run(group, group.core.reset(group.now, None, None, None))
-    stepping = group.begin(group.steps.step(steps(0), group.now))
-    group.hosts[0].finish(0)
-
-    def ended() -> Any:
-        yield from getattr(group.core, end)(group.now, None)
-        return group.core.requests.is_idle(0)
-
-    assert run(group, ended())
-    assert ids_of(stepping) == ["fake-0"]
-
-
 @pytest.mark.parametrize("ordinary", [True, False])
 @pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot"])
 def test_requests_that_were_sent_in_part_disturb_no_other_call(
@@ -404,7 +388,7 @@ def test_requests_have_a_worker_replaced_in_which_only_a_cancelled_call_still_ru
     die(group, 0)
     group.cancel(group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))))
     group.now += 60.0
-    with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
+    with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs"):
         group.steps.step_async(steps(0), group.now)
     assert group.hosts[0].alive
 

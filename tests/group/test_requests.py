@@ -71,7 +71,7 @@ class Driven:
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
             Event.CLAIMED: self._claim,
-            Event.DROPPED: lambda: self.table.drop(self.table.alone(SLOT)),
+            Event.DROPPED: self._drop,
             Event.KEPT: lambda: self.table.collector.keep(self.table.alone(SLOT), fault()),
             Event.FREED: self._free,
             Event.ABORTED: self._abort,
@@ -105,7 +105,7 @@ class Driven:
         assert self.table.collector.take_fault(fault).tolist() == [SLOT]
 
     def _result(self) -> None:
-        assert self.table.complete_one(1, self.entry()) == SLOT
+        assert self.table.complete([(1, np.array([self.entry()]))]).tolist() == [SLOT]
 
     def _end(self) -> int:
         slot = self.table.end(1, self.entry())
@@ -118,9 +118,18 @@ class Driven:
         self.table.fail(mine, owner, fault())
 
     def _abort(self) -> None:
-        self.table.aborted.add(SLOT, fault())
-        assert self.table.end(1, self.entry()) is None
-        assert not self.table.aborted.faults
+        lost = fault()
+        self.table.abort(self.table.alone(SLOT), [lost])
+        if self.ticket is not None:
+            assert self.ticket.errors == {SLOT: lost}
+            assert SLOT not in self.ticket.slots
+
+    def _drop(self) -> None:
+        if SLOT in self.table.unwanted:
+            assert self.table.end(1, self.entry()) is None
+            assert SLOT not in self.table.unwanted
+        else:
+            self.table.drop(self.table.alone(SLOT))
 
     def _restart(self) -> None:
         owed = self.table.owed(np.arange(3))
@@ -179,9 +188,12 @@ ALL: list[Combination] = list(itertools.product(State, Owner, Event))
 NOT_EXPRESSIBLE: dict[Combination, str] = {
     (State.BUSY, Owner.COLLECTOR, Event.VALUE): "only methods have values; each has a ticket",
     (State.BUSY, Owner.TICKET, Event.WITHDRAWN): "a call learns by an error that its env is away",
-    (State.BUSY, Owner.NOBODY, Event.RESULT): "what was given up for nobody is a method",
-    (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "no method of a client's env can be called",
-    (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN): "a method fails with its worker",
+    (State.BUSY, Owner.NOBODY, Event.RESULT): "whatever ends it, its reply is dropped",
+    (State.BUSY, Owner.NOBODY, Event.VALUE): "likewise",
+    (State.BUSY, Owner.NOBODY, Event.FAULT): "likewise",
+    (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "likewise",
+    (State.BUSY, Owner.NOBODY, Event.ABORTED): "it is aborted once",
+    (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN): "what nobody waits for ends with its worker",
     (State.READY, Owner.TICKET, Event.METHOD_GIVEN_UP): "methods have values, not results",
 }
 REACHABLE = {*STEPS, *METHODS}
@@ -237,7 +249,6 @@ def test_any_other_event_is_refused_or_has_no_effect(
     elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.WITHDRAWN):
         # A reply without a request, like a late one.
         assert table.end(1, driven.entry()) is None
-        assert table.complete_one(1, driven.entry()) is None
     elif event in (Event.ASKED_AGAIN, Event.ABORTED):
         assert table.owed(slots).size == 0
     elif event in (Event.CLAIMED, Event.DROPPED):
@@ -278,8 +289,27 @@ def test_the_value_of_a_cancelled_method_call_has_no_owner() -> None:
     """Unlike a step or a reset: a collect can't return it."""
     driven = brought_to(State.BUSY, Owner.NOBODY)
     assert driven.table.collector.num_ready == driven.table.collector.num_awaited == 0
-    driven.events[Event.FAULT]()
+    driven.events[Event.DROPPED]()
     assert not driven.table.collector.faults
+
+
+@pytest.mark.parametrize("owner", [Owner.COLLECTOR, Owner.TICKET])
+def test_the_reply_to_an_aborted_request_is_dropped(owner: Owner) -> None:
+    """Among others that came with it, too."""
+    driven = brought_to(State.BUSY, owner)
+    table = driven.table
+    driven.events[Event.ABORTED]()
+    others = np.array([slot for slot in range(3) if table.is_idle(slot)])
+    table.issue(others, Operation.STEP, COLLECTOR, 1.0)
+    for _ in table.put_in_flight(others):
+        pass
+    entries = table.numbering.entry
+    for host_id in (0, 1):
+        mine = np.flatnonzero(table.hosts == host_id)
+        found = table.complete([(host_id, entries[mine])])
+        assert SLOT not in found
+    assert table.is_idle(SLOT)
+    assert table.in_flight == [0, 0]
 
 
 def test_a_first_result_is_handed_out_once() -> None:
@@ -302,10 +332,10 @@ def test_a_late_reply_has_no_effect() -> None:
     (late,) = table.issue(slots, Operation.STEP, COLLECTOR, 1.0).tolist()
     table.in_flight[1] = 0
     (entry,) = table.ask_again(1, slots).tolist()
-    assert table.end(1, late) is table.complete_one(1, late) is None
+    assert table.end(1, late) is None
     assert not len(table.complete([(1, np.array([late]))]))
     assert table.state[SLOT] == State.BUSY
-    assert table.complete_one(1, entry) == SLOT
+    assert table.complete([(1, np.array([entry]))]).tolist() == [SLOT]
 
 
 def test_results_that_came_first_are_taken_first() -> None:
@@ -313,7 +343,7 @@ def test_results_that_came_first_are_taken_first() -> None:
     table = CheckedRequests(HOST_OF, 2)
     first, *others = table.issue(np.arange(3), Operation.STEP, COLLECTOR, 1.0).tolist()
     assert table.complete([(1, np.array(others))]).tolist() == [1, 2]
-    assert table.complete_one(0, first) == 0
+    assert table.complete([(0, np.array([first]))]).tolist() == [0]
     taken = [table.collector.pop_ready(1).item() for _ in range(3)]
     assert sorted(taken[:2]) == [1, 2]
     assert taken[2] == 0

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 
 from rlightning_aio._core.group.setup import build
-from rlightning_aio._core.group.state.request_states import COLLECTOR, LEGAL, Event, Owner, State
+from rlightning_aio._core.group.state.request_states import (
+    COLLECTOR,
+    LEGAL,
+    NOBODY,
+    Event,
+    Owner,
+    State,
+)
 from rlightning_aio._core.group.state.requests import Requests
 
 if TYPE_CHECKING:
@@ -73,7 +80,8 @@ _OF_REQUESTS: Final[Rules] = {
     "fail": lambda _, args: [(Event.FAULT, args[0])],
     "withdraw": lambda it, args: [(Event.WITHDRAWN, it.alone(args[0]))],
     "hand_out": lambda _, args: [(Event.HANDED_OUT, args[0])],
-    "end_aborted": lambda it, args: [(Event.ABORTED, args[0][it.aborted.among(args[0])])],
+    "abort": lambda _, args: [(Event.ABORTED, args[0])],
+    "drop_unwanted": lambda it, args: [(Event.DROPPED, args[0][it.owner[args[0]] == NOBODY])],
     "claim": lambda _, args: [(Event.CLAIMED, args[0])],
     "drop": lambda _, args: [(Event.DROPPED, args[0])],
     "settle": lambda _, args: [(Event.SETTLED, args[0].slots)],

@@ -1015,11 +1015,12 @@ class Play(Session):
             self.note_aborted(envs)
 
     async def op_drain(self, rng: Random) -> None:
-        """Take what is ready, and end the rest."""
+        """Take what is in flight, and end what is late."""
         pending = self.model.pending()
         if not self.may_abort() or not all(map(self.is_abortable, pending)):
             return
         deadline = rng.choice([None, 1e-4, 0.2])
+        ends = deadline is not None
         try:
             found, flags = await self.done(self.group.drain(deadline))
         except EnvFault as fault:
@@ -1028,13 +1029,14 @@ class Play(Session):
             if fault.results is not None and len(fault.results):
                 self.take(fault.results, None, COLLECTOR)
         except KeyboardInterrupt:
+            ends = True
             await self.done(self.group.abort())
             raise
         else:
             if len(found):
                 self.take(found, flags, COLLECTOR)
         finally:
-            envs = self.model.envs.values()
+            envs = self.model.envs.values() if ends else ()
             self.note_aborted([env for env in envs if env.limbo or env.request is not None])
 
     def may_abort(self) -> bool:

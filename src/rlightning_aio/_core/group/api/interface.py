@@ -158,13 +158,14 @@ class GroupInterface(Facade):
         raise NotImplementedError
 
     def drain(self, deadline: float | None = None) -> Any:
-        """Return results that are ready, and end everything else; all envs are idle then.
+        """Wait for all that is in flight, and return it as one batch.
 
         Args:
-            deadline: seconds to wait for the results of `step_async` and `reset_async`; None
-                takes those that are ready now.
+            deadline: seconds. What has not ended by then is aborted, as by `abort`, also requests
+                that other calls wait for; None waits for the results of `step_async` and
+                `reset_async`, however long they take, and aborts nothing.
 
-        Requests that have not ended by then are aborted, as by `abort`, also those of other calls.
+        Afterwards no env owes anything, which makes this the way to a checkpoint.
 
         Returns results and a flag for each, as `collect_async` does, in the order of the group;
         an empty batch if there are none. Cancelled, it loses no result that was ready.

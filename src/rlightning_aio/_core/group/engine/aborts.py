@@ -1,8 +1,8 @@
 """`Aborts`: ends requests without their results, because their caller wants none.
 
-The envs are free soon after that, whatever they do: their hosts cancel a request, withdraw it, or
-are replaced. The episode of an aborted request is over. Left out: what hosts do for that (see
-`HangDetector`).
+An aborted request belongs to nobody: its call ends in `EpisodeLost`, and its reply is dropped when
+it comes. The env is busy until then, which is soon, whatever it does: its host cancels the request,
+withdraws it, or is replaced (see `HangDetector`). The episode is lost.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import TURN
-from rlightning_aio._core.group.state.request_states import COLLECTOR, State
+from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY
 from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
 __all__ = ["Aborts"]
 
 _WHY: Final = Loss("was aborted", "cancelled", "caller")
-_TURNS: Final = 3
-"""Turns until a call has returned what it has, though it may look at the hosts before."""
 
 
 class Aborts:
@@ -72,36 +69,29 @@ class Aborts:
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.
 
-        Results that are ready stay; a call that has all of its own returns them before. Cancelled,
-        they end all the same.
+        Results that are ready stay. Cancelled, they end all the same.
         """
-        asked, slots = slots, self._requests.owed(slots)
-        aborted = self._requests.aborted
-        new = slots[~aborted.among(slots)]  # Another call may be ending the rest.
-        for slot in new.tolist():
-            aborted.add(slot, self._fault(slot))
+        requests, slots = self._requests, self._requests.owed(slots)
+        # Another call may be ending the rest; one that was cancelled belongs to nobody already.
+        new = slots[np.array([self._is_wanted(slot) for slot in slots.tolist()], np.bool_)]
+        wanted = new[requests.owner[new] != NOBODY]
+        requests.abort(wanted, [self._fault(slot) for slot in wanted.tolist()])
         self._stats.note_failures(new, _WHY.kind)
         self._abandon(new)
         for host_id, entry in self._supervisor.detector.abort(new, now):
-            self._requests.end(host_id, entry)
+            requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
         self._waiting.wake_serving()  # It may have results of these that it has not handed out.
         chosen = set(slots.tolist())
-        now = yield from self._waiting.until(now, lambda: len(aborted.faults.keys() & chosen))
-        for _ in range(_TURNS):
-            if self._is_returning(asked):
-                now = yield TURN
+        now = yield from self._waiting.until(now, lambda: len(requests.unwanted & chosen))
         self._arrivals.admit(slots, self._intake.now)
         return now
 
-    def _is_returning(self, slots: NDArray[np.intp]) -> bool:
-        """Return True if a call has all replies that it waits for, and some are of `slots`."""
-        requests = self._requests
-        ended = slots[requests.state[slots] > int(State.BUSY)]
-        owners: set[int] = {*requests.owner[ended].tolist()} - {COLLECTOR}
-        tickets = [requests.tickets.waiting[owner] for owner in owners]
-        return any(ticket.apart or not ticket.remaining for ticket in tickets)
+    def _is_wanted(self, slot: int) -> bool:
+        """Return False if nobody wants the reply of `slot`, because it was aborted."""
+        is_aborted = self._continuity.why_lost(slot) is _WHY
+        return not (is_aborted and slot in self._requests.unwanted)
 
     def _fault(self, slot: int) -> EpisodeLost:
         doing = Operation(self._requests.numbering.op(slot)).name.lower()

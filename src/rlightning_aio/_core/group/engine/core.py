@@ -165,18 +165,22 @@ class Core:
     def drain_requests(
         self, now: float, deadline: float | None
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        """Return the results that are ready by then, and end all other requests."""
+        """Return the results of all that is in flight, and end what has none by the deadline."""
         with self.observed.call("drain", now):
             return (yield from self._drain(now, deadline))
 
     def _drain(self, now: float, deadline: float | None) -> Procedure[tuple[BatchedData, Flags]]:
         self.steps.check_collectable()
-        collector, end = self.requests.collector, now + (deadline or 0.0)
+        collector, unwanted = self.requests.collector, self.requests.unwanted
+        end = None if deadline is None else now + deadline
         self.steps.collecting = True
         try:
             self.intake.now = now
-            now = yield from self.waiting.until(now, lambda: collector.num_awaited, end)
-            yield from self._aborts.end(self._all_slots, now)
+            now = yield from self.waiting.until(
+                now, lambda: collector.num_awaited + len(unwanted), end
+            )
+            if deadline is not None:
+                yield from self._aborts.end(self._all_slots, now)
         finally:
             self.steps.collecting = False
         results: tuple[BatchedData, Flags] = BatchedData([], []), []

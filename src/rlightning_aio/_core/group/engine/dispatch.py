@@ -57,7 +57,8 @@ class Dispatch:
     def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
         """Raise an error if the group is closed, or an env of `slots` is busy or gone.
 
-        A cancelled call that still runs in an env is ended before, inline by executing it.
+        What was cancelled or aborted and still runs in an env is ended before, inline by executing
+        it.
         """
         self._lifetime.check_open()
         while (slot := self._requests.first_not_idle(slots)) is not None:
@@ -74,7 +75,7 @@ class Dispatch:
     def _why_busy(self, slot: int) -> str:
         state, owner = self._requests.state.item(slot), self._requests.owner.item(slot)
         if owner == NOBODY:
-            return "a call that was cancelled still runs in it; try again when that has ended"
+            return "what was cancelled or aborted still runs in it; try again when that has ended"
         why = {
             State.BUSY: "its last request has not replied yet",
             State.READY: "the result of its last request was not collected",
@@ -87,7 +88,7 @@ class Dispatch:
         return f"{why}; wait for that call first"
 
     def _end_call(self, now: float, slot: int) -> bool:
-        """Note the end of a cancelled call that has ended since the group last waited.
+        """Note the end of a request of nobody that has ended since the group last waited.
 
         In this process, it is executed now, after the requests that were sent before it. Returns
         False if it has not ended.

@@ -109,9 +109,10 @@ class Intake:
         self._note_answered(self._requests.complete(reports))
 
     def _on_result(self, completion: Result) -> None:
-        slot = self._requests.complete_one(completion.host_id, completion.entry)
+        slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
+        self._requests.deliver(self._requests.alone(slot))
         if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
         if completion.is_loss:
@@ -244,17 +245,18 @@ class Intake:
         if loss is None:
             return
         requests, continuity = self._requests, self._continuity
-        # The episodes of aborted requests were over before.
-        lost = [slot for slot in loss.slots if slot not in requests.aborted.faults]
         requests.in_flight[loss.host_id] = 0  # It answers none of them.
-        owed = requests.end_aborted(loss.owed)
+        unwanted = requests.unwanted & {*loss.owed.tolist()}
+        owed = requests.drop_unwanted(loss.owed)
         if not loss.replaced:
             continuity.give_up(loss.slots)
             self._fail(owed, loss.error)
             return
         self._keep_ready(loss.slots)
         if loss.resets:
-            continuity.lose(lost, loss.why)
+            # The episodes of aborted requests were lost before.
+            over = {slot for slot in unwanted if continuity.why_lost(slot) is not None}
+            continuity.lose([slot for slot in loss.slots if slot not in over], loss.why)
         # A replacement answers steps and resets only.
         again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN) & loss.resets
         self._fail(owed[~again], loss.error)

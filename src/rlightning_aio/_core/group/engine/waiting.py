@@ -143,7 +143,8 @@ class Waiting:
                     if is_due:
                         now = yield Wait(0.0)
                 else:
-                    is_due = until is not None or supervisor.detector.timed
+                    detector = supervisor.detector
+                    is_due = until is not None or detector.timed or detector.any_ending
                     is_due = is_due or self._conditions.unusual & OF_HOSTS != 0
                     is_due = is_due or supervisor.members.possible
                     patient = supervisor.overdue.wait

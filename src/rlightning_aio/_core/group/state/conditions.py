@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
 
 __all__ = [
-    "ABORTING",
     "BESIDE_ROWS",
     "CLOSED",
     "CUT_BEFORE",
@@ -54,10 +53,7 @@ BESIDE_ROWS: Final = 1 << 5
 """A result that is ready is not, or not only, what its row holds."""
 FAULT: Final = 1 << 6
 """An error waits for the collector."""
-ABORTING: Final = 1 << 7
-"""A request is to end without its reply."""
-
-PAST_END: Final = 1 << 8
+PAST_END: Final = 1 << 7
 """Outside `auto_reset` an env is over, of an entry that was not warned that a step would go on."""
 OF_HOSTS: Final = ~(UNLIKE_ENVS | CUT_BEFORE | BESIDE_ROWS | PAST_END)
 """All that say something of hosts: while one is set, a waiting call looks at them at each turn."""

@@ -40,13 +40,13 @@ class Event(Enum):
     CLAIMED = auto()
     """A call takes a first result that waited for the collector."""
     DROPPED = auto()
-    """A call asks for more than that first result, or its caller wants no result."""
+    """A call asks for more than that first result, or nobody wants what it has led to."""
     RESULT = auto()
     VALUE = auto()
     FAULT = auto()
     WITHDRAWN = auto()
     ABORTED = auto()
-    """It has ended, and nobody gets what it led to."""
+    """Its caller wants no reply."""
     ASKED_AGAIN = auto()
     KEPT = auto()
     """Its error could not be raised at once: it waits for the collector."""
@@ -73,7 +73,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),
     (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
-    (_BUSY, _C, Event.ABORTED): (_IDLE, _C),
+    (_BUSY, _C, Event.ABORTED): (_BUSY, _N),
     (_BUSY, _C, Event.ASKED_AGAIN): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
     (_READY, _C, Event.CLAIMED): (_READY, _T),
@@ -82,7 +82,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _T, Event.RESULT): (_READY, _T),
     (_BUSY, _T, Event.VALUE): (_SPENT, _T),
     (_BUSY, _T, Event.FAULT): (_SPENT, _T),
-    (_BUSY, _T, Event.ABORTED): (_IDLE, _C),
+    (_BUSY, _T, Event.ABORTED): (_BUSY, _N),
     (_BUSY, _T, Event.ASKED_AGAIN): (_BUSY, _T),
     (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
     (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
@@ -91,9 +91,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_SPENT, _T, Event.METHOD_GIVEN_UP): (_IDLE, _C),
     (_READY, _T, Event.SETTLED): (_READY, _C),
     (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
-    (_BUSY, _N, Event.VALUE): (_IDLE, _C),
-    (_BUSY, _N, Event.FAULT): (_IDLE, _C),
-    (_BUSY, _N, Event.ABORTED): (_IDLE, _C),
+    (_BUSY, _N, Event.DROPPED): (_IDLE, _C),
 }
 """State and owner after each possible event. A combination that is missing can't happen."""
 

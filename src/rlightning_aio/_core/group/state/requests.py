@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rlightning_aio._core.group.state.conditions import ABORTING, Conditions
+from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.numbering import Numbering
 from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio._core.group.state.uncollected import UncollectedErrors
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Parked
     from rlightning_aio.protocol.rings import TrainerBell
 
-__all__ = ["Aborted", "CollectorQueue", "Requests", "Ticket", "Tickets"]
+__all__ = ["CollectorQueue", "Requests", "Ticket", "Tickets"]
 
 
 # Plain ints: NumPy takes several times as long over members of an enum.
@@ -177,33 +177,6 @@ class CollectorQueue(UncollectedErrors):
         self.num_ready -= len(slots)
 
 
-class Aborted:
-    """The slots whose outstanding requests end without a reply, whatever their hosts report.
-
-    Attributes:
-        faults: by slot, the error for a call that waits for the request.
-    """
-
-    def __init__(self, conditions: Conditions) -> None:
-        self._conditions = conditions
-        self.faults: dict[int, EnvFault] = {}
-
-    def add(self, slot: int, fault: EnvFault) -> None:
-        """Add a slot whose request is outstanding."""
-        self.faults[slot] = fault
-        self._conditions.note(ABORTING, True)
-
-    def among(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which of `slots` are aborted."""
-        return np.array([slot in self.faults for slot in slots.tolist()], np.bool_)
-
-    def pop(self, slots: NDArray[np.intp]) -> list[EnvFault]:
-        """Remove slots whose requests have ended; return their errors."""
-        taken = [self.faults.pop(slot) for slot in slots.tolist()]
-        self._conditions.note(ABORTING, bool(self.faults))
-        return taken
-
-
 class Requests:
     """See the module.
 
@@ -220,7 +193,7 @@ class Requests:
         in_flight: requests of each host that are not answered; the only count of them.
         rings: of each host, if it is a live worker of this machine; kept up by the hosts.
         in_rings: all hosts had rings when the group started.
-        aborted: requests that end without a reply.
+        unwanted: slots whose requests belong to nobody; the reply of each is dropped.
         anything_ended: something has ended since this was set to False.
     """
 
@@ -235,7 +208,7 @@ class Requests:
         conditions = conditions or Conditions()
         self.state = np.zeros(size, np.int8)
         self.collector = CollectorQueue(conditions, self.state)
-        self.aborted = Aborted(conditions)
+        self.unwanted: set[int] = set()
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
         self.in_flight = [0] * num_hosts
@@ -356,13 +329,13 @@ class Requests:
         )
         if slots is None:
             return False
-        self.deliver(slots)
+        self.deliver(self.drop_unwanted(slots) if self.unwanted else slots)
         return True
 
     def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
         """Record results that are in their rows; return their slots.
 
-        Late replies, to requests that were asked anew, are dropped.
+        Late replies, to requests that were asked anew, are dropped, and so are unwanted ones.
 
         Args:
             reports: a host, and the entries of what it has done; in the order of arrival.
@@ -381,17 +354,10 @@ class Requests:
         else:
             for host_id, own in reports:
                 self.in_flight[host_id] -= len(own)
-        if self.aborted.faults:
-            slots = self.end_aborted(slots)
+        if self.unwanted:
+            slots = self.drop_unwanted(slots)
         self.deliver(slots)
         return slots
-
-    def complete_one(self, host_id: int, entry: int) -> int | None:
-        """Record one result; return its slot, or None if it was late."""
-        slot = self.end(host_id, entry)
-        if slot is not None:
-            self.deliver(self.alone(slot))
-        return slot
 
     def end(self, host_id: int, entry: int) -> int | None:
         """End the request `entry`, and return its slot; None if nobody wants the reply any more."""
@@ -399,28 +365,34 @@ class Requests:
         if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
             return None
         self.in_flight[host_id] -= 1
-        if slot in self.aborted.faults:
-            self.end_aborted(self.alone(slot))
+        if slot in self.unwanted:
+            self.drop_unwanted(self.alone(slot))
             return None
         return slot
 
-    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        """End those of `slots` that are aborted, none of them in flight; return the others.
+    def drop_unwanted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """End those of `slots` that belong to nobody, none of them in flight; return the others."""
+        is_dropped = self.owner[slots] == NOBODY
+        dropped = slots[is_dropped]
+        self.unwanted.difference_update(dropped.tolist())
+        self._forget(dropped)
+        self.anything_ended = True
+        return slots[~is_dropped]
 
-        A call that waits for one gets its error, the collector nothing; the slot is free.
-        """
-        aborted = self.aborted.among(slots)
-        for owner, mine in self.owners(slots[aborted]):
-            faults = self.aborted.pop(mine)
+    def abort(self, slots: NDArray[np.intp], faults: Sequence[EnvFault]) -> None:
+        """Give outstanding requests to nobody; a call that waits for one gets its error."""
+        each: list[int] = slots.tolist()
+        fault_of = dict(zip(each, faults, strict=True))
+        for owner, mine in self.owners(slots):
             if owner > 0:
                 ticket = self.tickets.note_ended(owner, len(mine))
                 ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
-                ticket.errors.update(zip(mine.tolist(), faults, strict=True))
+                ticket.errors.update((slot, fault_of[slot]) for slot in mine.tolist())
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
-            self._forget(mine)
-            self.anything_ended = True
-        return slots[~aborted]
+        self.owner[slots] = NOBODY
+        self.unwanted.update(each)
+        self.anything_ended = True
 
     def join(self, slot: int, now: float, op: int = _JOIN) -> None:
         """Record a result that lies in its row without a request; the slot is idle."""
@@ -460,12 +432,8 @@ class Requests:
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
         self.anything_ended = True
-        owner = int(self.owner[slot])
-        if owner == NOBODY:
-            self._forget(self.alone(slot))
-        else:
-            self.tickets.note_ended(owner, 1).values[slot] = value
-            self.state[slot] = _SPENT_CODE
+        self.tickets.note_ended(int(self.owner[slot]), 1).values[slot] = value
+        self.state[slot] = _SPENT_CODE
 
     def owners(self, slots: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
         """Return each owner among `slots`, with those that have an error in common."""
@@ -490,11 +458,9 @@ class Requests:
             if ticket.apart:
                 ticket.ended.append(slots)
             self.state[slots] = _SPENT_CODE
-        elif owner == COLLECTOR:
+        else:
             self.collector.num_awaited -= len(slots)
             self.collector.keep(slots, fault)
-        else:
-            self._forget(slots)
 
     def withdraw(self, slot: int) -> None:
         """End a request of the collector without a result."""
@@ -560,7 +526,9 @@ class Requests:
         slots = ticket.slots = ticket.own_slots(self.owner)
         self.settle(ticket)
         if ticket.calls:
-            self.owner[self.owed(slots)] = NOBODY
+            owed = self.owed(slots)
+            self.owner[owed] = NOBODY
+            self.unwanted.update(owed.tolist())
             return
         ready = self.ready(slots)
         self.collector.num_awaited += len(self.owed(slots)) + len(ready)

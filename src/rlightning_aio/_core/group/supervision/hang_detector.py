@@ -96,7 +96,7 @@ class HangDetector:
 
     def _check_aborted(self, record: HostRecord) -> None:
         """Kill a worker whose aborted requests go on."""
-        outstanding = {} if record.dying else self._requests.aborted.faults
+        outstanding = set[int]() if record.dying else self._requests.unwanted
         record.abort_by = {k: by for k, by in record.abort_by.items() if k in outstanding}
         slot = min(record.abort_by, key=record.abort_by.__getitem__, default=None)
         if slot is not None and self._now >= record.abort_by[slot] and not read_news(record):
@@ -150,7 +150,7 @@ class HangDetector:
         expiry = self._expiry(record)
         if expiry is None or self._now < expiry or read_news(record):
             return
-        if entry and slot_of(entry) in self._requests.aborted.faults:  # It counts as aborted.
+        if entry and slot_of(entry) in record.abort_by:  # It counts as aborted.
             self._kill_aborted(record, slot_of(entry))
             return
         record.is_hung = True
