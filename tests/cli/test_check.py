@@ -107,3 +107,12 @@ def test_check_names_numbers_outside_of_the_space(tmp_path: Path, placement: str
         "an observation holds 2.0, and the space goes from 0.0 to 1.0: clip it, or declare a "
         "wider space"
     )
+
+
+@pytest.mark.parametrize("where", ["info", "observation"])
+def test_actions_obey_masks(tmp_path: Path, where: str) -> None:
+    """Also where observations are compared with their space."""
+    masked = {"name": "m", "task": "cli.stub_envs:Masked", "env_kwargs": {"where": where}}
+    config = write_config(tmp_path, {**masked, "placement": "inline"})
+    (found,) = invoke_json("check", config, "--steps", "30")["entries"]
+    assert found["problems"] == []

@@ -32,9 +32,11 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.json_text import json_of
+from rlightning_aio.policies.masks import allowed_action
+from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
 from rlightning_aio.registry import ENVS, load
-from rlightning_aio.trees import as_numpy, tree_of, walked
+from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -257,7 +259,8 @@ async def _compare_spaces(group: EnvGroup, steps: int, found: _Finding) -> None:
     (meta,) = group.metas
     env, space = group[meta.env_id], cast("gym.Space[Any]", meta.observation_space)
     actions = cast("gym.Space[Any]", meta.action_space)
-    actions.seed(0)
+    rng = np.random.default_rng(0)
+    sample = sampler_of(actions, rng)
     said = dict[str, str]()
     result = await env.call("reset", seed=2)
     for step in range(steps + 1):
@@ -266,8 +269,8 @@ async def _compare_spaces(group: EnvGroup, steps: int, found: _Finding) -> None:
             said.setdefault("bounds", f"{words}: clip it, or declare a wider space")
         if step == steps or any(np.any(as_numpy(flag)) for flag in _ends(result)):
             break
-        response = PolicyResponse(meta.env_id, action=actions.sample())
-        result = await env.call("step", response)
+        action = allowed_action(actions, index(sample(1), 0), result, rng)
+        result = await env.call("step", PolicyResponse(meta.env_id, action=action))
     found.problems += said.values()
 
 
