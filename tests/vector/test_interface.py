@@ -401,17 +401,43 @@ class Interrupting(Plain):
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
 def test_after_ctrl_c_it_is_reset(placement: str) -> None:
-    """A step would hide from the program what the interrupted one returned: an end, for example."""
+    """A step would hide from the program what the interrupted one returned: an end, for example.
+    No other call is made, either.
+    """
     trainer = os.getpid()
     env = VectorEnv([lambda: Interrupting(trainer)] * 2, placement=placement)
     first, _ = env.reset(seed=0)
     for actions in ([1, 0], [0, 1]):
         with pytest.raises(KeyboardInterrupt):
             env.step(actions)
-        with pytest.raises(ResetNeeded, match="interrupted"):
-            env.step([0, 0])
+        mask = {"reset_mask": np.array([True, False])}
+        for ask in (
+            partial(env.step, [0, 0]),
+            partial(env.step_async, [0, 0]),
+            partial(env.reset, options=mask),
+            partial(env.get_attr, "count"),
+            env.snapshot,
+        ):
+            with pytest.raises(ResetNeeded, match="interrupted"):
+                ask()
         np.testing.assert_array_equal(env.reset(seed=0)[0], first)
     env.step([0, 0])
+    env.close()
+
+
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_after_ctrl_c_a_state_can_be_restored(placement: str) -> None:
+    """As a reset: it drops what was in flight."""
+    trainer = os.getpid()
+    env = VectorEnv([lambda: Interrupting(trainer)] * 2, placement=placement)
+    env.reset(seed=0)
+    kept = env.snapshot()
+    expected = env.step([0, 0])
+    env.restore(kept)
+    with pytest.raises(KeyboardInterrupt):
+        env.step([1, 0])
+    env.restore(kept)
+    assert_alike(env.step([0, 0]), expected)
     env.close()
 
 
