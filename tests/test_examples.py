@@ -26,7 +26,6 @@ ELSEWHERE = {
     "lerobot": "vector/test_pages.py",
     "metrics": "test_metrics.py",
     "rlightning": "test_docs.py",
-    "scaling": "on_ray/test_pages.py",
     "simulators": "cli/test_simulators_page.py",
     "stable_baselines3": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
@@ -48,10 +47,10 @@ def by_program(written: str) -> dict[str, str]:
     return dict(part.split("\n", 1) for part in written.split("\0")[1:])
 
 
-# Those of migrating.md are run by vector/test_pages.py.
+# Those of migrating.md are run by vector/test_pages.py, that on Ray by on_ray/test_pages.py.
 NEEDS_MORE = (
     r"^(import (torch|aiohttp)$|from stable_baselines3|net = "
-    r"|from (ray|rl_zoo3|skrl|tianshou|torchrl)\b)"
+    r"|from (ray|rl_zoo3|skrl|tianshou|torchrl)\b|    \"placement\": \"ray\")"
 )
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)
 
