@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/timeline.md from timelines that are recorded here and now.
+"""Draw the pictures of docs/metrics.md from timelines that are recorded here and now.
 
     python docs/draw_timelines.py
 

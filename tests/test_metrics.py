@@ -35,12 +35,12 @@ def test_the_page_tells_who_starves(tmp_path: Path) -> None:
 
 
 def test_the_programs_of_the_page_run(tmp_path: Path) -> None:
-    """Deaths are counted by entry, and every library gets the numbers."""
+    """Deaths are counted by entry, every library gets the numbers, and a timeline is written."""
     pytest.importorskip("prometheus_client")
     pytest.importorskip("opentelemetry.sdk.metrics")
     pytest.importorskip("tensorboardX")
-    first, _, fails, board, _, prometheus, telemetry = blocks("python", "metrics.md")
-    printed = run_programs([first, fails, board, prometheus, telemetry], tmp_path)
+    first, _, fails, board, _, prometheus, telemetry, traced = blocks("python", "metrics.md")
+    printed = run_programs([first, fails, board, prometheus, telemetry, traced], tmp_path)
     assert "sound: 0 restarts, 0 episodes lost" in printed
     assert re.search(r"fragile: [4-9] restarts, [4-9] episodes lost", printed)
     sent = [r"^(envs/\w+) ", r"^(envs_\w+) ", r'"name": "(envs/\w+)"']
@@ -50,3 +50,4 @@ def test_the_programs_of_the_page_run(tmp_path: Path) -> None:
         assert {f"envs/{name}"} <= found[0] & found[2]
         assert f"envs_{name}" in found[1]
         assert f"envs/{name}".encode() in curves.read_bytes()
+    assert (tmp_path / "run.json").stat().st_size > 0

@@ -408,7 +408,7 @@ class Facade:
         Use ``with group.trace("run.json"):`` (or ``async with``), or `Trace.start` and
         `Trace.stop`. The timeline shows steps and resets of each env, waits of workers and trainer,
         the path of each request to its result, restarts, hangs and step limits: see
-        docs/timeline.md. `span` adds other work of the trainer.
+        docs/metrics.md. `span` adds other work of the trainer.
 
         Args:
             path: of the file, in Chrome's trace event format (JSON). It is written when the
