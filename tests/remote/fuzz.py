@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import os
 import tracemalloc
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from remote.random_spaces import mutation
-from remote.unauthenticated_peers import hello
 from remote.unreliable import World
 
-from rlightning_aio.remote.keys import AllowedKeys, make_keys, read_client_keys
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from rlightning_aio.protocol.net.wire import ClientHello, Writer
 
 _KEPT = 200
 
@@ -28,13 +22,11 @@ class Findings:
     Attributes:
         frames: corrupted messages that were delivered.
         steps: steps that were answered.
-        malformed: corrupted messages that the server recognised as malformed.
         grown: bytes by which memory grew over the second half.
     """
 
     frames: int = 0
     steps: int = 0
-    malformed: int = 0
     grown: int = 0
 
 
@@ -69,28 +61,20 @@ def fuzz(frames: int, seed: int) -> Findings:
         findings.grown = tracemalloc.get_traced_memory()[0] - held
     finally:
         tracemalloc.stop()
-    findings.malformed = world.server.num_malformed
     return findings
 
 
-def fuzz_keys(files: int, seed: int, directory: Path) -> int:
-    """Write `files` corrupted key files next to a good one; count how often that was unknown."""
-    rng = np.random.default_rng(seed)
-    (arm,) = make_keys(directory, ["arm"])
-    allowed = directory / "server" / "clients"
-    listed, key = AllowedKeys(allowed), read_client_keys(arm).public
-    honest = [(allowed / "arm.key").read_bytes()]
-    unknown = 0
-    for k in range(files):
-        name = rng.bytes(int(rng.integers(1, 9))).replace(b"/", b"_").replace(b"\0", b"_")
-        path = allowed / os.fsdecode(b"%d%s.key" % (k % 20, name))
-        path.write_bytes(b"".join(mutation(rng)(honest)))
-        unknown += not listed.holds(key)
-        if k % 20 == 19:
-            for file in allowed.iterdir():
-                if file.name != "arm.key":
-                    file.unlink()
-    return unknown
+def hello(rng: np.random.Generator) -> list[bytes]:
+    """Return a hello that is valid but for its version."""
+    space = {"type": "discrete", "n": 2**62, "start": 2**62}
+    return Writer().write(
+        ClientHello(
+            version=int(rng.integers(0, 3)),
+            name=f"peer-{rng.integers(100)}",
+            observation_space=space,
+            action_space=space,
+        )
+    )
 
 
 def spoil(
@@ -104,7 +88,7 @@ def spoil(
         whole = hello(rng) if is_hello else said[int(rng.integers(len(said)))]
         parts = mutation(rng)(whole)
         if to_server:
-            world.server.receive(client.route or b"%s:-" % name.encode(), parts, world.now)
+            world.server.receive(client.route or b"%s:-" % name.encode(), parts)
             world.flush()
         elif client.route is not None:
             client.receive(parts)

@@ -252,9 +252,7 @@ def test_a_key_that_is_overwritten_in_place_is_no_longer_admitted(
         friend.join()
         another.join()
     assert "the server does not know this client's key" in errors[0]
-    warnings = [r.getMessage() for r in caplog.records if "can't name a client" in r.getMessage()]
-    assert len(warnings) == 1
-    assert "\\udcff\\x1b.key" in warnings[0]
+    assert caplog.text.count("\\udcff\\x1b.key has no line public-key") == 1
 
 
 # Addresses and settings
@@ -338,7 +336,6 @@ def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path
     )
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
-        remote = group["robots-0"]._server._listener
         friend = ClientThread(address, "arm")
         batch, _ = group.reset()
         with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
@@ -351,11 +348,6 @@ def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path
                 if k % 10 == 0:
                     group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                     batch, _ = group.collect_async(deadline=HANG)
-            # It is cut off and dials again, repeatedly.
-            while remote._sessions.num_malformed < 3 or remote.connections.num_cut < 3:
-                say(peer, [bomb])
-                group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
-                batch, _ = group.collect_async(deadline=HANG)
         assert group["robots-0"].clients == ["robots-0/arm"]
         group.close()
         friend.join()
@@ -380,7 +372,6 @@ def test_a_frame_beyond_the_limit_is_not_read() -> None:
                 batch, _ = group.collect_async(deadline=HANG)
             peer.disable_monitor()
             monitor.close()
-        assert group["robots-0"]._server._listener._sessions.num_malformed == 0
         group.close()
         friend.join()
 

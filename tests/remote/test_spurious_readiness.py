@@ -11,7 +11,7 @@ from kit.counting import ClientThread, CountingEnv
 from patience import HANG
 
 from rlightning_aio import sync
-from rlightning_aio._core.hosts.env_server import authenticator, connection_limiter, listener
+from rlightning_aio._core.hosts.env_server import authenticator, listener
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,7 +45,7 @@ def test_spurious_readiness_disturbs_neither_side(
 
         return asked
 
-    for module in (listener, authenticator, connection_limiter):
+    for module in (listener, authenticator):
         monkeypatch.setattr(module, "is_readable", lying(module.is_readable))
     config = {
         "name": "robots",

@@ -104,10 +104,8 @@ def test_the_limits_are_those_of_the_code() -> None:
     """In mebibytes, and in parts."""
     assert f"| header | {wire.MAX_HEADER_BYTES >> 20} MiB |" in PAGE
     assert f"| header of a hello | {wire.MAX_HELLO_BYTES >> 10} KiB |" in PAGE
-    assert f"| a result and an action of all clients | {wire.MAX_BYTES_IN_ALL >> 30} GiB |" in PAGE
     assert f"| frame | {wire.MAX_FRAME_BYTES >> 20} MiB |" in PAGE
     assert f"| parts of a message | {wire.MAX_PARTS:,} |" in PAGE
-    assert f"`extras` or `options` | {wire.MAX_NESTING} |" in PAGE
 
 
 def test_the_hello_is_read() -> None:

@@ -167,7 +167,7 @@ class World:
             self.server.disconnected(route)
         else:
             self.delivered.setdefault((client.name, True), []).append(parts)
-            self.server.receive(route, parts, self.now)
+            self.server.receive(route, parts)
         self.flush()
 
     def to_client(self, client: Client) -> None:

@@ -222,7 +222,7 @@ class _Listener:
             if parts is None:
                 self._sessions.disconnected(route)
             else:
-                self._sessions.receive(route, parts, now)
+                self._sessions.receive(route, parts)
         self._sessions.tick(now)
         self._send()
 

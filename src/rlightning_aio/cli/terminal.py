@@ -25,7 +25,7 @@ from rich.table import Table
 import rlightning_aio
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
 from rlightning_aio.json_text import json_of
-from rlightning_aio.protocol.net.limited_log import LOG
+from rlightning_aio.protocol.net.texts import LOG
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence

@@ -41,9 +41,9 @@ from rlightning_aio.protocol.net.client_session import (
     ResetRequest,
     StepRequest,
 )
-from rlightning_aio.protocol.net.limited_log import LOG
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
+from rlightning_aio.protocol.net.texts import LOG
 from rlightning_aio.protocol.net.wire import (
     HANDSHAKE_SECONDS,
     MAX_FRAME_BYTES,

@@ -9,8 +9,8 @@ Deleting a file in ``server/clients/``, or writing another key into it, shuts th
 
 from __future__ import annotations
 
+import contextlib
 import logging
-import os
 import re
 import shutil
 import tempfile
@@ -27,13 +27,15 @@ from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import write_file
+from rlightning_aio.protocol.net.texts import in_one_line
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Sequence
 
 __all__ = [
-    "AllowedKeys",
     "ClientKeys",
+    "ListedKeys",
     "ServerKeys",
     "make_keys",
     "read_client_keys",
@@ -46,6 +48,7 @@ _SERVER: Final = "server"
 _CLIENT: Final = "client"
 _ALLOWED: Final = "clients"
 _KEY_BYTES: Final = 32
+_TICK_NS: Final = 1_000_000_000
 
 _log = logging.getLogger(__name__)
 
@@ -201,100 +204,58 @@ def _is_key(text: bytes) -> bool:
         return False
 
 
-class _Stamp(NamedTuple):
-    """Properties of a file; at least one changes when it is written.
+class ListedKeys:
+    """The keys that are in a directory, read again when it or one of its files has changed.
 
-    Unlike the time of its contents, that of its last change can't be set, and access rights change
-    it.
-    """
-
-    changed_ns: int
-    size: int
-    inode: int
-
-
-_UNSETTLED: Final = _Stamp(-1, -1, -1)
-_TICK_NS: Final = 1_000_000_000
-
-
-class AllowedKeys:
-    """The keys that are now in a directory.
-
-    `holds` compares the stamps of all files (a few microseconds for each), and reads files that
-    have changed. A file that holds no key is skipped with one warning.
+    A file that holds no key is skipped with a warning. `zmq.auth` calls it a credentials provider.
 
     Args:
         directory: of public keys, ``<name>.key`` each.
-
-    Attributes:
-        directory: as given.
     """
 
     def __init__(self, directory: Path) -> None:
-        self.directory = directory
-        self._read: dict[str, tuple[_Stamp, bytes | None]] = {}
+        self._directory = directory
+        self._changed_ns: dict[Path, int] = {}
         self._keys: set[bytes] = set()
-        self._faulty: set[str] = set()
-        self._is_unreadable = False
+        self._warned: set[str] = set()
 
-    def holds(self, key: bytes) -> bool:
+    def callback(self, domain: str, key: bytes) -> bool:
         """Return True if there is a file with the public key `key` (Z85 text)."""
-        stamps = self._stamps()
-        if stamps != {name: stamp for name, (stamp, _) in self._read.items()}:
-            self._refresh(stamps)
+        del domain
+        changed_ns = self._times()
+        # What was written a moment ago may be written again within one tick of the file system.
+        is_settled = time.time_ns() - max(changed_ns.values(), default=0) > _TICK_NS
+        if changed_ns != self._changed_ns or not is_settled:
+            self._changed_ns = changed_ns
+            self._keys = {found for path in changed_ns if (found := self._key_in(path)) is not None}
+        if key not in self._keys:
+            _log.warning("the key %r of a client is not in %s", key.decode(), self._directory)
         return key in self._keys
 
-    def is_known(self, key: bytes) -> bool:
-        """Return True if `key` was a client's when the files were read last."""
-        return key in self._keys
-
-    def _stamps(self) -> dict[str, _Stamp]:
-        stamps: dict[str, _Stamp] = {}
+    def _times(self) -> dict[Path, int]:
+        """Return when the directory and each file in it were last changed."""
         try:
-            with os.scandir(self.directory) as files:
-                for file in files:
-                    if file.name.endswith(_PUBLIC_SUFFIX) and not file.name.startswith("."):
-                        try:
-                            said = file.stat()
-                        except OSError:
-                            continue  # Deleted since it was listed, or a link to nowhere.
-                        stamps[file.name] = _Stamp(said.st_ctime_ns, said.st_size, said.st_ino)
+            times = {self._directory: self._directory.stat().st_mtime_ns}
         except OSError as error:
-            # A directory that can't be read admits no client.
-            if not self._is_unreadable:
-                self._is_unreadable = True
-                _log.warning("can't read %s: %s; no client is let in", self.directory, error)
+            self._warn(f"can't read {self._directory}: {error}; no client is let in")
             return {}
-        self._is_unreadable = False
-        return stamps
+        for path in self._directory.glob(f"[!.]*{_PUBLIC_SUFFIX}"):
+            with contextlib.suppress(OSError):  # Deleted since it was listed.
+                if path.is_file():
+                    times[path] = path.stat().st_mtime_ns
+        return times
 
-    def _refresh(self, stamps: dict[str, _Stamp]) -> None:
-        read: dict[str, tuple[_Stamp, bytes | None]] = {}
-        for name, stamp in sorted(stamps.items()):
-            known = self._read.get(name)
-            if known is not None and known[0] == stamp:
-                read[name] = known
-                continue
-            # A second write within one tick of the file system's clock does not change the stamp.
-            is_settled = time.time_ns() - stamp.changed_ns > _TICK_NS
-            read[name] = stamp if is_settled else _UNSETTLED, self._key_in(name)
-        self._read = read
-        self._faulty &= read.keys()
-        self._keys = {key for _, key in read.values() if key is not None}
-
-    def _key_in(self, name: str) -> bytes | None:
-        """Return the key in the file `name`; None, with a warning, if there is none."""
-        path = self.directory / name
-        try:
-            if not name.isprintable():
-                raise ConfigError(f"{str(path)!a} has a name that can't name a client")
-            if not path.is_file():
-                raise ConfigError(f"{path} is not a file")
-            key = read_public_key(path)
-        except ConfigError as error:
-            if name not in self._faulty:
-                self._faulty.add(name)
-                _log.warning("%s; its client is not let in", error)
+    def _key_in(self, path: Path) -> bytes | None:
+        if path == self._directory:
             return None
-        self._faulty.discard(name)
-        return key
+        try:
+            return read_public_key(path)
+        except ConfigError as error:
+            self._warn(f"{error}; its client is not let in")
+            return None
+
+    def _warn(self, text: str) -> None:
+        """Log a warning once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            _log.warning("%s", in_one_line(text))

@@ -6,7 +6,6 @@ no error. Small parts are copied, which is faster than counting references to th
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import zmq
@@ -57,15 +56,10 @@ def send_parts(socket: zmq.Socket[Any], parts: Sequence[Part]) -> None:
         send(part, _MORE if position < last else _LAST, copy=size < _COPIED_BYTES)
 
 
-def receive_parts(
-    socket: zmq.Socket[Any], frame: zmq.Frame, max_parts: int = sys.maxsize
-) -> list[Part]:
-    """Return the parts of a message from `frame` to the last, at most `max_parts`.
-
-    The remaining parts stay in the socket.
-    """
+def receive_parts(socket: zmq.Socket[Any], frame: zmq.Frame) -> list[Part]:
+    """Return the parts of a message from `frame` to the last."""
     parts = [_content(frame)]
-    while frame.more and len(parts) < max_parts:
+    while frame.more:
         frame = socket.recv(_LAST, copy=False)
         parts.append(_content(frame))
     return parts

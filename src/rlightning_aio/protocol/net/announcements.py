@@ -50,11 +50,6 @@ class Announcement(NamedTuple):
     results: ResultLayout
     actions: SpaceLayout
 
-    @property
-    def num_bytes(self) -> int:
-        """Size of one result and one action."""
-        return self.results.num_bytes + self.actions.num_bytes
-
 
 def announced(
     hello: ClientHello,

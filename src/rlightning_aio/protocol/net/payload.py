@@ -51,7 +51,6 @@ class SpaceLayout:
 
     Attributes:
         num_frames, num_texts: of one value.
-        num_bytes: of all its frames.
     """
 
     def __init__(self, space: gym.Space[Any], what: str) -> None:
@@ -59,7 +58,6 @@ class SpaceLayout:
         self._only = self._node.form if type(self._node) is _Array else None
         self.num_frames = self._node.num_frames
         self.num_texts = self._node.num_texts
-        self.num_bytes = self._node.num_bytes
 
     def pack(self, value: Any, packed: Packed) -> None:
         """Append `value` to `packed`; the bytes are copies.
@@ -88,7 +86,6 @@ class SpaceLayout:
 class _Node:
     num_frames = 0
     num_texts = 0
-    num_bytes = 0
 
     def pack(self, value: Any, packed: Packed) -> None:
         raise NotImplementedError
@@ -103,7 +100,6 @@ class _Array(_Node):
     def __init__(self, space: gym.Space[Any], what: str) -> None:
         shape = tuple(cast("tuple[int, ...]", space.shape))
         self.form = ArrayForm(DTYPES[np.dtype(space.dtype).name], shape)
-        self.num_bytes = self.form.size
         self._leaf = Leaf((), shape, self.form.dtype)
         self._what = what
 
@@ -159,7 +155,6 @@ class _Parts(_Node):
         self._what = what
         self.num_frames = sum(node.num_frames for node in nodes.values())
         self.num_texts = sum(node.num_texts for node in nodes.values())
-        self.num_bytes = sum(node.num_bytes for node in nodes.values())
 
 
 class _Dict(_Parts):
@@ -220,7 +215,6 @@ class ResultLayout:
     Attributes:
         head: ``()``, ``(num_envs,)``, and with agents ``(num_agents,)`` or
             ``(num_agents, num_envs)``.
-        num_bytes: of one result's frames.
     """
 
     def __init__(
@@ -231,7 +225,6 @@ class ResultLayout:
         self._each = (num_envs,) if num_envs > 1 else ()
         self.head = (len(agents), *self._each) if agents else self._each
         self._columns = [ArrayForm(DTYPES[name], self.head) for name in ("float64", "bool", "bool")]
-        self.num_bytes = self._observation.num_bytes + sum(form.size for form in self._columns)
         if prod(self.head) > MAX_HEAD:
             raise WireError(f"{prod(self.head)} rewards in one result; {MAX_HEAD} are allowed")
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass, field
-from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from rlightning_aio.errors import BadAction, EnvBusy, UnknownEnv
@@ -20,12 +19,9 @@ from rlightning_aio.outcomes import BLAMES
 from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.announcements import Rejection, announced
-from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
 from rlightning_aio.protocol.net.payload import Packed
-from rlightning_aio.protocol.net.texts import in_lines, in_one_line
+from rlightning_aio.protocol.net.texts import LOG, in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
-    MAX_BYTES_IN_ALL,
-    MAX_NESTING,
     Bye,
     ClientHello,
     ClientResult,
@@ -39,7 +35,6 @@ from rlightning_aio.protocol.net.wire import (
     Welcome,
     WireError,
     Writer,
-    nests_too_deep,
     portable,
 )
 
@@ -49,17 +44,9 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.announcements import Announcement, ClientKind
     from rlightning_aio.types import ClientTraits, EnvMeta
 
-__all__ = ["MessageEffect", "OutgoingMessage", "RemoteResult", "ServerSession", "ServerSessions"]
+__all__ = ["OutgoingMessage", "RemoteResult", "ServerSession", "ServerSessions"]
 
 _MAX_SESSIONS: Final = 512
-
-
-class MessageEffect(Enum):
-    """The effect of a message that the server received."""
-
-    IN_SESSION = "it belongs to a session, or opened one"
-    TURNED_AWAY = "it was understood and refused"
-    MALFORMED = "it was dropped"
 
 
 class OutgoingMessage(NamedTuple):
@@ -119,13 +106,6 @@ class _Request(NamedTuple):
     deadline: float | None
 
 
-class _Loss(NamedTuple):
-    """A marked result that the next step of a client returns, and its size."""
-
-    result: RemoteResult
-    num_bytes: int
-
-
 @dataclass(slots=True, eq=False)
 class ServerSession:
     """One connection of a client that was let in.
@@ -156,8 +136,6 @@ class ServerSession:
         Raises:
             WireError: they are not what the client announced.
         """
-        if nests_too_deep(message.info) or nests_too_deep(message.extra):
-            raise WireError(f"an info is nested more than {MAX_NESTING} deep")
         header = (message.reward, message.terminated, message.truncated)
         request = self.request
         return RemoteResult(
@@ -194,7 +172,6 @@ class ServerSessions:
     Attributes:
         clients: the env of each client that has joined (its first result has come), by name.
         outbox: messages that wait to be sent, oldest first; the sender removes them.
-        num_malformed: messages that were dropped as malformed.
     """
 
     def __init__(
@@ -207,18 +184,17 @@ class ServerSessions:
     ) -> None:
         self.clients: dict[str, EnvMeta] = {}
         self.outbox: deque[OutgoingMessage] = deque()
-        self.num_malformed = 0
         self._server_id = server_id
         self._timeouts = {"step": step_timeout, "reset": reset_timeout}
         self._objection = objection
         self._reader: Reader[FromClient] = Reader(FromClient)
         self._writer = Writer()
-        self._log = LimitedLog(server_id)
+        self._last_warning = ""
         self._dropped_extras: set[str] = set()
         self._kind: ClientKind | None = None
         self._by_route: dict[bytes, ServerSession] = {}
         self._by_name: dict[str, ServerSession] = {}
-        self._losses: dict[str, _Loss] = {}
+        self._losses: dict[str, RemoteResult] = {}
         self._results: list[RemoteResult] = []
         self._check_at: float | None = None
 
@@ -232,9 +208,9 @@ class ServerSessions:
         results, self._results = self._results, []
         return results
 
-    def routes(self) -> set[bytes]:
-        """Return the routes of all sessions."""
-        return {*self._by_route}
+    def holds(self, route: bytes) -> bool:
+        """Return True if the connection `route` has a session."""
+        return route in self._by_route
 
     # -- requests -------------------------------------------------------------------
 
@@ -278,8 +254,8 @@ class ServerSessions:
         """
         session = self._by_name.get(client)
         if (loss := self._losses.pop(client, None)) is not None:
-            loss.result.number = number
-            self._results.append(loss.result)
+            loss.number = number
+            self._results.append(loss)
             if session is not None and session.first is not None:
                 first, session.first = session.first, None
                 self._add(session, first)
@@ -373,44 +349,42 @@ class ServerSessions:
 
     # -- messages -------------------------------------------------------------------
 
-    def receive(self, route: bytes, parts: Sequence[Part], now: float) -> MessageEffect:
+    def receive(self, route: bytes, parts: Sequence[Part]) -> None:
         """Read one message and answer it. No content makes it raise.
 
         Args:
             route: of the connection, for answers.
             parts: header and frames.
-            now: monotonic seconds.
         """
         session = self._by_route.get(route)
         try:
             message, frames = self._reader.read(parts)
             if session is not None:
                 self._handle(session, message, frames)
-                return MessageEffect.IN_SESSION
-            if isinstance(message, ClientHello):
-                return self._on_hello(message, len(parts[0]), route, now)
+            elif isinstance(message, ClientHello):
+                self._on_hello(message, len(parts[0]), route)
+            # A client may have sent other messages before it read that its session is over.
         except WireError as error:
-            self.num_malformed += 1
             text = in_one_line(str(error))
-            line = f"dropped a message ({self.num_malformed} so far): {text}"
-            self._log.warn("malformed", line, now)
-            if session is not None:
+            if session is None:
+                self._warn(f"dropped a message: {text}")
+            else:
                 self._dismiss(session, f"a message of it is malformed: {text}")
-            return MessageEffect.MALFORMED
-        # A client may have sent other messages before it read that its session is over.
-        return MessageEffect.TURNED_AWAY
 
-    def _on_hello(self, hello: ClientHello, size: int, route: bytes, now: float) -> MessageEffect:
+    def _warn(self, text: str) -> None:
+        """Log a warning, unless it repeats the last one."""
+        if text != self._last_warning:
+            self._last_warning = text
+            LOG.warning("%s: %s", self._server_id, text)
+
+    def _on_hello(self, hello: ClientHello, size: int, route: bytes) -> None:
         """Answer a hello whose header has `size` bytes."""
         try:
             self._let_in(hello, size, route)
         except Rejection as error:
             text = in_one_line(str(error))
-            line = in_one_line(f"refused the client {hello.name!r}: {text}")
-            self._log.warn("refused", line, now)
+            self._warn(in_one_line(f"refused the client {hello.name!r}: {text}"))
             self._post(route, Refusal(text=text, retry=error.retry))
-            return MessageEffect.TURNED_AWAY
-        return MessageEffect.IN_SESSION
 
     def _let_in(self, hello: ClientHello, size: int, route: bytes) -> None:
         if hello.name in self._by_name:
@@ -418,24 +392,8 @@ class ServerSessions:
         if len(self._by_name) >= _MAX_SESSIONS:
             raise Rejection(f"{len(self._by_name)} clients are here already", retry=True)
         found = announced(hello, size, self._server_id, self._kind, self._objection)
-        self._make_room(found.num_bytes)
         self._by_route[route] = self._by_name[hello.name] = ServerSession(hello.name, route, found)
         self._post(route, Welcome(env_id=found.meta.env_id))
-
-    def _make_room(self, num_bytes: int) -> None:
-        """Forget losses, the oldest first, until there is room for another client."""
-        reserved = sum([one.announced.num_bytes for one in self._by_name.values()])
-        kept = sum([loss.num_bytes for loss in self._losses.values()])
-        while self._losses and (
-            reserved + kept + num_bytes > MAX_BYTES_IN_ALL or len(self._losses) > _MAX_SESSIONS
-        ):
-            kept -= self._losses.pop(next(iter(self._losses))).num_bytes
-        if reserved + num_bytes > MAX_BYTES_IN_ALL:
-            raise Rejection(
-                f"a result and an action take {num_bytes} bytes, and the {len(self._by_name)} "
-                f"clients that are here have reserved {reserved} of {MAX_BYTES_IN_ALL}",
-                retry=True,
-            )
 
     def _handle(self, session: ServerSession, message: FromClient, frames: Sequence[Part]) -> None:
         """Read a message of a session.
@@ -554,6 +512,4 @@ class ServerSessions:
             ]
             # Otherwise its first result was never taken.
             if len(self._results) == num_results:
-                self._losses[session.name] = _Loss(
-                    session.marked(cause), session.announced.results.num_bytes
-                )
+                self._losses[session.name] = session.marked(cause)

@@ -137,7 +137,7 @@ def space_from(description: Any) -> gym.Space[Any]:
     """Return the space that `description` describes.
 
     Raises:
-        WireError: it is invalid, or values of the space exceed `MAX_FRAME_BYTES`.
+        WireError: it is invalid, or an array exceeds `MAX_FRAME_BYTES`.
     """
     try:
         # Gymnasium's warnings do not matter here, even if the trainer turns them into errors.
@@ -155,13 +155,9 @@ def space_from(description: Any) -> gym.Space[Any]:
 
 
 class _Builder:
-    """Builds one space from an untrusted description.
-
-    Invariant: the memory of a space is subtracted from the limit before the space is built.
-    """
+    """Builds one space from an untrusted description, whose size is checked first."""
 
     def __init__(self) -> None:
-        self._bytes_left = MAX_FRAME_BYTES
         self._members_left = _MAX_MEMBERS
         self._builders: dict[str, Callable[[Description, int], gym.Space[Any]]] = {
             "box": self._box,
@@ -192,7 +188,7 @@ class _Builder:
         dtype = _dtype(fields)
         shape = self._shape(fields["shape"], dtype)
         low, high = (_bound_array(fields[bound], shape, dtype) for bound in ("low", "high"))
-        return _CompactBox(low, high, shape, dtype)
+        return spaces.Box(low, high, dtype=dtype.type)
 
     def _discrete(self, fields: Description, depth: int) -> gym.Space[Any]:
         del depth
@@ -246,9 +242,8 @@ class _Builder:
         shape = tuple(_int(extent) for extent in _list(value))
         if len(shape) > _MAX_AXES or min(shape, default=0) < 0:
             raise WireError(f"a space has a negative shape, or more than {_MAX_AXES} axes")
-        self._bytes_left -= math.prod(shape) * dtype.itemsize
-        if self._bytes_left < 0:
-            raise WireError(f"a space's values exceed {MAX_FRAME_BYTES} bytes")
+        if math.prod(shape) * dtype.itemsize > MAX_FRAME_BYTES:
+            raise WireError(f"a space's array exceeds {MAX_FRAME_BYTES} bytes")
         return shape
 
 
@@ -271,37 +266,9 @@ def _int(value: Any) -> int:
     return value
 
 
-class _CompactBox(spaces.Box[Any]):
-    """A Box whose bounds take only the memory of the numbers in its description.
-
-    Its bounds are read-only views. Otherwise a description of a few bytes could announce bounds
-    that take gigabytes.
-
-    Args:
-        low, high: arrays that broadcast to `shape`.
-    """
-
-    def __init__(
-        self,
-        low: NDArray[Any],
-        high: NDArray[Any],
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-    ) -> None:
-        low, high = (np.array(bound) for bound in np.broadcast_arrays(low, high))
-        super().__init__(low, high, dtype=dtype.type)
-        for name in ("low", "high", "bounded_below", "bounded_above"):
-            setattr(self, name, np.broadcast_to(getattr(self, name), shape))
-        self._shape = shape
-
-    def __reduce__(self) -> Any:
-        return spaces.Box, (self.low.copy(), self.high.copy(), self.shape, self.dtype)
-
-
 def _bound_array(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    bound = np.array(_numbers(value, len(shape)), dtype.type)
-    np.broadcast_to(bound, shape)  # Raises if the shapes don't fit.
-    return bound
+    # A copy: Gymnasium's own arrays can be written.
+    return np.broadcast_to(np.array(_numbers(value, len(shape)), dtype.type), shape).copy()
 
 
 def _numbers(value: Any, axes: int) -> Any:

@@ -1,15 +1,19 @@
 """Texts from the network in a form that is safe to show in logs, errors and terminals.
 
+Both ends of env_server use the logger `LOG`.
+
 Rule: no text of a peer reaches a terminal unchanged. Characters that can't be printed (escapes, and
 those that reorder a line) become Python's escapes, and a text that is too long loses its middle.
 """
 
 from __future__ import annotations
 
+import logging
 from typing import Final
 
-__all__ = ["in_lines", "in_one_line"]
+__all__ = ["LOG", "in_lines", "in_one_line"]
 
+LOG: Final = logging.getLogger("rlightning_aio.remote")
 _ONE_LINE: Final = 1000
 _LINES: Final = 100_000
 

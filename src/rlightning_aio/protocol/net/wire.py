@@ -26,12 +26,10 @@ if TYPE_CHECKING:
 __all__ = [
     "DTYPES",
     "HANDSHAKE_SECONDS",
-    "MAX_BYTES_IN_ALL",
     "MAX_FRAME_BYTES",
     "MAX_HEADER_BYTES",
     "MAX_HELLO_BYTES",
     "MAX_NAME_LENGTH",
-    "MAX_NESTING",
     "MAX_PARTS",
     "VERSION",
     "ArrayForm",
@@ -50,7 +48,6 @@ __all__ = [
     "Welcome",
     "WireError",
     "Writer",
-    "nests_too_deep",
     "ping_ms",
     "portable",
 ]
@@ -60,14 +57,10 @@ MAX_HEADER_BYTES: Final = 4 << 20
 MAX_HELLO_BYTES: Final = 256 << 10
 """Size of a hello's header; reading one takes 50 ms at most."""
 MAX_FRAME_BYTES: Final = 64 << 20
-MAX_BYTES_IN_ALL: Final = 1 << 30
-"""Memory for one result and one action of each client of a server, all clients together."""
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
-MAX_NESTING: Final = 32
-"""Levels of maps and arrays in a value. Each level costs several nested calls."""
-HANDSHAKE_SECONDS: Final = 5.0
+HANDSHAKE_SECONDS: Final = 2.0
 """Time for the handshake of a connection."""
 
 DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
@@ -82,6 +75,8 @@ DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
 
 _ARRAY_EXTENSION: Final = 1
 _MAX_AXES: Final = 32
+_MAX_DEPTH: Final = 32
+"""Levels of maps in which `portable` looks for what can't be sent."""
 
 Part: TypeAlias = bytes | memoryview
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -194,21 +189,6 @@ _OPEN_FIELDS: Final[Mapping[type[Struct], tuple[str, ...]]] = {
     ClientResult: ("info", "extra"),
 }
 """Fields whose contents an env or a policy has made."""
-
-_FLAT: Final = frozenset({type(None), bool, int, float, str, bytes})
-
-
-def nests_too_deep(value: Any, levels: int = MAX_NESTING) -> bool:
-    """Return True if `value` has more than `levels` levels of maps and arrays."""
-    if isinstance(value, dict):
-        parts = cast("dict[Any, Any]", value).values()
-    elif isinstance(value, list | tuple):
-        parts = cast("Sequence[Any]", value)
-    else:
-        return False
-    return not levels or any(
-        nests_too_deep(part, levels - 1) for part in parts if type(part) not in _FLAT
-    )
 
 
 class ArrayForm:
@@ -338,8 +318,6 @@ def _check_open(name: str, values: dict[Any, Any] | None) -> None:
         # It could be encoded, but the reader would refuse the whole message.
         if not isinstance(key, str):
             raise Untransferable(f"{name} has the key {key!r}; keys must be strings")
-    if nests_too_deep(values):
-        raise Untransferable(f"{name} is nested more than {MAX_NESTING} deep")
 
 
 def portable(values: Mapping[str, Any], lost: list[str]) -> dict[str, Any]:
@@ -357,7 +335,7 @@ class _Value(Struct):
 
 
 def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int) -> Any:
-    if isinstance(value, dict) and depth < MAX_NESTING:
+    if isinstance(value, dict) and depth < _MAX_DEPTH:
         kept: dict[Any, Any] = {}
         # Readers require strings at the top level, and accept numbers below.
         kinds = str | int if depth else str
@@ -369,9 +347,6 @@ def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int
             elif portable_inner is not _Lost:
                 kept[key] = portable_inner
         return kept
-    if nests_too_deep(value, MAX_NESTING - depth):
-        lost.append(path)
-        return _Lost
     try:
         writer.write(_Value(value))
     except Untransferable:

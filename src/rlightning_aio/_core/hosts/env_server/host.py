@@ -34,7 +34,6 @@ from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_o
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation, number_of, op_of, slot_of
 from rlightning_aio.protocol.net.server_session import ServerSessions
-from rlightning_aio.protocol.net.wire import MAX_BYTES_IN_ALL
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -48,6 +47,8 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["EnvServerHost"]
+
+_MAX_SLAB_BYTES = 1 << 30
 
 
 class _ClientRow:
@@ -322,7 +323,7 @@ def _slab_for(meta: EnvMeta, max_rows: int) -> Slab:
     """Return rows for clients of one kind, in memory of this process alone."""
     layout = RowLayout.of(meta)
     # Unused rows cost no memory.
-    rows = max(1, min(max_rows, MAX_BYTES_IN_ALL // layout.size(1)))
+    rows = max(1, min(max_rows, _MAX_SLAB_BYTES // layout.size(1)))
     memory = mmap.mmap(-1, layout.size(rows), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     slab = Slab(layout, memoryview(memory), rows)
     slab.sent_ns = np.zeros(rows, np.int64)

@@ -7,23 +7,23 @@ what messages mean. The descriptor is that of a set: those of ZMQ, which only re
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Final, cast
 
 import zmq
 
 from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descriptor_set
 from rlightning_aio._core.hosts.env_server.authenticator import Authenticator
-from rlightning_aio._core.hosts.env_server.connection_limiter import ConnectionLimiter
-from rlightning_aio._core.hosts.env_server.rate_limiter import (
-    DROPPED_FRAME_COST,
-    MAX_SAVED,
-    PEERS_SHARE,
-    RateLimiter,
-)
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.protocol.net.limited_log import LimitedLog
-from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS, ping_ms
-from rlightning_aio.remote.zmq_messages import is_readable, next_frame, receive_parts, send_parts
+from rlightning_aio.protocol.net.texts import LOG
+from rlightning_aio.protocol.net.wire import HANDSHAKE_SECONDS, MAX_FRAME_BYTES, ping_ms
+from rlightning_aio.remote.zmq_messages import (
+    is_readable,
+    next_frame,
+    next_message,
+    receive_parts,
+    send_parts,
+)
 
 if TYPE_CHECKING:
     import select
@@ -35,15 +35,19 @@ if TYPE_CHECKING:
 __all__ = ["Listener"]
 
 _MESSAGES_PER_PUMP: Final = 1000
-"""Upper limit, so that a flood does not occupy the driver."""
+"""Upper limit, so that the driver does other things in between."""
 _MAX_UNSENT_PER_CLIENT: Final = 100
 _MAX_UNREAD_PER_CLIENT: Final = 100
+_MAX_WAITING_CONNECTIONS: Final = 32
+"""Connections that the system holds until ZMQ accepts them."""
 _LINGER_MS: Final = 200
-_MIN_UPDATE_SECONDS: Final = 0.01
-"""Time between two updates of connections while messages wait."""
-_MAX_CONSECUTIVE_UPDATES: Final = 50
-_UPDATES_PER_SECOND: Final = 50
-"""If more connections come and go, several are processed by one update."""
+_FAILED: Final = (
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL),
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL),
+)
+"""Events of handshakes that failed. Which of them comes depends on the end that notices first."""
+_EVENTS: Final = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | sum(_FAILED)
+_EVENT: Final = struct.Struct("=Hi")
 
 
 class Listener:
@@ -54,9 +58,6 @@ class Listener:
         settings: see `ServerSettings`.
         sessions: reads and writes the messages.
 
-    Attributes:
-        connections: limits connections, once the listener has started.
-
     Raises:
         ConfigError: the keys can't be read.
     """
@@ -65,21 +66,18 @@ class Listener:
         self.server_id = server_id
         self._settings = settings
         self._sessions = sessions
-        self._limiter = RateLimiter(MAX_SAVED, PEERS_SHARE)
-        self._log = LimitedLog(server_id)
-        self._authenticator = Authenticator(settings.keys, self._limiter, self._log)
-        self._update_limiter = RateLimiter(_MAX_CONSECUTIVE_UPDATES, _UPDATES_PER_SECOND)
-        self._update_at: float | None = None
-        self._updated_at = 0.0
-        self._ignores_connections = False
-        self._is_skipping = False
+        self._authenticator = Authenticator(settings.keys)
         self._address: str | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._router: zmq.Socket[bytes]
-        self.connections: ConnectionLimiter
+        self._monitor: zmq.Socket[bytes]
         self._descriptors: select.epoll
         self._wake_up: WakeUp
         self._is_woken = False
+        self._warned_of_handshakes = False
+        # The open connections by their descriptors, with the route of a session.
+        self._open: dict[int, bytes | None] = {}
+        self._gone: list[bytes] = []
 
     @property
     def address(self) -> str:
@@ -121,6 +119,8 @@ class Listener:
         router.set(zmq.SNDHWM, _MAX_UNSENT_PER_CLIENT)
         router.set(zmq.RCVHWM, _MAX_UNREAD_PER_CLIENT)
         router.set(zmq.LINGER, _LINGER_MS)
+        router.set(zmq.BACKLOG, _MAX_WAITING_CONNECTIONS)
+        router.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
         router.set(zmq.HEARTBEAT_IVL, interval)
         router.set(zmq.HEARTBEAT_TIMEOUT, patience)
         self._authenticator.open(context, router)
@@ -128,24 +128,11 @@ class Listener:
         if ":" in host:
             router.set(zmq.IPV6, 1)
             host = f"[{host}]"
-        connections = self.connections = ConnectionLimiter(
-            context,
-            router,
-            self._limiter,
-            self._log,
-            has_keys=self._authenticator.has_keys,
-            used_routes=self._sessions.routes,
-        )
-        try:
-            router.bind(f"tcp://{host}:{settings.port or '*'}")
-        except zmq.ZMQError:
-            connections.close()
-            raise
+        self._monitor = router.get_monitor_socket(_EVENTS)
+        router.bind(f"tcp://{host}:{settings.port or '*'}")
         self._address = router.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
-        connections.watch_port(int(self._address.rpartition(":")[2]))
-        self._descriptors.register(_descriptor(router), READABLE)
-        self._descriptors.register(connections.fileno(), READABLE)
-        self._descriptors.register(self._authenticator.fileno(), READABLE)
+        for socket in (router, self._monitor, self._authenticator.socket):
+            self._descriptors.register(_descriptor(socket), READABLE)
 
     def close(self) -> None:
         """Send all clients a goodbye and stop listening; idempotent, takes at most 0.2 s."""
@@ -155,9 +142,9 @@ class Listener:
         if self._address is not None:
             self._sessions.close("the trainer closed its group")
             self._send()
-            self.connections.close()
         self._descriptors.close()
         self._wake_up.close()
+        self._router.disable_monitor()
         context.destroy(linger=_LINGER_MS)
 
     # -- waiting --------------------------------------------------------------------
@@ -172,8 +159,7 @@ class Listener:
 
     def deadline(self) -> float | None:
         """Return the time at which `pump` is due even without a message; None if never."""
-        times = [self._sessions.deadline(), self._update_at]
-        return min([time for time in times if time is not None], default=None)
+        return self._sessions.deadline()
 
     def _call_back(self) -> None:
         """Make the driver pump once more, though no change will wake it."""
@@ -188,81 +174,75 @@ class Listener:
         if self._is_woken:
             self._is_woken = False
             self._wake_up.clear()
+        self._authenticator.answer()
+        self._read_events()
+        # What a connection sent before its end counts, so its messages are read after that event.
         # This question is what clears ZMQ's descriptor.
         has_message = is_readable(self._router)
-        if not has_message or now >= self._updated_at + _MIN_UPDATE_SECONDS:
-            # Until the next update, descriptors of their own report connections.
-            self._updated_at = now
-            self._update_connections(now)
-            # One that has ended meanwhile may have sent something before that.
-            has_message = has_message or is_readable(self._router)
         for _ in range(_MESSAGES_PER_PUMP):
             if not has_message:
                 break
-            has_message = self._receive(now) and is_readable(self._router)
+            has_message = self._receive() and is_readable(self._router)
         if has_message:
             self._call_back()
         else:
-            # What these connections sent has been read.
-            self._end_closed()
+            gone, self._gone = self._gone, []
+            for route in gone:
+                self._sessions.disconnected(route)
         self._sessions.tick(now)
         self._send()
 
-    def _update_connections(self, now: float) -> None:
-        """Process connections that came or went, unless many did so a moment ago."""
-        if self._ignores_connections and self._update_at is not None and now < self._update_at:
-            return
-        any_change = self.connections.update(now)
-        if self._authenticator.answer_questions(now) or any_change:
-            self._update_limiter.spend(1, now)
-        is_busy = self._update_limiter.budget(now) < 1
-        self._update_at = (
-            self._update_limiter.time_of(1, now) if is_busy else self._authenticator.deadline(now)
-        )
-        if is_busy != self._ignores_connections:
-            self._ignores_connections = is_busy
-            for source in (self.connections, self._authenticator):
-                self._descriptors.modify(source.fileno(), 0 if is_busy else READABLE)
+    def _read_events(self) -> None:
+        """Note which connections have come and gone."""
+        while is_readable(self._monitor) and (parts := next_message(self._monitor)) is not None:
+            # The second part is an address, which says less than the descriptor.
+            event, descriptor = _EVENT.unpack(parts[0])
+            if event in _FAILED:  # There is a reason in place of the descriptor.
+                self._warn_of_handshake()
+                continue
+            if (route := self._open.pop(descriptor, None)) is not None:
+                self._gone.append(route)
+            if event == zmq.EVENT_ACCEPTED:
+                self._open[descriptor] = None
 
-    def _receive(self, now: float) -> bool:
-        """Read one message, or some parts of a dropped one. Return False if there is none."""
+    def _warn_of_handshake(self) -> None:
+        if not self._warned_of_handshakes:
+            self._warned_of_handshakes = True
+            LOG.warning(
+                "%s: a handshake failed: it took too long, or the other end has other keys than "
+                "these, or none; further ones are not reported",
+                self.server_id,
+            )
+
+    def _receive(self) -> bool:
+        """Read one message. Return False if there is none."""
         frame = next_frame(self._router)
         if frame is None:
             return False
-        connection = None if self._is_skipping else self.connections.sender(frame, now)
-        if connection is None:
-            self._drop(frame, now)
-            return True
+        route = frame.bytes
         parts: list[Part] = []
         if frame.more:
-            first = self._router.recv(zmq.NOBLOCK, copy=False)
-            parts = receive_parts(self._router, first, MAX_PARTS + 1)
-            self._is_skipping = self._router.get(zmq.RCVMORE) != 0
-        effect = self._sessions.receive(connection.route, parts, now)
-        self.connections.record(connection, effect, sum([len(part) for part in parts]), now)
-        if self._is_skipping:
-            self.connections.cut(connection)
+            parts = receive_parts(self._router, self._router.recv(zmq.NOBLOCK, copy=False))
+        if self._sessions.holds(route):
+            self._sessions.receive(route, parts)
+        elif self._is_open(frame):
+            self._sessions.receive(route, parts)
+            if self._sessions.holds(route):
+                self._open[frame.get(zmq.SRCFD)] = route
         return True
 
-    def _drop(self, frame: zmq.Frame, now: float) -> None:
-        """Discard a message from `frame` on, or the first parts of one with very many."""
-        num_dropped = 1
-        while frame.more and num_dropped <= MAX_PARTS:
-            frame = self._router.recv(zmq.NOBLOCK, copy=False)
-            num_dropped += 1
-        self._is_skipping = frame.more
-        self._limiter.spend(num_dropped * DROPPED_FRAME_COST, now)
+    def _is_open(self, frame: zmq.Frame) -> bool:
+        """Return True if a connection without a session that sent `frame` is still there."""
+        self._read_events()  # The connection may be newer than those that were read last.
+        descriptor = frame.get(zmq.SRCFD)
+        # A descriptor may belong to another connection by now.
+        return descriptor in self._open and self._open[descriptor] in {None, frame.bytes}
 
     def flush(self) -> None:
         """Send new requests, and make sure that results wake the driver."""
         self._send()
         if self._sessions.has_results:
             self._call_back()
-
-    def _end_closed(self) -> None:
-        """End the sessions of connections that are gone."""
-        for route in self.connections.take_closed():
-            self._sessions.disconnected(route)
 
     def _send(self) -> None:
         outbox = self._sessions.outbox
@@ -273,9 +253,8 @@ class Listener:
             try:
                 send_parts(self._router, [route, *parts])
             except zmq.ZMQError as error:
-                if error.errno == zmq.EAGAIN:  # The client reads nothing.
-                    self.connections.cut_route(route)
-                elif error.errno != zmq.EHOSTUNREACH:
+                # The connection is gone, or the client reads nothing.
+                if error.errno not in {zmq.EHOSTUNREACH, zmq.EAGAIN}:
                     raise
                 self._sessions.disconnected(route)
         # Sending reads ZMQ's signals, so the descriptor may not report waiting messages.
