@@ -30,7 +30,7 @@ PAGES = {
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
     "benchmarks/tables.md": "benchmark_tables.md",
-    "examples": "docs/examples.md",
+    "examples": "docs/start.md",
 }
 LINK = re.compile(r"(?<=\])\(([^)\s#:]+)(#[^)\s]*)?\)|(?<=src=)\"([^\"#:]+)\"")
 SHOWN = {".py", ".ipynb", ".yaml", ".toml", ".txt", ".cff"}
