@@ -16,7 +16,7 @@ async def main() -> None:
                 batch, _ = await group.collect_async(min_results=32, max_results=32)
                 transitions += np.count_nonzero(~batch.is_reset)
                 group.step_async(batch.respond(action=rng.integers(2, size=len(batch))))
-        print(group.get_env_stats(by_entry=True))
+        print(group.metrics())
 
 
 rl.run(main())

@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from attempts.room import CountedRoom
 from attempts.rooms import PLACES, rooms
@@ -21,6 +22,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.attempts.records import success_of
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 
 if TYPE_CHECKING:
@@ -642,3 +644,12 @@ async def test_with_other_options(
             assert attempt.outcome.kind == "terminated"
             assert attempt.first.tolist() == [attempts.spec.seed, 0]
             assert attempt.last.tolist() == [attempts.spec.seed, 3]
+
+
+def test_a_last_info_without_a_verdict_has_none() -> None:
+    """The first info of the next episode has none about the last one."""
+    both = {"success": False, "final_info": {"reward": 1.0}}
+    assert success_of(both) is None
+    masks = {"_final_info": np.array([True, False]), "_success": np.array([True, True])}
+    assert success_of({**both, **masks, "success": np.array([False, True])}, 0) is None
+    assert success_of({**both, **masks, "success": np.array([False, True])}, 1) is True

@@ -76,8 +76,8 @@ def test_rollout_prints_what_it_collected(tmp_path: Path) -> None:
     done = run(*words, "--json")
     assert (done.returncode, done.stderr.count("warning")) == (0, 0), done.stderr
     numbers = json.loads(done.stdout, parse_constant=strict)["metrics"]
-    means = [numbers[f"envs/{name}/episode_return_mean"] for name in REWARDS]
-    assert means == [3.0, None, None, None, None]
+    returns = [numbers[f"envs/{name}/episode_returns"] for name in REWARDS]
+    assert returns == [3.0 * numbers["envs/plain/episodes"], None, None, None, None]
     assert " nan" not in invoke(*words).stdout
 
 

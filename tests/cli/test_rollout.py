@@ -32,7 +32,7 @@ def test_rollout_prints_the_numbers_of_each_entry(tmp_path: Path) -> None:
     whole, pole, short = (int(text.replace(",", "")) for text in numbers["steps"])
     assert pole + short == whole == 1234
     assert numbers["envs"] == ["5", "3", "2"]
-    assert float(numbers["episode_length_mean"][2]) <= 7
+    assert float(numbers["mean_length"][2]) <= 7
     assert "outcomes_env_died" not in numbers
     assert "Traceback" not in done.stderr
 
@@ -49,7 +49,7 @@ def test_stdout_is_one_json_document(tmp_path: Path) -> None:
         500,
         2,
     )
-    assert numbers["envs/episode_return_mean"] == numbers["envs/episode_length_mean"] > 1
+    assert numbers["envs/episode_returns"] == numbers["envs/episode_lengths"] > 1
     assert document["steps_per_second"] == pytest.approx(500 / document["seconds"])
     assert "collecting 500 steps" in done.stderr
 
@@ -119,10 +119,14 @@ def test_a_seed_repeats_a_rollout(tmp_path: Path) -> None:
 
     def episodes(seed: int) -> tuple[int, float]:
         numbers = invoke_json("rollout", config, "--steps", 600, "--seed", seed)["metrics"]
-        return numbers["envs/outcomes_terminated"], numbers["envs/episode_return_mean"]
+        return numbers["envs/outcomes_terminated"], numbers["envs/episode_returns"]
 
     assert episodes(3) == episodes(3)
     assert episodes(3) != episodes(4)
+
+
+def mean_length(numbers: dict[str, float]) -> float:
+    return numbers["envs/episode_lengths"] / numbers["envs/episodes"]
 
 
 def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
@@ -133,7 +137,7 @@ def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
         *("rollout", config, "imports=[]", "--steps", 200, "--policy", "one_sided:left", "--json"),
         cwd=tmp_path,
     )
-    assert 8 <= json.loads(done.stdout)["metrics"]["envs/episode_length_mean"] <= 11
+    assert 8 <= mean_length(json.loads(done.stdout)["metrics"]) <= 11
 
 
 def test_a_policy_may_return_a_batch_of_responses(tmp_path: Path) -> None:
@@ -198,7 +202,7 @@ def test_a_policy_may_be_what_evaluate_takes(tmp_path: Path, name: str) -> None:
     words = ("--policy", f"cli.stub_policies:{name}", "--json")
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "placement": "inline"})
     numbers = json.loads(invoke("rollout", config, "--steps", 100, *words).stdout)["metrics"]
-    assert 8 <= numbers["envs/episode_length_mean"] <= 11
+    assert 8 <= mean_length(numbers) <= 11
     found = json.loads(invoke("eval", config, "--episodes", 2, *words).stdout)
     assert 8 <= found["length"]["mean"] <= 11
 

@@ -15,7 +15,6 @@ import pytest
 from envs.group_contract import GroupContract
 from kit.contract import Expected, same
 
-from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.simulators.vulkan import render_device_is_usable
 from rlightning_aio.errors import ConfigError
@@ -165,20 +164,6 @@ def test_success_and_failure_end_the_episode() -> None:
     assert result.info["fail"] is True
     assert result.last_terminated is True
     env.close()
-
-
-def test_statistics_have_the_rate_of_failures() -> None:
-    """Success and failure at the ends of episodes are in the statistics of the env."""
-    config = entry("MS-CartpoleBalance-v1", max_episode_steps=200)
-    with sync.build_env_group(config) as group:
-        batch, _ = group.reset(seed=0)
-        with group.auto_reset():
-            for _ in range(300):
-                batch, _ = group.step(batch.respond(action=np.ones((1, 1), np.float32)))
-        stats = group.get_env_stats()["skill-0"]
-    assert stats["episodes"] >= 2
-    assert stats["fail_rate"] == 1.0
-    assert stats["success_rate"] is None
 
 
 def test_the_step_limit_is_the_tasks_unless_configured() -> None:

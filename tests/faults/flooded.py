@@ -17,7 +17,7 @@ import sys
 import psutil
 
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio._core.group.supervision.hint import HINT_AFTER_BATCHES
+from rlightning_aio._core.group.supervision.hint import LAST_LOOK
 from rlightning_aio.sync import EnvGroup, build_env_group
 
 ENTRIES = [
@@ -89,8 +89,8 @@ def main() -> None:
         flooder.stdin.write(f"{group['server-0'].address.rsplit(':', 1)[1]}\n".encode())
         flooder.stdin.flush()
         steps = 0
-        # The hint is computed once, from the times of this number of batches.
-        while has_descriptors() or steps <= HINT_AFTER_BATCHES:
+        # After that many batches no more hint is looked for.
+        while has_descriptors() or steps <= LAST_LOOK:
             step(group, ["local-0", "local-1"])
             assert len(group.collect_async(wait_all=True)[0]) == 2
             steps += 1

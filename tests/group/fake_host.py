@@ -24,7 +24,7 @@ from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
-from rlightning_aio._core.group.state.stats import Stats
+from rlightning_aio._core.group.state.sums import Sums
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
@@ -501,6 +501,7 @@ class FakeGroup:
         layout = SlabLayout(size)
         continuity = Continuity(envs, conditions)
         lifetime = Lifetime(conditions)
+        records: list[Any] = []
         tables = Tables(
             envs,
             requests,
@@ -510,11 +511,12 @@ class FakeGroup:
             observed,
             lifetime,
             Arena(),
-            Stats(envs, requests),
+            Sums(envs, requests, records),
             clock=lambda: self.now,
             driver=self,
             num_cores=0,
             shares_thread=True,
+            records=records,
         )
         completions, arena = tables.completions, tables.arena
         supervisor = Supervisor(tables)

@@ -10,46 +10,39 @@ import signal
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pytest
 from group.sample_envs import Gate
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
-from kit.scripted import CUT, DIE, GO, RAISE
+from kit.scripted import CUT, DIE, GO, RAISE, Counts
 from kit.scripted import END as FAIL_END
 from kit.scripted import HANG as HANG_UP
 from patience import HANG
 
 import rlightning_aio
-from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
-from rlightning_aio._core.group.state import stats
-from rlightning_aio._core.group.state.episode_counts import OUTCOMES
-from rlightning_aio._core.group.state.samples import EnvTimes, Sample, Window
+from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, RLightningError, sync
+from rlightning_aio._core.group.state import sums
+from rlightning_aio._core.group.state.request_states import State
+from rlightning_aio._core.group.state.sums import Sums
+from rlightning_aio.outcomes import OutcomeKind
+from rlightning_aio.protocol.slab import IS_RESET
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-OF_LOOP = {"loop_lag_seconds_p99", "loop_lag_seconds_max"}
-OF_GROUP = {"batch_size", "seconds_waiting_for_envs", "seconds_in_trainer"} | OF_LOOP
-OF_ENVS = [
-    *("seconds_in_envs", "seconds_queued"),
-    *("seconds_waiting_to_be_collected", "seconds_waiting_for_actions"),
-]
-
-
+SECONDS = ("seconds_in_envs", "seconds_queued", "seconds_uncollected", "seconds_idle")
 NAMES = {
-    *OF_GROUP,
-    *OF_ENVS,
-    *("steps", "steps_per_second", "envs", "idle", "in_flight", "uncollected", "queued"),
-    *("oldest_request_seconds", "step_seconds_p50", "step_seconds_p99"),
-    *("slowest_env", "slowest_env_seconds", "restarts"),
-    *("episode_return_mean", "episode_length_mean"),
-    *(f"outcomes_{kind}" for kind in OUTCOMES),
+    *("steps", "results", "episodes", "episode_returns", "episode_lengths", *SECONDS),
+    *(f"outcomes_{kind}" for kind in get_args(OutcomeKind)),
+    *("envs", "idle", "busy", "uncollected", "restarts"),
 }
+COMPUTING = "seconds_computing"
 
 
 def numbers(group: Any, entry: str = "") -> SimpleNamespace:
@@ -60,29 +53,23 @@ def numbers(group: Any, entry: str = "") -> SimpleNamespace:
     return SimpleNamespace(**{name: value for name, value in own.items() if "/" not in name})
 
 
-def assert_adds_up(found: SimpleNamespace, envs: int) -> None:
-    """The envs' seconds are the trainer's; they begin with the first request, a little later."""
-    of_envs = sum(getattr(found, name) for name in OF_ENVS)
-    of_trainer = found.seconds_in_trainer + found.seconds_waiting_for_envs
-    assert 0 <= of_trainer - of_envs / envs < 0.3
-
-
 @one_driver
-async def test_names_are_stable_and_values_plain_numbers(start: Any, place: Any) -> None:
+async def test_names_are_stable_and_values_plain_numbers(start: Any) -> None:
     """The same before the first step, after it, by entry, and after the group is closed."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
     before = group.metrics()
-    assert before["envs/steps_per_second"] == before["envs/steps"] == 0
+    assert before["envs/steps"] == before["envs/seconds_idle"] == 0
     await group.reset()
     await group.step(responses(group.env_ids, 1, 2, 3, 4, 5, what=END))
     after = group.metrics(by_entry=True)
-    expected = NAMES - (OF_LOOP if place.synchronous else set())
-    everyone = {f"envs/{name}" for name in expected}
-    own = {f"envs/{entry}/{name}" for entry in ("probe", "more") for name in expected - OF_GROUP}
-    assert set(before) < set(after) == everyone | own
+    names = NAMES | ({COMPUTING} if f"envs/{COMPUTING}" in before else set())
+    everyone = {f"envs/{name}" for name in names}
+    own = {f"envs/{entry}/{name}" for entry in ("probe", "more") for name in names}
+    assert set(before) == everyone
+    assert set(after) == everyone | own
     assert {type(value) for value in after.values()} <= {int, float}
     assert all(map(math.isfinite, after.values()))
-    for name in ("steps", "envs", "idle", *OF_ENVS):
+    for name in NAMES - {"seconds_idle"}:  # The envs wait while they are asked.
         parts = sum(after[f"envs/{entry}/{name}"] for entry in ("probe", "more"))
         assert after[f"envs/{name}"] == pytest.approx(parts)
     await group.close()
@@ -102,162 +89,110 @@ async def test_counts_of_envs_steps_and_outcomes(start: Any) -> None:
     await group.reset()
     group.step_async(responses(["probe-0", "probe-3"], 1.0, 1.0, what=DO_NOTHING))
     found = numbers(group)
-    assert (found.envs, found.idle, found.in_flight + found.uncollected) == (4, 2, 2)
-    assert found.oldest_request_seconds >= 0
+    assert (found.envs, found.idle, found.busy + found.uncollected) == (4, 2, 2)
     await group.collect_async(wait_all=True)
     found = numbers(group)
-    assert (found.idle, found.in_flight, found.uncollected, found.queued) == (4, 0, 0, 0)
-    assert found.oldest_request_seconds == 0
-    assert (found.steps, found.outcomes_terminated, found.outcomes_truncated) == (5, 1, 2)
-    assert (found.episode_return_mean, found.episode_length_mean) == (8 / 3, 1)
-    assert 0 <= found.slowest_env < 4
-    assert found.slowest_env_seconds > 0
-    assert found.batch_size == pytest.approx((4 + 1 + 2 + 4 + 2) / 5)
+    assert (found.idle, found.busy, found.uncollected) == (4, 0, 0)
+    assert (found.steps, found.results) == (5, 13)
+    assert (found.outcomes_terminated, found.outcomes_truncated) == (1, 2)
+    assert (found.episodes, found.episode_returns, found.episode_lengths) == (3, 8, 3)
 
 
 @one_driver
-async def test_each_moment_of_an_env_is_somewhere(start: Any) -> None:
-    """While all envs are idle, their seconds add up to those of the trainer."""
+async def test_each_moment_of_an_env_is_in_one_sum(start: Any) -> None:
+    """From its first request: while all envs are idle, their seconds are those that passed."""
     group = await start(ENTRY)
+    began = time.monotonic()
     batch, _ = await group.reset()
-    until = time.monotonic() + 0.2
-    while time.monotonic() < until:
+    asked = time.monotonic()
+    for _ in range(100):
         group.step_async(responses(group.env_ids, 1, 1, 1, 1))
-        await asyncio.sleep(0.001)
+        await asyncio.sleep(0)
         batch, _ = await group.collect_async(wait_all=True)
     assert len(batch) == 4
-    found = numbers(group)
-    assert min(found.seconds_in_trainer, found.seconds_waiting_for_envs) > 0
-    assert_adds_up(found, envs=4)
+    least = time.monotonic() - asked
+    found = vars(numbers(group))
+    most = time.monotonic() - began
+    assert 4 * least <= sum(found[name] for name in SECONDS) <= 4 * most
+    assert min(found[name] for name in SECONDS) >= 0
 
 
-def sample(rng: random.Random, at: int, slots: list[int], sent: list[int]) -> Sample:
+def part(rng: random.Random, slots: list[int], sent: list[int], at: int) -> Any:
+    """A part of a batch: which results are resets is in its flags, if any is one."""
     done = [rng.randint(s, at) for s in sent]
     busy = [rng.randint(0, d - s) for d, s in zip(done, sent, strict=True)]
-    resets = rng.choice([None, np.array([rng.random() < 0.5 for _ in slots])])
-    return Sample(
-        batch=at,
-        at_ns=at,
-        slots=np.array(slots),
-        sent_ns=np.array(sent),
-        times=np.array([done, busy]).T,
-        num_envs=1,
-        resets=resets,
-        synchronous=True,
-        since_ns=0,
-        needed=0,
-    )
+    flags = np.zeros((len(slots), 4), np.bool_)
+    has_flags = rng.random() < 0.5
+    flags[:, IS_RESET] = [has_flags and rng.random() < 0.5 for _ in slots]
+    zeros = np.zeros(len(slots), int) if has_flags else None
+    return SimpleNamespace(
+        slots=np.array(slots), times=np.array([done, busy]).T, flags=flags, agents=(),
+        reward=np.zeros(len(slots)), episode_return=zeros, episode_length=zeros,
+        info_marks=None, out_of_band={}, restarted=None,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_sums_of_times_are_those_of_a_plain_loop(seed: int) -> None:
-    """Whenever they are read, and however many results are summed at once."""
-    rng = random.Random(seed)
-    size, num_entries = 5, rng.choice([1, 2])
-    entries = np.array([slot % num_entries for slot in range(size)])
-    names = SimpleNamespace(entries=entries, entry_names=["a", "b"][:num_entries])
-    envs: Any = SimpleNamespace(names=names, local_ids=list(range(size)))
-    envs_type = type("Envs", (SimpleNamespace,), {"__len__": lambda _: size})
+def test_sums_of_times_are_those_of_a_plain_loop(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whenever they are read, and however many results are added at once."""
+    rng, size, now = random.Random(seed), 5, 10**12
+    monkeypatch.setattr(sums, "_MOST_ROWS", rng.randint(1, 20))
+    monkeypatch.setattr(sums, "_LEAST_ROWS", 1)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now)
+    envs: Any = type("Envs", (), {"__len__": lambda _: size})()
     requests: Any = SimpleNamespace(state=np.zeros(size, np.int8), sent_ns=np.zeros(size, int))
-    times = EnvTimes(envs_type(**vars(envs)), requests)
-    most_kept = rng.randint(1, 20)
-    kept: list[Sample] = []
-
-    def settle() -> None:
-        if kept:
-            times.add(kept)
-            kept.clear()
-
-    expected = np.zeros((num_entries, 5))
-    taken: dict[int, int] = {}
-    now = 10**12
+    found = Sums(envs, requests, [])
+    expected, taken = np.zeros((size, 5)), dict[int, int]()
     for _ in range(100):
         slots = rng.sample(range(size), rng.randint(1, size))
         sent = [now + rng.randint(0, 1000) for _ in slots]
-        requests.sent_ns[slots], requests.state[slots] = sent, 1
+        requests.sent_ns[slots], requests.state[slots] = sent, int(State.BUSY)
         now += 2000
-        one = sample(rng, now, slots, sent)
-        kept.append(one)
-        if len(kept) >= most_kept:
-            settle()
-        requests.state[slots] = 0
+        one = part(rng, slots, sent, now)
+        found.add([one])
+        requests.state[slots] = int(State.IDLE)
         for k, (slot, s) in enumerate(zip(slots, sent, strict=True)):
             done, busy = one.times[k].tolist()
-            row = expected[entries[slot]]
-            row += [
-                one.resets is None or not one.resets[k],
-                *(busy / 1e9, (done - busy - s) / 1e9, (now - done) / 1e9),
-                (s - taken[slot]) / 1e9 if slot in taken else 0,
-            ]
+            waited = s - taken[slot] if slot in taken else 0
+            parts = (busy, done - busy - s, now - done, waited)
+            expected[slot] += [not one.flags[k, IS_RESET], *(ns / 1e9 for ns in parts)]
             taken[slot] = now
         if rng.random() < 0.1:
+            now += 500
             until_now = expected.copy()
             for slot, at in taken.items():
-                until_now[entries[slot], 4] += (now + 500 - at) / 1e9
-            until = times.waiting_until(now + 500)
-            settle()
-            np.testing.assert_allclose(times.so_far(until), until_now, atol=1e-12)
-        if rng.random() < 0.05:
-            settle()
-            times.forget(slot := rng.randrange(size))
-            taken.pop(slot, None)
-    assert len(taken) > 0
+                until_now[slot, 4] += (now - at) / 1e9
+            chosen = np.array(rng.sample(range(size), rng.randint(1, size)))
+            read = found.added(chosen)
+            shown = [read[name] for name in ("steps", *SECONDS)]
+            np.testing.assert_allclose(shown, until_now[chosen].sum(axis=0), atol=1e-12)
+    assert len(taken) == size
 
 
-def lags(needed: int, since: int, *done: int) -> list[float]:
-    times = np.array([[d, 0] for d in done])
-    slots, sent = np.arange(len(done)), np.zeros(len(done), int)
-    one = Sample(1, 1000, slots, sent, times, 1, None, False, since, needed)
-    return (Window([one], 1000).lags() * 1e9).round().tolist()
+class Busy(Counts):
+    """Computes in each step."""
+
+    def does(self, action: Any) -> None:
+        until = time.process_time() + 0.05
+        while time.process_time() < until:
+            pass
 
 
-def test_a_call_is_due_with_the_last_result_that_it_needs() -> None:
-    """Not with the first that is there, nor with those that come while it is late."""
-    assert lags(2, 0, 100, 900, 400) == [600]
-    assert lags(3, 0, 100, 900, 400) == [100]
-    assert lags(2, 500, 100, 900, 400) == []  # It did not have to wait.
-    assert lags(0, 0, 100, 900, 400) == []  # It had a window.
-    assert lags(9, 0, 100, 900, 400) == [100]
-
-
-def test_a_batch_of_several_layouts_is_one() -> None:
-    """Its size, its lag, and its part in the rate, of which the first batch is none."""
-
-    def part(batch: int, at: int, needed: int, *done: int) -> Sample:
-        times = np.array([[d, 0] for d in done])
-        sent = np.zeros(len(done), int)
-        return Sample(batch, at, np.arange(len(done)), sent, times, 1, None, False, 0, needed)
-
-    parts = [part(1, 1000, 3, 100, 900), part(1, 1000, 3, 800), part(2, 2000, 1, 1500)]
-    window = Window(parts, 10**9 + 1000)
-    assert window.batch_sizes().tolist() == [3, 1]
-    assert (window.lags() * 1e9).round().tolist() == [100, 500]
-    assert window.rate(np.ones(4, np.bool_)) == pytest.approx(1)
-    parts[0].needed = parts[1].needed = 2
-    assert (Window(parts, 0).lags() * 1e9).round().tolist() == [200, 500]
-    assert len(Window([], 0).lags()) == len(Window([], 0).batch_sizes()) == 0
-    assert Window(parts[:2], 10**9).rate(np.ones(3, np.bool_)) == 0
-
-
-async def test_the_lag_of_the_loop_is_how_late_calls_return() -> None:
-    """Something else blocks the loop while workers have done their part."""
-
-    async def block() -> None:
-        while True:
-            await asyncio.sleep(0.02)
-            time.sleep(0.1)  # noqa: ASYNC251
-
-    entry = {**ENTRY, "num_workers": 2, "envs_per_process": 2}
-    async with rlightning_aio.build_env_group(entry) as group:
-        await group.reset()
-        blocking = asyncio.create_task(block())
-        lag, until = 0.0, time.monotonic() + HANG
-        while lag < 0.05 and time.monotonic() < until:
-            await group.step(responses(group.env_ids, 1.0, 1.0))
-            lag = vars(numbers(group)).get("loop_lag_seconds_max", 0.0)
-        blocking.cancel()
-        await asyncio.wait([blocking])
-        assert 0.05 < lag < HANG
+def test_what_workers_compute_is_a_sum() -> None:
+    """It goes on growing when a worker is replaced."""
+    with sync.build_env_group({"name": "b", "task": Busy, "num_workers": 1}) as group:
+        before = numbers(group)
+        if not hasattr(before, COMPUTING):
+            pytest.skip("this system keeps no accounts of processors")
+        batch, _ = group.reset()
+        group.step(batch.respond(action=[0]))
+        after = numbers(group)
+        assert after.seconds_computing >= before.seconds_computing + 0.05
+        os.kill(group.get_workers()[0]["pid"], signal.SIGKILL)
+        group.step(batch.respond(action=[0]))
+        assert numbers(group).seconds_computing > after.seconds_computing
 
 
 @pytest.fixture
@@ -269,8 +204,8 @@ def gates() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("gates")
-async def test_requests_that_no_env_executes_yet_are_queued() -> None:
-    """Behind `max_concurrency`; the oldest request shows an env that doesn't come back."""
+async def test_requests_that_no_env_executes_yet_are_busy() -> None:
+    """Behind `max_concurrency`; aborted, they are idle, and their steps count nowhere."""
     entry = {"name": "e", "placement": "loop", "num_workers": 6, "max_concurrency": 2, **OWN}
     async with rlightning_aio.build_env_group(entry) as group:
         batch, _ = await group.reset()
@@ -278,13 +213,12 @@ async def test_requests_that_no_env_executes_yet_are_queued() -> None:
         while len(Scripted.at_gate) < 2:  # noqa: ASYNC110
             await asyncio.sleep(0.001)
         found = numbers(group)
-        assert (found.in_flight, found.queued, found.idle) == (6, 4, 0)
-        assert 0 < found.oldest_request_seconds < HANG
+        assert (found.busy, found.idle) == (6, 0)
         await group.abort()
         batch, _ = await group.reset()
         await group.step(batch.respond(action=np.full(6, STEP)))
         found = numbers(group)
-        assert (found.in_flight, found.queued, found.idle) == (0, 0, 6)
+        assert (found.busy, found.idle) == (0, 6)
         assert (found.steps, found.restarts) == (6, 0)
 
 
@@ -354,34 +288,25 @@ async def test_an_episode_that_is_aborted_counts_once(num_aborts: int, tmp_path:
         assert numbers(group).outcomes_cancelled == 1
 
 
-def test_other_threads_may_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At any time; no result is counted twice or left out, and counts only grow."""
-    monkeypatch.setattr(stats, "_MOST_ROWS", 3 * 16)
-    entry = {**ENTRY, "envs_per_process": 4}
-    with sync.build_env_group([entry, {**entry, "name": "more"}]) as group:
-        group.reset()
-        wrong: list[Any] = []
-        ended = threading.Event()
+class Held(Counts):
+    """Its steps last until they are let go."""
 
-        def read() -> None:
-            last: dict[str, float] = {}
-            while not ended.is_set():
-                found = group.metrics(by_entry=True)
-                counted = [key for key in found if key.endswith("/steps") or "/outcomes_" in key]
-                wrong.extend(key for key in counted if found[key] < last.get(key, 0))
-                last = found
+    began, ends = threading.Event(), threading.Event()
 
-        readers = [threading.Thread(target=read) for _ in range(2)]
-        for reader in readers:
-            reader.start()
-        with group.auto_reset(4):
-            for _ in range(300):
-                group.step(responses(group.env_ids, *[1.0] * 8))
-        ended.set()
-        for reader in readers:
-            reader.join()
-        assert wrong == []
-        found = numbers(group)
-        assert (found.steps, found.outcomes_truncated) == (1920, 480)
-        assert found.episode_length_mean == 4
-        assert_adds_up(found, envs=8)
+    def does(self, action: Any) -> None:
+        self.began.set()
+        self.ends.wait(HANG)
+
+
+def test_another_thread_may_not_read_during_a_call() -> None:
+    """The group is used by one thread at a time; the error says so."""
+    entry = {"name": "held", "task": Held, "num_workers": 1, "placement": "inline"}
+    with sync.build_env_group(entry) as group, ThreadPoolExecutor(1) as pool:
+        batch, _ = group.reset()
+        stepping = pool.submit(group.step, batch.respond(action=[0]))
+        Held.began.wait(HANG)
+        with pytest.raises(RLightningError, match="only one thread may at a time"):
+            group.metrics()
+        Held.ends.set()
+        stepping.result()
+        assert numbers(group).steps == 1

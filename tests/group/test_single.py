@@ -12,6 +12,7 @@ from group import sample_envs
 from group.sample_envs import HALVED
 from hypothesis import given
 from hypothesis import strategies as st
+from kit.driven import without_times
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -109,7 +110,7 @@ class Used:
         self.context.close()
 
     def close(self) -> Any:
-        stats = self.group.get_env_stats()
+        stats = {id_: without_times(own) for id_, own in self.group.get_env_stats().items()}
         self.context.close()
         self.group.close()
         return stats

@@ -515,7 +515,7 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
 
 @one_driver
 async def test_statistics_of_a_group(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Throughput by entry and kind, batch sizes, latencies, and episodes by env."""
+    """Throughput by entry, batch sizes, mean times, and episodes by env."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
     assert group.get_stats()["steps_per_second"] == 0.0
     await group.reset()
@@ -528,25 +528,17 @@ async def test_statistics_of_a_group(start: Any, capsys: pytest.CaptureFixture[s
     stats = group.get_stats()
     assert stats["steps_per_second"] > 0
     assert set(stats["entries"]) == {"probe", "more"}
-    assert stats["entries"]["probe"]["sync"] > 0 < stats["entries"]["probe"]["async"]
-    assert stats["entries"]["more"]["async"] == 0
-    assert (stats["batch_size"]["min"], stats["batch_size"]["max"]) == (1, 5)
-    for kind in ("step", "wait", "transfer"):
-        assert 0 <= stats["latency_us"][kind]["p50"] <= stats["latency_us"][kind]["p99"]
-    by_entry = group.get_env_stats(by_entry=True)
-    assert [(name, sums["episodes"]) for name, sums in by_entry.items()] == [
-        ("probe", 2),
-        ("more", 1),
-    ]
-    assert by_entry["probe"]["mean_return"] == 4.0
-    by_env = group.get_env_stats(reset=True)
+    assert stats["entries"]["probe"] == pytest.approx(3 / 2 * stats["entries"]["more"])
+    assert stats["batch_size"] == (5 + 2 + 2 + 1 + 1) / 5
+    assert set(stats["latency_us"]) == {"step", "wait", "transfer"}
+    assert min(stats["latency_us"].values()) >= 0
+    by_env = group.get_env_stats()
     assert list(by_env) == group.env_ids
     assert (by_env["probe-0"]["episodes"], by_env["probe-0"]["mean_return"]) == (2, 4.0)
-    assert (by_env["probe-0"]["last_return"], by_env["probe-0"]["last_length"]) == (5.0, 1)
     assert (by_env["more-0"]["episodes"], by_env["more-0"]["mean_length"]) == (1, 2.0)
     assert by_env["probe-1"]["episodes"] == 0
     assert by_env["probe-1"]["mean_return"] is None
-    assert group.get_env_stats()["probe-0"]["episodes"] == 0
+    assert by_env["probe-0"]["outcomes_terminated"] == by_env["probe-0"]["outcomes_truncated"] == 1
     group.print_timing_summary()
     printed = capsys.readouterr().out
     assert "steps per second" in printed

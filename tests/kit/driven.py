@@ -155,3 +155,8 @@ ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
 AWAITING = Place("awaiting workers", {"envs_per_process": 2}, synchronous=True, awaitable=True)
 """Awaitable envs in workers. Only `test_stepping` runs on them; it is representative."""
 PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, MIXED_SYNC, SEVERAL, LOOP, AWAITING]
+
+
+def without_times(stats: dict[str, Any]) -> dict[str, Any]:
+    """The figures of an env, of `get_env_stats`, that are the same in each run."""
+    return {name: value for name, value in stats.items() if not name.startswith("seconds_")}

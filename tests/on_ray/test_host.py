@@ -19,6 +19,7 @@ from hosts.beside_others import (
     check_usable_after_an_error,
     steps,
 )
+from kit.driven import without_times
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet
 from rlightning_aio.errors import ConfigError, StartFailed
@@ -57,7 +58,7 @@ async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Pl
                 check_three_are_equal(batch, flags)
                 resets += int(np.sum(batch.is_reset))
         stats = group.get_env_stats()
-    episodes = [[stats[f"{place}-{k}"] for k in range(4)] for place in THREE_PLACES]
+    episodes = [[without_times(stats[f"{place}-{k}"]) for k in range(4)] for place in THREE_PLACES]
     assert episodes[0] == episodes[1] == episodes[2]
     assert resets == 4 * 12
 

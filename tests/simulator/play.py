@@ -1129,7 +1129,7 @@ class Play(Session):
         self.group.get_stats()
         numbers = self.group.metrics(by_entry=True)
         require(not any(map(math.isnan, numbers.values())), "numbers", numbers)
-        there = [numbers[f"envs/{state}"] for state in ("idle", "in_flight", "uncollected")]
+        there = [numbers[f"envs/{state}"] for state in ("idle", "busy", "uncollected")]
         require(min(there) >= 0 and sum(there) == numbers["envs/envs"], "numbers", numbers)
         if self.batches and rng.random() < 0.3:
             batch = self.batches[-1]

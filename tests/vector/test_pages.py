@@ -24,7 +24,7 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("migrating#skrl", ["skrl"]),
         ("migrating#Tianshou", ["tianshou"]),
         ("trainers", ["skyrl_gym"]),
-        ("metrics", ["wandb", "prometheus_client", "opentelemetry.sdk", "tensorboardX"]),
+        ("metrics", ["wandb", "prometheus_client"]),
     ],
 )
 def test_programs_run(

@@ -36,7 +36,7 @@ from rlightning_aio.config import load_config
 from rlightning_aio.errors import EnvFault, RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.config import EnvConfig
@@ -223,17 +223,28 @@ def _report(
         f"{'Interrupted after ' if interrupted else ''}{count(done.steps)} steps in "
         f"{done.seconds:.1f} s: {count(done.rate)} steps/s"
     )
+    print_lines([title])  # A narrow table would fold it.
     entries = [config.name for config in done.configs]
-    entries = entries if len(entries) > 1 else []
-    table = named_columns(title, "", "all" if entries else "", *entries)
+    _print_numbers(numbers, entries if len(entries) > 1 else [])
+
+
+def _print_numbers(numbers: Mapping[str, float], entries: Sequence[str]) -> None:
+    """Print what is not 0 of the whole group, and of each of several entries."""
+    table = named_columns("", "", "all", *entries)
     table.show_header = bool(entries)
-    for name in (name for name in numbers if name.count("/") == 1):
-        short = name.removeprefix("envs/")
-        own = [numbers.get(f"envs/{entry}/{short}") for entry in entries]
-        if numbers[name] or any(own):  # Most counters of failures are 0.
-            table.add_row(short, *(_text(value) for value in (numbers[name], *own)))
+    prefixes = ["envs/", *(f"envs/{entry}/" for entry in entries)]
+    for short in (name.removeprefix("envs/") for name in numbers if name.count("/") == 1):
+        own = [numbers.get(prefix + short) for prefix in prefixes]
+        if any(own):  # Most counters of failures are 0.
+            table.add_row(short, *map(_text, own))
+    episodes = [numbers[f"{prefix}episodes"] for prefix in prefixes]
+    for what in ("return", "length") if episodes[0] else ():
+        sums = [numbers[f"{prefix}episode_{what}s"] for prefix in prefixes]
+        means = [total / n if n else None for total, n in zip(sums, episodes, strict=True)]
+        table.add_row(f"mean_{what}", *map(_text, means))
     print_table(table)
-    print_lines([_BIAS] if numbers.get("envs/episode_return_mean") is not None else [])
+    if episodes[0]:
+        print_lines([_BIAS])
 
 
 def _text(value: float | None) -> str:

@@ -5,5 +5,5 @@ Imports run down: `api` (the two public groups), `setup` (what is started), `tim
 restarts), `tables` (what all parts share), `episodes` (step limits, losses, seeds, the format of
 snapshots), `state`, `drivers` (how a procedure waits).
 Decisions get the time as an argument, or from `Tables.clock`; only drivers, `api` and what measures
-(`stats`, `hint`, `timeline`) read a clock, and none knows where an env runs.
+(`sums`, `timeline`) read a clock, and none knows where an env runs.
 """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.group.state.slab_layout import SlabLayout
-    from rlightning_aio._core.group.state.stats import Stats
+    from rlightning_aio._core.group.state.sums import Sums
     from rlightning_aio._core.hosts.arena import Arena
     from rlightning_aio._core.hosts.base import Driver, Shared
     from rlightning_aio._core.hosts.messages import Completion, Completions
@@ -33,7 +33,7 @@ class Tables:
         observed: holds the observer.
         lifetime: whether the group is open.
         arena: the memory that hosts share with the group.
-        stats: of the results that were returned.
+        sums: the numbers of the group.
         clock: monotonic seconds, for the parts that can't be given the time.
         driver: of the group.
         num_cores: that this process and its workers may use.
@@ -52,7 +52,7 @@ class Tables:
     observed: Observed
     lifetime: Lifetime
     arena: Arena
-    stats: Stats
+    sums: Sums
     clock: Callable[[], float]
     driver: Driver
     num_cores: int = 1

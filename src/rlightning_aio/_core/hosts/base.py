@@ -169,8 +169,8 @@ class Host(Protocol):
         nobody uses what it holds.
         """
 
-    def processor_times(self) -> tuple[int, int] | None:
-        """Return the ns for which its threads have run, and have waited for a core, if known."""
+    def processor_ns(self) -> int | None:
+        """Return for how long its living threads have run or waited for a core, if known."""
         return None
 
 

@@ -63,7 +63,6 @@ class EnvGroup(GroupInterface):
         except BaseException:
             self._after_close()
             raise
-        self._driver.call_time.begin(time.monotonic())
         return metas
 
     async def __aenter__(self) -> Self:

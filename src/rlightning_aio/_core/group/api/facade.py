@@ -141,7 +141,6 @@ class Facade:
         self._driver.apply_completions = self._core.apply_completions
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False
-        self._ended_ns = 0
         self._traces: list[Trace] = []
         _groups.add(self)
 
@@ -318,57 +317,44 @@ class Facade:
     # -- measurements -------------------------------------------------------------
 
     def metrics(self, by_entry: bool = False) -> dict[str, float]:
-        """The numbers of the running group, as Weights & Biases and TensorBoard take them.
+        """The numbers of the group, as Weights & Biases and TensorBoard take them.
 
-        Which side starves, which env is slow, what fails: docs/metrics.md explains every number.
-        Names are stable, values are plain numbers, and what was not measured yet is left out.
-        Never waits, and works from any thread, before, during and after other calls.
+        Which side starves, what fails, how episodes end: sums since the start, and what the envs do
+        now. docs/metrics.md explains every number. Names are stable, and values are plain numbers.
+        Never waits, and works before, during and after other calls.
 
         Args:
             by_entry: add the numbers of each config entry, as ``envs/<entry>/<name>``.
+
+        Raises:
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        now_ns = self._ended_ns or time.monotonic_ns()
-        call_seconds = self._driver.call_time.so_far(now_ns / 1e9)
-        return self._core.metrics.read(now_ns, call_seconds, by_entry=by_entry)
+        return self._driver.look(partial(self._core.sums.metrics, by_entry=by_entry))
 
     def get_stats(self) -> dict[str, Any]:
-        """Throughput and latencies over the last ten seconds, at most the last thousand batches.
+        """Means over the group's life, made of the sums of `metrics`.
 
-        An env step is a step of one sub-environment: a result of an env with ``num_envs: n``
-        counts as n steps, a result of a multi-agent env as one, a reset as none.
+        Keys: ``steps_per_second`` (env steps, from the first request to the last result);
+        ``entries`` (the same by config entry); ``batch_size`` (results per batch); ``latency_us``
+        (of steps and resets: ``step``, the time in the env; ``wait``, from sending until the env
+        begins; and ``transfer``, from the end in the env until the result is returned). All are 0
+        before the first result.
 
-        Keys: ``steps_per_second`` (env steps); ``entries`` (by config entry, env steps per
-        second from ``step``, as ``sync``, and from ``collect_async``, as ``async``);
-        ``batch_size`` (results per batch: mean, min, max); ``latency_us`` (``p50`` and ``p99`` of
-        ``step``, the time in the env; ``wait``, from sending until the env begins; and
-        ``transfer``, from the end in the env until the result is returned). The dicts are empty
-        before anything was measured.
+        Raises:
+            RLightningError: as `metrics`.
         """
-        return self._core.stats.summary(time.monotonic_ns())
+        return self._driver.look(self._core.sums.summary)
 
-    def get_env_stats(
-        self, reset: bool = False, by_entry: bool = False
-    ) -> dict[str, dict[str, Any]]:
-        """Requests sent, episodes ended, and mean and last return and length, by env id.
+    def get_env_stats(self) -> dict[str, dict[str, Any]]:
+        """The sums of `metrics` by env id, with ``mean_return`` and ``mean_length``.
 
-        The means are over all ended episodes, so envs with short episodes contribute more of them.
-        To measure a policy, use `rlightning_aio.evaluation.evaluate`.
+        The means are over all ended episodes, None before the first. To measure a policy, use
+        `rlightning_aio.evaluation.evaluate`.
 
-        An episode ends by itself or at the step limit of `auto_reset`. ``success_rate`` and
-        ``fail_rate`` are the shares of True in ``info["success"]`` and ``info["fail"]`` of the
-        results that end episodes; None if the env sets no such key.
-
-        A former client, its slot taken by another, counts only in the figures of its entry.
-
-        Args:
-            reset: set the figures to zero after this call.
-            by_entry: return the figures of each config entry instead.
+        Raises:
+            RLightningError: as `metrics`.
         """
-        stats = self._core.stats
-        found = stats.by_entry() if by_entry else stats.by_env()
-        if reset:
-            stats.reset_envs()
-        return found
+        return self._driver.look(self._core.sums.by_env)
 
     @property
     def num_restarts(self) -> int:
@@ -394,13 +380,13 @@ class Facade:
         return self._driver.look(self._core.describe_workers, time.monotonic_ns())
 
     def print_timing_summary(self) -> None:
-        """Print the figures of `get_stats` as a table."""
+        """Print the numbers of `get_stats` as a table."""
         stats = self.get_stats()
         print(f"{stats['steps_per_second']:12.0f} env steps per second")
-        for name, rates in stats["entries"].items():
-            print(f"{rates['sync'] + rates['async']:12.0f}   {name}")
-        for kind, figures in stats["latency_us"].items():
-            print(f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)")
+        for name, rate in stats["entries"].items():
+            print(f"{rate:12.0f}   {name}")
+        for kind, microseconds in stats["latency_us"].items():
+            print(f"{microseconds:12.1f} µs {kind} (mean)")
 
     def trace(self, path: str | Path) -> Trace:
         """Record a timeline of this group into a file that https://ui.perfetto.dev opens.
@@ -437,7 +423,7 @@ class Facade:
         if not self._core.lifetime.closed:
             return  # `close` raised before it closed anything.
         self._finalizer.detach()
-        self._ended_ns = self._ended_ns or time.monotonic_ns()
+        self._core.sums.ended_ns = self._core.sums.ended_ns or time.monotonic_ns()
         for trace in list(self._traces):
             trace.stop()
         close_errors = self._core.supervisor.close_errors

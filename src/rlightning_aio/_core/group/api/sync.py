@@ -65,7 +65,6 @@ class EnvGroup(GroupInterface):
         except BaseException:
             self._after_close()
             raise
-        self._driver.call_time.begin(time.monotonic())
         return metas
 
     def __enter__(self) -> Self:

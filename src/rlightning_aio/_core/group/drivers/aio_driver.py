@@ -9,7 +9,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.drivers.wait import (
-    CallTime,
     Parked,
     Patient,
     forked_from,
@@ -47,8 +46,6 @@ class AioDriver:
         # The queue of completions, and the function that applies them; set by the group.
         self.completions: Sized = ()
         self.apply_completions: Callable[[], None]
-        self.call_time = CallTime()
-        self._num_calls = 0
         # The future of each waiting call, until it is woken.
         self._waiting: list[asyncio.Future[None]] = []
         self._nudge: asyncio.TimerHandle | None = None
@@ -93,8 +90,10 @@ class AioDriver:
         return function(*args)
 
     def look(self, function: Callable[..., T], *args: Any) -> T:
-        """Call a function that only looks at the group: as any other."""
-        return self.call(function, *args)
+        """Call a function that only looks at the group, which may outlive its loop."""
+        if self._loop is None or not self._loop.is_closed() or this_process[0] != self._pid:
+            self.check_caller()
+        return function(*args)
 
     def interruptible(self, execute: Callable[[], T]) -> T:
         """Call a function that runs an env; asyncio handles Ctrl-C."""
@@ -226,10 +225,6 @@ class AioDriver:
             RLightningError: the group belongs to another loop, or to another process.
         """
         self.check_caller()
-        call_time = self.call_time
-        self._num_calls += 1
-        if self._num_calls == 1:
-            call_time.waited = (call_time.waited[0], time.monotonic())
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
@@ -247,11 +242,6 @@ class AioDriver:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
-        finally:
-            self._num_calls -= 1
-            if not self._num_calls:
-                ended, since = call_time.waited
-                call_time.waited = (ended + time.monotonic() - since, 0.0)
 
     async def run_last(self, procedure: Procedure[None]) -> None:
         """Run the procedure that closes the group, on any loop.

@@ -16,7 +16,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
-from rlightning_aio._core.group.drivers.wait import TURN, CallTime, forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import TURN, forked_from, this_process
 from rlightning_aio._core.hosts.descriptors import READABLE, WRITABLE, new_descriptor_set
 from rlightning_aio.errors import RLightningError
 
@@ -48,7 +48,6 @@ class SyncDriver:
         self.completions: Sized = ()
         self.apply_completions: Callable[[], None]
         self.awaited: Callable[[float], str]
-        self.call_time = CallTime()
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
@@ -124,11 +123,6 @@ class SyncDriver:
             raise KeyboardInterrupt
 
     def _run(self, procedure: Procedure[T]) -> T:
-        call_time = self.call_time
-        ended, before = call_time.waited
-        # A signal handler may call within a call, which continues counting.
-        began = before or time.monotonic()
-        call_time.waited = (ended, began)
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
@@ -147,9 +141,6 @@ class SyncDriver:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
-        finally:
-            if not before:
-                call_time.waited = (ended + time.monotonic() - began, 0.0)
 
     def call(self, function: Callable[[*A], T], *args: *A) -> T:
         """Call a function of the group; errors are those of `run`.

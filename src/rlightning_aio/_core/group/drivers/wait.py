@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "TURN",
-    "CallTime",
     "GroupDriver",
     "Parked",
     "Patient",
@@ -80,34 +79,10 @@ The driver calls `Core.apply_completions` before it resumes a procedure.
 """
 
 
-class CallTime:
-    """How long the calls of a group have waited. A driver changes it, any thread may read it.
-
-    Attributes:
-        waited: seconds of calls that have ended, and since when one waits; 0.0 if none does.
-    """
-
-    def __init__(self) -> None:
-        self._began = 0.0
-        self.waited = (0.0, 0.0)
-
-    def begin(self, now: float) -> None:
-        """Count from now on, if not for long already."""
-        if not self._began:
-            self._began, self.waited = now, (0.0, 0.0)
-
-    def so_far(self, now: float) -> tuple[float, float]:
-        """Return the seconds in which a call waited, and those in which none did."""
-        ended, since = self.waited
-        waited = ended + (now - since if since else 0.0)
-        return waited, (now - self._began if self._began else 0.0) - waited
-
-
 class GroupDriver(Driver, Protocol):
     """Waits for the sources of a group.
 
     Attributes:
-        call_time: how long calls have waited; those that wait at the same time count once.
         completions: queue of the outcomes that sources posted.
         apply_completions: applies them; the driver calls it whenever the queue isn't empty.
     """
@@ -115,8 +90,6 @@ class GroupDriver(Driver, Protocol):
     completions: Sized
 
     apply_completions: Callable[[], None]
-
-    call_time: CallTime
 
     def check_caller(self) -> None:
         """Raise `RLightningError` if another thread uses the group, or another loop owns it."""

@@ -2,7 +2,7 @@
 
 `core` puts it together. `steps` (with `actions`), `resets`, `calls`, `snapshots`, `aborts` and
 `agent_steps` are the operations; `dispatch` sends, `waiting` waits, `intake` (with `arrivals`)
-applies reports, `results` makes batches, `metrics` only reads. `actions` refuses what
-doesn't fit the space before anything is sent. An operation is a generator, so the same code serves
-both public groups. What a death means is decided in `supervision`; what is in flight is in `state`.
+applies reports, `results` makes batches. `actions` refuses what doesn't fit the
+space before anything is sent. An operation is a generator, so the same code serves both public
+groups. What a death means is decided in `supervision`; what is in flight is in `state`.
 """

@@ -51,7 +51,7 @@ class Aborts:
         self._arrivals = arrivals
         self._intake = waiting.intake
         self._waiting = waiting
-        self._stats = tables.stats
+        self._sums = tables.sums
 
     def drop(self, slots: NDArray[np.intp]) -> None:
         """Drop those results of `slots` that wait for the collector; errors that do so stay."""
@@ -60,7 +60,7 @@ class Aborts:
         if len(ready):
             self._requests.drop(ready)
             self._results.let_go(ready)
-            self._stats.note_failures(ready, _WHY.kind)
+            self._sums.note_failures(ready, _WHY.kind)
         failed = self._requests.collector.free(slots.tolist())
         dropped = np.concatenate((ready, failed))
         self._abandon(dropped)
@@ -76,7 +76,7 @@ class Aborts:
         new = slots[np.array([self._is_wanted(slot) for slot in slots.tolist()], np.bool_)]
         wanted = new[requests.owner[new] != NOBODY]
         requests.abort(wanted, [self._fault(slot) for slot in wanted.tolist()])
-        self._stats.note_failures(new, _WHY.kind)
+        self._sums.note_failures(new, _WHY.kind)
         self._abandon(new)
         for host_id, entry in self._supervisor.detector.abort(new, now):
             requests.end(host_id, entry)

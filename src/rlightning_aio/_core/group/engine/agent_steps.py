@@ -229,7 +229,7 @@ class AgentSteps:
         slots = self._requests.settle_ended(ticket)
         self._steps.note_freed(failed)
         if len(slots):
-            batch, _ = self._steps.hand_out(slots, synchronous=True)
+            batch, _ = self._steps.hand_out(slots)
             self._resolve(batch, slots)
         return True
 

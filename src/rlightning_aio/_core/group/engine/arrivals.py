@@ -41,7 +41,6 @@ class Arrivals:
         self._layout = tables.layout
         self._continuity = tables.continuity
         self._results = results
-        self._stats = tables.stats
         self.held_back: dict[int, Joined] = {}
         self._withdrawn: set[int] = set()
         self.asked = self.back = np.zeros(0, np.intp)
@@ -65,7 +64,6 @@ class Arrivals:
     def _accept(self, completion: Joined, slot: int, now: float) -> None:
         meta, first_slot = completion.meta, slot - completion.env_index
         if self._envs.env_ids[slot] not in ("", meta.env_id):
-            self._stats.move_to_entry(slot)
             self._withdrawn.discard(slot)
         has_row = self._layout.of(slot)[0].action is not None
         self._envs.note_joined(slot, first_slot, meta, completion.traits, has_row=has_row)

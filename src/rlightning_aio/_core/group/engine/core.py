@@ -18,7 +18,6 @@ from rlightning_aio._core.group.engine.arrivals import Arrivals
 from rlightning_aio._core.group.engine.calls import Calls
 from rlightning_aio._core.group.engine.dispatch import Dispatch
 from rlightning_aio._core.group.engine.intake import Intake
-from rlightning_aio._core.group.engine.metrics import Metrics
 from rlightning_aio._core.group.engine.resets import Resets
 from rlightning_aio._core.group.engine.results import Results
 from rlightning_aio._core.group.engine.snapshots import Snapshots
@@ -52,8 +51,8 @@ class Core:
         zero_copy: return observations as views if their rows are contiguous.
 
     Attributes:
-        tables, supervisor: as given; envs, requests, continuity, observed, lifetime, stats: of the
-            tables; results, intake, waiting, metrics, steps, agent_steps, calls: made here.
+        tables, supervisor: as given; envs, requests, continuity, observed, lifetime, sums: of the
+            tables; results, intake, waiting, steps, agent_steps, calls: made here.
     """
 
     def __init__(
@@ -66,8 +65,7 @@ class Core:
         self.continuity = tables.continuity
         self.observed = tables.observed
         self.lifetime = tables.lifetime
-        self.stats = tables.stats
-        self.metrics = Metrics(tables)
+        self.sums = tables.sums
         self.results = results = Results(tables, zero_copy=zero_copy)
         arrivals = Arrivals(tables, results)
         self.intake = intake = Intake(tables, supervisor, results, arrivals)
@@ -186,7 +184,7 @@ class Core:
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
             slots = collector.pop_ready(collector.num_ready)
-            results = self.steps.hand_out(slots, synchronous=False)
+            results = self.steps.hand_out(slots)
         if collector.faults:
             faults = [*collector.faults]
             for fault in faults:

@@ -79,7 +79,7 @@ class Intake:
         self._results = results
         self._continuity = tables.continuity
         self._arrivals = arrivals
-        self._stats = tables.stats
+        self._sums = tables.sums
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
             Result: self._on_result,
@@ -236,7 +236,7 @@ class Intake:
         """End requests that are no longer in flight, with one error for each caller."""
         for owner, mine in self._requests.owners(slots):
             fault = error_for(mine)
-            self._stats.note_failures(mine, fault.outcome.kind)
+            self._sums.note_failures(mine, fault.outcome.kind)
             self._requests.fail(mine, owner, fault)
 
     def _on_died(self, completion: Died) -> None:

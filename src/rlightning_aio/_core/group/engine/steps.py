@@ -97,7 +97,7 @@ class Steps:
         self._observed = tables.observed
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
-        self._hints = supervisor.hints
+        self._hint = supervisor.hint
         self._completions = tables.completions
         self._driver = tables.driver
         self._results = results
@@ -105,7 +105,7 @@ class Steps:
         self._dispatch = dispatch
         self._waiting = waiting
         self._intake = waiting.intake
-        self._stats = tables.stats
+        self._sums = tables.sums
         self.collecting = False
         # The host of the only env, which steps in the calls of a synchronous group.
         self._alone: Executing | None = None
@@ -158,7 +158,7 @@ class Steps:
                 ticket, now = yield from self._waiting.ask(now, slots, send)
                 if ticket.errors:
                     self._raise_faults(ticket)
-            results, flags = self.hand_out(slots, synchronous=True, since=began, needed=len(slots))
+            results, flags = self.hand_out(slots)
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("step", began)
@@ -211,9 +211,7 @@ class Steps:
             slots, local = collector.pop_ready(most), self._envs.all
             if len(slots) == len(local) > slots[-1]:
                 slots = local  # The same slots, which lie side by side.
-            # In a window, others are waited for, too.
-            needed = 0 if rules.timeout is not None else need
-            return self.hand_out(slots, synchronous=False, since=began, needed=needed)
+            return self.hand_out(slots)
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("collect_async", began)
@@ -347,7 +345,7 @@ class Steps:
             fault = self._intake.apply_error(0, ErrorText.of(error))
             if fault is None:
                 return False
-            self._stats.note_failures(slots, fault.outcome.kind)
+            self._sums.note_failures(slots, fault.outcome.kind)
             if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
                 requests.collector.keep(slots, fault)
                 raise
@@ -366,7 +364,7 @@ class Steps:
         """Return the results of a call in its order, or raise its faults with the results."""
         if ticket.errors:
             self._raise_faults(ticket)
-        return self.hand_out(slots, synchronous=True)
+        return self.hand_out(slots)
 
     def _raise_faults(self, ticket: Ticket) -> NoReturn:
         done = self._requests.ready(ticket.slots)  # Others may have requests of other calls.
@@ -374,7 +372,7 @@ class Steps:
         fault.others = tuple(ticket.faults[1:])
         if len(done):
             try:
-                fault.results = self.hand_out(done, synchronous=True)[0]
+                fault.results = self.hand_out(done)[0]
             except BaseException:
                 for unraised, own in ticket.failures():
                     self._requests.collector.keep(own, unraised)
@@ -384,18 +382,11 @@ class Steps:
         self.note_freed(ticket.errors)
         raise fault
 
-    def hand_out(
-        self,
-        slots: NDArray[np.intp],
-        *,
-        synchronous: bool,
-        since: float = 0.0,
-        needed: int = 0,
-    ) -> tuple[BatchedData, Flags]:
+    def hand_out(self, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
         """Return the results of `slots`, all ready.
 
         They stay ready until the batch is complete: if memory runs out on the way, the next
-        collect returns them. For `since` and `needed` see `Sample`.
+        collect returns them.
         """
         results, continuity, observer = self._results, self._continuity, self._observed.observer
         noted = None if observer is None else observer.before_results(slots)
@@ -415,7 +406,7 @@ class Steps:
                 parts, self._tables, slots, self._envs.names, results.sources(slots)
             )
             self._driver.check_interrupt()
-            self._stats.account(parts, synchronous=synchronous, since=since, needed=needed)
+            self._sums.add(parts)
             continuity.returned(slots, flagged, judged)
             if self._conditions.unusual & BESIDE_ROWS:
                 results.let_go(slots)
@@ -425,15 +416,15 @@ class Steps:
             raise
         if observer is not None:
             observer.after_results(noted, parts)
-        if self._arrivals.held_back or self._stats.num_batches >= self._hints.due:
+        if self._arrivals.held_back or self._sums.num_batches >= self._hint.due:
             self._note_returned(slots)
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
 
     def _note_returned(self, slots: NDArray[np.intp]) -> None:
-        """Let envs join whose rows are free now, and give hints."""
+        """Let envs join whose rows are free now, and look for a hint."""
         self._arrivals.admit(slots, self._intake.now)
-        if self._stats.num_batches >= self._hints.due:
-            self._hints.look()
+        if self._sums.num_batches >= self._hint.due:
+            self._hint.look()
 
     @staticmethod
     def _mark_cut(part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:

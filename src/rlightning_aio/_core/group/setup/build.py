@@ -16,7 +16,7 @@ from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Ob
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
-from rlightning_aio._core.group.state.stats import Stats
+from rlightning_aio._core.group.state.sums import Sums
 from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio._core.group.setup.plan import Plan
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.hosts.base import Driver
     from rlightning_aio._core.hosts.messages import StartOrder
 
@@ -111,6 +112,7 @@ def _tables(
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)
     requests = Requests(hosts, len(orders), conditions)
+    records: list[HostRecord] = []
     return Tables(
         envs=envs,
         requests=requests,
@@ -120,7 +122,8 @@ def _tables(
         observed=Observed(),
         lifetime=Lifetime(conditions),
         arena=Arena(),
-        stats=Stats(envs, requests),
+        sums=Sums(envs, requests, records),
+        records=records,
         clock=time.monotonic,
         driver=driver,
         num_cores=cores,

@@ -2,9 +2,9 @@
 
 `supervisor` decides what becomes of a host that ended or hung: a replacement, a later attempt, or
 giving up. `hang_detector` says who is late (of awaitable envs, the event loop's `TimeLimit`),
-`shutdown` ends hosts, `fault_messages` words the errors, `workers` and `hint` describe hosts to
-users, `overdue` names envs that no limit ends, `members` lists envs that join. What a loss means
-for an episode is in `episodes`.
+`shutdown` ends hosts, `fault_messages` words the errors, `workers` describes hosts to users, `hint`
+suggests a faster setting, `overdue` names envs that no limit ends, `members` lists envs that join.
+What a loss means for an episode is in `episodes`.
 
 Rule: a hang ends as a death. A signal has a hung worker write its stacks, which works inside C
 code, too; then its fork server kills it. If no death is reported within five seconds, the fork

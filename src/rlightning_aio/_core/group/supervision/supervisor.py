@@ -30,7 +30,7 @@ from rlightning_aio._core.group.supervision.fault_messages import (
     without_terminal,
 )
 from rlightning_aio._core.group.supervision.hang_detector import HangDetector, read_news
-from rlightning_aio._core.group.supervision.hint import Hints
+from rlightning_aio._core.group.supervision.hint import Hint
 from rlightning_aio._core.group.supervision.members import Members
 from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
@@ -85,7 +85,7 @@ class Supervisor:
         hosts: in the order of their slots; records: of them.
         members: the envs that join and leave.
         detector: finds workers that hang.
-        shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
+        shutdown: ends the hosts; workers: describes them; hint: on settings; crash_log: of
             restarts; env_errors: of envs; overdue: names envs that owe a result for long.
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
@@ -110,7 +110,7 @@ class Supervisor:
         self.detector = HangDetector(tables)
         self.shutdown = Shutdown(tables)
         self.workers = Workers(tables)
-        self.hints = Hints(tables)
+        self.hint = Hint(tables)
         self.overdue = Overdue(tables)
         self.crash_log = CrashLog()
         self.env_errors = EnvErrors(tables, self.crash_log, self._update_any_deaths)

@@ -11,7 +11,7 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["check_system", "processor_times"]
+__all__ = ["check_system", "processor_ns"]
 
 
 def check_system(config: EnvConfig) -> None:
@@ -29,17 +29,16 @@ def check_system(config: EnvConfig) -> None:
         )
 
 
-def processor_times(pid: int) -> tuple[int, int] | None:
-    """Return the ns for which the living threads of a process have run, and have waited for a core.
+def processor_ns(pid: int) -> int | None:
+    """Return for how long the living threads of a process have run or waited for a core, in ns.
 
     None if the process has ended, or the kernel keeps no such accounts.
     """
-    ran = queued = 0
+    ran = 0
     try:
         for accounts in Path(f"/proc/{pid}/task").glob("*/schedstat"):
             on_core, in_queue, _ = accounts.read_text().split()
-            ran += int(on_core)
-            queued += int(in_queue)
+            ran += int(on_core) + int(in_queue)
     except (OSError, ValueError):
         return None  # A thread has ended meanwhile, or the accounts have another form.
-    return (ran, queued) if ran else None
+    return ran or None
