@@ -23,13 +23,11 @@ LOOPS = ("async_loop", "sync_loop")
 # Run by other tests: they need other packages, or are not complete programs.
 ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
-    "lerobot": "vector/test_pages.py",
     "metrics": "test_metrics.py",
     "rlightning": "test_docs.py",
     "simulators": "cli/test_simulators_page.py",
     "stable_baselines3": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
-    "trainers": "vector/test_pages.py",
 }
 
 
@@ -50,7 +48,8 @@ def by_program(written: str) -> dict[str, str]:
 # Those of migrating.md are run by vector/test_pages.py, that on Ray by on_ray/test_pages.py.
 NEEDS_MORE = (
     r"^(import (torch|aiohttp)$|from stable_baselines3|net = "
-    r"|from (ray|rl_zoo3|skrl|tianshou|torchrl)\b|    \"placement\": \"ray\")"
+    r"|from (lerobot|ray|rl_zoo3|skrl|skyrl_gym|tianshou|torchrl)\b"
+    r"| +import gym_pusht|    \"placement\": \"ray\")"
 )
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)
 

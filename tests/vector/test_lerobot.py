@@ -64,7 +64,7 @@ def evaluated(folder: Path, *arguments: str) -> Any:
 
 
 def test_lerobot_eval_counts_the_same(tmp_path: Path) -> None:
-    """The plug-in makes asynchronous envs ours; its own can't run `gym_pusht` (docs/lerobot.md)."""
+    """The plug-in makes asynchronous envs ours; LeRobot's own can't run `gym_pusht`."""
     own = evaluated(tmp_path / "own", "--eval.use_async_envs=false")
     ours = evaluated(tmp_path / "ours", "--eval.use_async_envs=true")
     assert len(own["sum_rewards"]) == 4

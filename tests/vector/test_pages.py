@@ -17,13 +17,13 @@ DOCS = Path(__file__).parents[2] / "docs"
     ("page", "needed"),
     [
         ("stable_baselines3", ["stable_baselines3"]),
-        ("lerobot", ["lerobot"]),
+        ("migrating#LeRobot", ["lerobot"]),
         ("migrating#TorchRL", ["torchrl"]),
         ("migrating#RLlib", ["ray", "tree", "torch"]),
         ("migrating#RL Zoo", ["rl_zoo3"]),
         ("migrating#skrl", ["skrl"]),
         ("migrating#Tianshou", ["tianshou"]),
-        ("trainers", ["skyrl_gym"]),
+        ("migrating#Trainers of language models", ["skyrl_gym"]),
         ("metrics", ["wandb", "prometheus_client"]),
     ],
 )
