@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from collecting.test_interruptions import PER_ENTRY, SEED, check, parts_of, policy
-from combinations.played import Uneven
+from collecting.test_interruptions import PER_ENTRY, SEED, Uneven, check, parts_of, policy
 from faults.striking import hear_of_interrupt, struck
 
 from rlightning_aio import sync
@@ -80,7 +79,7 @@ def test_a_collector_can_be_restarted_wherever_it_was_interrupted(
                 collector.restart(SEED)
             collect_from_all(collector, found)
         if not has_ended:  # Where a line ends the call, Python looks for no signals.
-            check(found, 4)
+            check(found)
         with contextlib.suppress(NothingPending):
             while True:
                 group.collect_async(wait_all=True)

@@ -18,8 +18,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from combinations.features import copied, stored
-from combinations.played import Uneven, act, played
 from kit.counting import ClientThread, CountingEnv
 from kit.driven import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
 from kit.processes import kill
@@ -28,7 +26,8 @@ from patience import HANG
 
 import rlightning_aio as rl
 import rlightning_aio.sync
-from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting import Collector, Rollout
+from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.errors import EnvRaised, NothingPending, RLightningError, WorkerDied
 from rlightning_aio.evaluation import evaluate
 from rlightning_aio.registry import ENVS
@@ -37,9 +36,33 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Generator
 
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.collecting import Rollout
 
 SEED = 7
+
+
+class Uneven(gym.Env[Any, Any]):
+    """Shows [steps of the episode, a number that depends on all before]; episodes are short."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps, self.length, self.at = 0, *self.np_random.integers((1, 0), (8, 1000)).tolist()
+        return np.array([0.0, self.at]), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        self.at = (7 * self.at + 3 * int(action[0]) + int(self.np_random.integers(1000))) % 1009
+        over, odd = self.steps >= self.length, bool(self.length % 2)
+        observation = np.array([float(self.steps), self.at])
+        return observation, float(self.at % 100), over and odd, over and not odd, {}
+
+
+def copied(rollout: Rollout) -> Rollout:
+    """One whose arrays nobody else writes to."""
+    columns = {name: rollout[name].copy() for name in rollout}
+    return Rollout(columns, Ends(rollout.ends, rollout.end_observation.copy()), rollout.episodes)
 
 
 class Awaited(Awaitable):
@@ -55,7 +78,7 @@ class Awaited(Awaitable):
 
 
 def policy(batch: BatchedData) -> dict[str, Any]:
-    return {"action": act("uneven", batch.observation), "seen": batch.observation}
+    return {"action": batch.observation[:, 1:] % 5, "seen": batch.observation}
 
 
 async def awaited_policy(batch: BatchedData) -> dict[str, Any]:
@@ -78,18 +101,25 @@ def cut_off(coroutine: Coroutine[Any, Any, Any], at: int) -> Generator[Any, Any,
     raise AssertionError
 
 
-class Used:
-    """What `stored` asks of the use of a group."""
-
-    def __init__(self, size: int) -> None:
-        self.size = size
-
-
-def check(found: list[Rollout], size: int) -> None:
-    """Each env has made its first transitions, each once and in order."""
-    for k, own in enumerate(stored(Used(size), found)):
-        (expected,) = played("uneven", "disabled", [SEED + k], math.inf, len(own))
-        assert own == expected[: len(own)], f"env {k}"
+def check(found: list[Rollout]) -> None:
+    """Each env has made its first transitions, each once and in order, as it does alone."""
+    alone: dict[int, tuple[Uneven, Any]] = {}
+    for rollout in found:
+        after = rollout.next_observation
+        for place in np.ndindex(rollout.shape):
+            index = int(rollout.index[place])
+            if index not in alone:
+                env = Uneven()
+                alone[index] = env, env.reset(seed=SEED + index)[0]
+            env, before = alone[index]
+            assert rollout.observation[place].tolist() == before.tolist(), f"env {index}"
+            assert rollout.seen[place].tolist() == before.tolist()
+            assert rollout.first[place] == (before[0] == 0)
+            shown, reward, *ends, _ = env.step(before[1:] % 5)
+            assert after[place].tolist() == shown.tolist()
+            assert rollout.reward[place] == reward
+            assert [rollout.terminated[place], rollout.truncated[place]] == ends
+            alone[index] = env, env.reset()[0] if any(ends) else shown
 
 
 def parts_of(rollout: Rollout | dict[str, Rollout]) -> list[Rollout]:
@@ -144,7 +174,7 @@ async def test_a_collect_goes_on_wherever_it_was_cancelled(way: str, slow: str) 
             with group.auto_reset(math.inf):
                 collector: Any = Collector(group, answer, seed=SEED, **options)
                 found, num_cut = await collected(collector, at, 4)
-        check(found, 4)
+        check(found)
         assert sum(map(len, found)) % options["num_transitions"] == 0
         if not num_cut:
             assert at > 1
@@ -158,7 +188,7 @@ async def test_a_collect_of_workers_goes_on_wherever_it_was_cancelled() -> None:
         for at in range(6):
             with group.auto_reset(math.inf):
                 collector: Any = Collector(group, PER_ENTRY, num_transitions=3, seed=SEED)
-                check((await collected(collector, at, 4))[0], 4)
+                check((await collected(collector, at, 4))[0])
             with contextlib.suppress(NothingPending):
                 while True:
                     await group.collect_async(wait_all=True)

@@ -314,9 +314,9 @@ class Collector(Generic[G, R]):
             for env_id in self._failed:
                 if not is_resettable(self._group, env_id):
                     raise self._refusal(env_id, "restart() has the next collect reset all envs")
-            while asked(self._group):  # Of a start that was cancelled, or before `restart`.
+            if asked(self._group):  # By a start that was cancelled, or before `restart`.
                 with suppress(EnvFault):
-                    yield partial(self._group.collect_async, wait_all=True)
+                    yield self._group.drain
             try:
                 self._received, _ = yield partial(self._group.reset, seed=self._seed)
             except EnvFault as fault:
