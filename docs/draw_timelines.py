@@ -33,11 +33,9 @@ COLORS = {
     "step": "#4c78a8",
     "reset": "#f58518",
     "collect_async": "#d8dce4",
-    "hand out": "#54a24b",
     "step_async": "#72b7b2",
     "policy": "#b279a2",
     "learner": "#e45756",
-    "waiting for work": "#eeeeee",
 }
 TURNS = 12
 RECORDINGS = 8
@@ -116,7 +114,7 @@ def draw(events: list[dict[str, Any]], path: Path) -> None:
             names[track] = event["args"]["name"]
         elif event["ph"] == "X" and event["name"] in COLORS:
             slices[track].append((event["ts"] / 1e3, event["dur"] / 1e3, event["name"]))
-    shown = [track for track in sorted(names) if names[track] != "worker"]
+    shown = sorted(names)
     figure, axes = plt.subplots(figsize=(9, 0.42 * len(shown) + 1.3), layout="constrained")
     middle = sum(slices[shown[0]][-1][:2]) / 2
     for row, track in enumerate(shown):
@@ -124,8 +122,7 @@ def draw(events: list[dict[str, Any]], path: Path) -> None:
         # Those around others first, so that what is within them is seen.
         for began, length, name in sorted(slices[track], key=lambda one: -one[1]):
             if began < middle + WINDOW_MS and began + length > middle:
-                height = 0.5 if name == "hand out" else 0.8
-                axes.barh(row, length, height, began - middle, color=COLORS[name], linewidth=0)
+                axes.barh(row, length, 0.8, began - middle, color=COLORS[name], linewidth=0)
     used = {name for track in shown for began, _, name in slices[track] if began > middle}
     handles = [plt.Rectangle((0, 0), 1, 1, color=COLORS[name]) for name in COLORS if name in used]
     labels = [name for name in COLORS if name in used]

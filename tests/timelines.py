@@ -10,10 +10,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pathlib import Path
 
-SENDING = {"step", "step_async", "reset", "reset_async", "restore"}
-TRAINER = 1
-"""The trainer's process in the file."""
-
 
 @dataclass
 class Slice:
@@ -26,9 +22,6 @@ class Slice:
     ended: int
     args: dict[str, Any]
 
-    def holds(self, at: int) -> bool:
-        return self.began <= at <= self.ended
-
 
 def _ns(us: float) -> int:
     return round(us * 1000)
@@ -37,14 +30,11 @@ def _ns(us: float) -> int:
 class Seen:
     """The timeline in a file in Chrome's trace event format, checked while it is read.
 
-    Slices of a track nest; every track has a name; each flow leads from a call that sends through
-    the slice of an env to the call that hands out its result; and each request has one result.
+    Slices of a track nest, every track has a name, and each request has one slice.
     """
 
     def __init__(self, path: Path) -> None:
-        document = json.loads(path.read_text())
-        self.seconds_not_kept: float = document["otherData"]["seconds_not_kept"]
-        events = document["traceEvents"]
+        events = json.loads(path.read_text())["traceEvents"]
         named = {
             (event["name"], event["pid"], event.get("tid")): event["args"]["name"]
             for event in events
@@ -66,10 +56,9 @@ class Seen:
             for event in events
             if event["ph"] == "i"
         ]
-        assert {event["ph"] for event in events} <= set("MXistf")
+        assert {event["ph"] for event in events} <= set("MXi")
         self._check_nested()
         self._check_requests()
-        self.flows = self._check_flows([event for event in events if event["ph"] in "stf"])
 
     def _slice(self, event: dict[str, Any]) -> Slice:
         began = _ns(event["ts"])
@@ -103,25 +92,3 @@ class Seen:
     def _check_requests(self) -> None:
         numbers = Counter((one.process, one.track, one.args["request"]) for one in self.results())
         assert set(numbers.values()) <= {1}
-
-    def _check_flows(self, events: list[dict[str, Any]]) -> int:
-        ends: defaultdict[int, dict[str, Any]] = defaultdict(dict)
-        for event in events:
-            assert event["ph"] not in ends[event["id"]]
-            ends[event["id"]][event["ph"]] = event
-        by_place: defaultdict[tuple[str, str], list[Slice]] = defaultdict(list)
-        for one in self.slices:
-            by_place[one.process, one.track].append(one)
-        starts = {(one.process, one.track, one.began) for one in self.results()}
-        for flow in ends.values():
-            assert flow.keys() == set("stf")
-            sent, stepped, taken = (flow[phase] for phase in "stf")
-            assert sent["ts"] <= stepped["ts"]
-            assert sent["ts"] <= taken["ts"]
-            place = self._place[stepped["pid"], stepped["tid"]]
-            assert (*place, _ns(stepped["ts"])) in starts
-            for end, names in ((sent, SENDING), (taken, {"hand out"})):
-                assert end["pid"] == TRAINER
-                own = by_place[self._place[end["pid"], end["tid"]]]
-                assert any(one.name in names and one.holds(_ns(end["ts"])) for one in own)
-        return len(ends)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 from kit.driven import Driven, on_one_driver
 from kit.processes import kill, pid_of
 from kit.tokens import Tokens, two_workers
+from patience import HANG
 from timelines import Seen
 
 from rlightning_aio.errors import WorkerDied
@@ -35,35 +37,50 @@ def test_hangs_deaths_and_restarts_are_marked(start: Start, tmp_path: Path) -> N
             group.step(tokens.steps(group.group.env_ids))
     seen = Seen(tmp_path / "run.json")
     found = marks(seen)
-    assert found.count(("hung", "worker")) == 1
-    assert found.count(("died", "worker")) == 2
-    lost = [track for name, track in found if name == "episode lost"]
-    assert sorted(lost) == [f"faulty-{k}" for k in range(4)]
-    (hung,) = seen.called("step, hung")
+    assert found.count(("hung", "faulty-1")) == 1
+    # Those of a worker are shown at the first of its envs.
+    assert sorted(track for name, track in found if name == "died") == ["faulty-0", "faulty-2"]
+    assert sorted(track for name, track in found if name == "up") == ["faulty-0", "faulty-2"]
+    (hung,) = seen.called("step, unfinished")
     assert hung.track == "faulty-1"
     assert hung.ended - hung.began >= 1e9
-    replaced = seen.called("being replaced")
-    assert sorted(one.process for one in replaced) == ["worker 0 (faulty)", "worker 1 (faulty)"]
     causes = {args["cause"] for name, _, _, args in seen.marks if name == "died"}
     assert "hung in a step and was killed" in causes
-    lost = [args for name, _, _, args in seen.marks if name == "episode lost"]
-    kinds = sorted((args["kind"], args["blame"]) for args in lost)
-    assert kinds[-1] == ("env_hung", "either")  # The others of its worker are not to blame.
-    assert {kind for kind, _ in kinds[:-1]} == {"env_died"}
-    assert all(args["cause"] for args in lost)
 
 
 @on_one_driver
-def test_requests_in_progress_at_the_end_are_shown(start: Start, tmp_path: Path) -> None:
-    """A user who interrupts a hanging program sees in which env it hangs."""
+@pytest.mark.parametrize("limits", [{}, {"step_timeout": HANG}], ids=["no limit", "a limit"])
+def test_an_unfinished_request_begins_when_its_env_begins_it(
+    start: Start, limits: dict[str, Any], tmp_path: Path
+) -> None:
+    """Not when it was sent; what waits behind it is not shown, and the timeline ends with it."""
+    group, tokens = start(two_workers(on_worker_death="raise", **limits)), Tokens()
+    env_ids = group.group.env_ids
+    with group.group.trace(tmp_path / "run.json"):
+        steps = tokens.steps(env_ids, {"faulty-1": "sleep"})
+        group.step_async(steps)
+        group.collect_async(min_results=3)
+        time.sleep(0.01)
+    seen = Seen(tmp_path / "run.json")
+    (stuck,) = seen.called("step, unfinished")
+    assert stuck.track == "faulty-1"
+    (before,) = seen.of("faulty-0")
+    assert stuck.began >= before.ended
+    assert stuck.ended == max(one.ended for one in seen.slices)
+    assert stuck.ended >= stuck.began + 10_000_000
+    kill(group.get_workers()[0]["pid"])
+    with pytest.raises(WorkerDied):
+        group.collect_async(wait_all=True)
+
+
+@on_one_driver
+def test_a_worker_that_is_given_up_is_marked(start: Start, tmp_path: Path) -> None:
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
     with group.group.trace(tmp_path / "run.json"):
+        group.step_async(tokens.steps(group.group.env_ids))
+        group.collect_async(wait_all=True)
         group.step_async(tokens.steps(group.group.env_ids, {"faulty-3": "sleep"}))
-        group.collect_async(min_results=3)
-    (stuck,) = Seen(tmp_path / "run.json").called("step, not done")
-    assert stuck.track == "faulty-3"
-    with group.group.trace(tmp_path / "run.json"):
         kill(group.get_workers()[1]["pid"])
         with pytest.raises(WorkerDied):
             group.collect_async(wait_all=True)
-    assert ("given up", "worker") in marks(Seen(tmp_path / "run.json"))
+    assert ("given up", "faulty-2") in marks(Seen(tmp_path / "run.json"))

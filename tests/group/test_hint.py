@@ -41,14 +41,18 @@ def workers(count: int, together: int, **fields: object) -> list[HostRecord]:
 
 
 def spent(
-    records: list[HostRecord], step: float, computing: float | None = None, trainer: float = 0.0
+    records: list[HostRecord],
+    step: float,
+    computing: float | None = None,
+    trainer: float = 0.0,
+    times: int = 32,
 ) -> dict[str, float]:
-    """What sums grow by in 32 steps of each env, which take turns in their workers; in seconds."""
+    """What sums grow by in some steps of each env, which take turns in their workers."""
     envs = sum(len(record.slots) for record in records)
-    busy, queued = 32 * envs * step, 32 * (envs - len(records)) * step
-    found = {"results": 32 * envs, "seconds_in_envs": busy, "seconds_queued": queued}
-    found |= {"seconds_uncollected": 0.0, "seconds_idle": 32 * envs * trainer}
-    return found if computing is None else {**found, "seconds_computing": 32 * envs * computing}
+    busy, queued = times * envs * step, times * (envs - len(records)) * step
+    found = {"results": times * envs, "seconds_in_envs": busy, "seconds_queued": queued}
+    found |= {"seconds_uncollected": 0.0, "seconds_idle": times * envs * trainer}
+    return found if computing is None else {**found, "seconds_computing": times * envs * computing}
 
 
 def test_envs_that_share_workers_and_wait_get_a_hint() -> None:
@@ -97,7 +101,7 @@ def test_envs_that_compute_with_a_worker_each_get_a_hint(
     step: float, said: int | str, cores: int, wanted: str | None
 ) -> None:
     records = workers(6, 1, envs_per_process=said)
-    found = advice(records, spent(records, step * MS, step * MS), cores)
+    found = advice(records, spent(records, step * MS, step * MS, times=1000), cores)
     if wanted is None:
         assert found is None
     else:
@@ -118,11 +122,14 @@ def test_steps_that_cost_less_than_the_exchange_get_a_hint() -> None:
         (1, 1, 8, {"step_timeout": 5}, False),
     ):
         records = workers(count, together, **fields)
-        said = advice(records, spent(records, step / 1e6, step / 1e6), 2)
+        said = advice(records, spent(records, step / 1e6, step / 1e6, times=1000), 2)
         assert (said is not None and "placement: inline" in said) == wanted
 
 
 def test_few_results_are_no_reason() -> None:
+    records = workers(1, 1)
+    assert advice(records, spent(records, 0.01 * MS, times=1000), 2) is not None
+    assert advice(records, spent(records, 0.01 * MS, times=999), 2) is None
     records = workers(1, 2)
     numbers = spent(records, 10 * MS, MS)
     assert advice(records, numbers, 2) is not None

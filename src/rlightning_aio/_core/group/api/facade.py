@@ -16,7 +16,7 @@ from rlightning_aio._core.group.drivers.wait import this_process
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.conditions import NO_SPAN
-from rlightning_aio._core.group.timeline.trace import Trace
+from rlightning_aio._core.group.timeline import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction
 from rlightning_aio.registry import ENVS
@@ -392,9 +392,9 @@ class Facade:
         """Record a timeline of this group into a file that https://ui.perfetto.dev opens.
 
         Use ``with group.trace("run.json"):`` (or ``async with``), or `Trace.start` and
-        `Trace.stop`. The timeline shows steps and resets of each env, waits of workers and trainer,
-        the path of each request to its result, restarts, hangs and step limits: see
-        docs/metrics.md. `span` adds other work of the trainer.
+        `Trace.stop`. The timeline shows steps and resets of each env with the numbers of their
+        requests, the calls of the trainer, hangs and deaths: see docs/metrics.md. `span` adds other
+        work of the trainer.
 
         Args:
             path: of the file, in Chrome's trace event format (JSON). It is written when the
@@ -403,7 +403,7 @@ class Facade:
         Raises:
             OSError: the file can't be written.
         """
-        return Trace(self._core, path, self._traces, by_task=self._shares_thread)
+        return Trace(self._core, path, self._traces)
 
     def span(self, name: str) -> AbstractContextManager[Any]:
         """Add a slice to the timeline for other work: ``with group.span("learner"):``.

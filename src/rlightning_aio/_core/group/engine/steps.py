@@ -389,7 +389,6 @@ class Steps:
         collect returns them.
         """
         results, continuity, observer = self._results, self._continuity, self._observed.observer
-        noted = None if observer is None else observer.before_results(slots)
         try:
             parts = results.gather(slots)
             flagged: list[ResultColumns] = []
@@ -415,7 +414,7 @@ class Steps:
             self._requests.requeue(slots)
             raise
         if observer is not None:
-            observer.after_results(noted, parts)
+            observer.note_results(parts)
         if self._arrivals.held_back or self._sums.num_batches >= self._hint.due:
             self._note_returned(slots)
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()

@@ -8,15 +8,12 @@ The component that knows of a condition sets it and clears it; while any is set,
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
 
 from rlightning_aio.errors import GroupClosed, RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
-
-    import numpy as np
-    from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
 
@@ -122,12 +119,8 @@ class Observer(Protocol):
         """Record that an operation of the core has ended that was called at `began`."""
         ...
 
-    def before_results(self, slots: NDArray[np.intp]) -> Any:
-        """Record that results of `slots` are about to be returned, for `after_results`."""
-        ...
-
-    def after_results(self, noted: Any, parts: Sequence[ResultColumns]) -> None:
-        """Record that results were returned as `parts`; `noted` is from `before_results`."""
+    def note_results(self, parts: Sequence[ResultColumns]) -> None:
+        """Record that results are returned as `parts`."""
         ...
 
     def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:

@@ -101,7 +101,7 @@ class Sums:
     def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> None:
         """Count steps and resets of `slots` that end without a result; other requests don't."""
         own = slots[~self._requests.numbering.awaits_value(slots)]
-        self._sums[_FIRST_OUTCOME + _CODE_OF[kind], own] += 1
+        self._sums[_FIRST_OUTCOME + _CODE_OF[kind]] += self._counted(own)
 
     def _settle(self) -> None:
         """Add what is kept to the sums."""
@@ -113,9 +113,9 @@ class Sums:
         if ends:
             slots, flags, returns, lengths = map(np.concatenate, zip(*ends, strict=True))
             over, codes = _ended(flags, lengths)
-            np.add.at(self._sums, (_FIRST_OUTCOME + codes[over], slots[over]), 1)
+            self._add_outcomes(slots[over], codes[over])
             self._add_episodes(slots, over, returns, lengths)
-            np.subtract.at(self._sums[_STEPS], slots, flags[:, IS_RESET])
+            self._sums[_STEPS] -= self._counted(slots[flags[:, IS_RESET]])
 
     def _add_times(
         self, slots: Any, times: Any, sent: Any, taken: Sequence[int], widths: Sequence[int]
@@ -133,16 +133,26 @@ class Sums:
         before[own[first]] = asked[first]
         self._taken_ns[own] = returned
         self._sums[_IDLE] += self._taken_ns - before
+        self._sums[_RESULTS] += (counted := self._counted(own))
+        if {*widths} != {1}:
+            counted = self._counted(own, np.repeat(widths, lengths))
+        self._sums[_STEPS] += counted
         columns = {
-            _STEPS: np.repeat(widths, lengths),
-            _RESULTS: None,
             _IN_ENVS: busy,
             _QUEUED: np.maximum(done - busy - asked, 0),
             _UNCOLLECTED: returned - done,
             _IDLE: asked - returned,
         }
         for k, column in columns.items():
-            self._sums[k] += np.bincount(own, column, len(self._taken_ns))
+            self._sums[k] += self._counted(own, column)
+
+    def _counted(self, slots: NDArray[np.intp], weights: Any = None) -> NDArray[Any]:
+        """Return how often each slot is among `slots`, which may repeat, or the sum of weights."""
+        return np.bincount(slots, weights, len(self._taken_ns))
+
+    def _add_outcomes(self, slots: NDArray[np.intp], codes: NDArray[np.int64]) -> None:
+        for code in set(codes.tolist()):
+            self._sums[_FIRST_OUTCOME + code] += self._counted(slots[codes == code])
 
     def _add_episodes(
         self,
@@ -152,18 +162,18 @@ class Sums:
         lengths: NDArray[np.int64],
     ) -> None:
         """Add the episodes that are `over`, of the same shape as returns and lengths."""
-        own = slots[over.nonzero()[0]]  # A slot may repeat.
+        own = slots[over.nonzero()[0]]
+        self._sums[_EPISODES] += self._counted(own)
+        self._sums[_LENGTHS] += self._counted(own, lengths[over])
         with np.errstate(over="ignore", invalid="ignore"):  # The sums show them.
-            np.add.at(self._sums[_EPISODES], own, 1)
-            np.add.at(self._sums[_RETURNS], own, returns[over])
-            np.add.at(self._sums[_LENGTHS], own, lengths[over])
+            self._sums[_RETURNS] += self._counted(own, returns[over])
 
     def _add_reported(
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
         """Add the ends of episodes in any results, with the outcomes that `BatchedData` has."""
         resets = part.is_reset.reshape(len(part), -1).sum(axis=1)
-        np.subtract.at(self._sums[_STEPS], part.slots, resets)
+        self._sums[_STEPS] -= self._counted(part.slots, resets)
         over, codes = _ended(part.flags, lengths)
         if part.restarted is not None:
             over[part.restarted] = False
@@ -184,8 +194,7 @@ class Sums:
                         is_lost = part.restarted is not None and part.restarted[row]
                         # If the caller has ended it, `note_failures` has counted it.
                         over[row] &= not (is_lost and reported.kind == "cancelled")
-        slots = part.slots[over.nonzero()[0]]
-        np.add.at(self._sums, (_FIRST_OUTCOME + codes[over], slots), 1)
+        self._add_outcomes(part.slots[over.nonzero()[0]], codes[over])
 
     # -- what is asked ----------------------------------------------------------------
 

@@ -28,6 +28,8 @@ _TINY_US: Final = 30.0
 """Limit of steps that take less time than the way to a worker and back."""
 _ENOUGH_SECONDS: Final = 0.02
 _ENOUGH_RESULTS: Final = 16
+_MANY_RESULTS: Final = 1000
+"""Of short steps, which hardly matter to a program that ends soon."""
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -75,7 +77,8 @@ def advice(records: Sequence[HostRecord], spent: Mapping[str, float], num_cores:
     if results < _ENOUGH_RESULTS or busy <= 0:
         return None
     step_us = 1e6 * busy / results
-    if together == 1 and workers > num_cores and step_us < _BRIEF_US:
+    is_brief = results >= _MANY_RESULTS and step_us < _BRIEF_US
+    if together == 1 and workers > num_cores and is_brief:
         if config.envs_per_process != "auto":
             return None  # As its user wants it.
         return (
@@ -84,7 +87,7 @@ def advice(records: Sequence[HostRecord], spent: Mapping[str, float], num_cores:
             f"processes; to have envs share workers, set envs_per_process: "
             f"{-(-workers // num_cores)} (in VectorEnv, max_concurrency={num_cores})"
         )
-    if workers == 1 and together * step_us < _TINY_US and not records[0].limits:
+    if workers == 1 and together * step_us < _TINY_US and is_brief and not records[0].limits:
         return (
             f"its steps take {together * step_us:.0f} µs, less than the way to a worker and back; "
             "to have them in this process, set placement: inline"
