@@ -13,8 +13,6 @@ import functools
 import traceback
 from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
-import gymnasium.error
-
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
@@ -105,10 +103,10 @@ class PolicyServerError(RLightningError, ConnectionError):
     """A policy server is missing or silent, reports an error, or breaks its protocol."""
 
 
-class ResetNeeded(RLightningError, gymnasium.error.ResetNeeded):
-    """The episodes of a `Collector` were lost with a call that Ctrl-C has interrupted.
+class ResetNeeded(RLightningError):
+    """What is built on a group has lost its episodes with a call that was cut off, as by Ctrl-C.
 
-    It is Gymnasium's error of that name, too.
+    A vector environment raises it as Gymnasium's error of that name, too.
     """
 
 

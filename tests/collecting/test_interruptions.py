@@ -430,7 +430,7 @@ def test_a_collect_after_ctrl_c_asks_for_a_restart() -> None:
         collector = Collector(group, policy, num_transitions=24, min_results=4)
         with pytest.raises(KeyboardInterrupt):
             collector.collect()
-        for kind in (rl.ResetNeeded, gym.error.ResetNeeded):
+        for kind in (rl.ResetNeeded, RLightningError):
             with pytest.raises(kind, match=r"restart\(seed=…\)"):
                 collector.collect()
         collector.restart()

@@ -294,9 +294,11 @@ async def test_an_episode_tells_that_it_was_lost(place: dict[str, Any]) -> None:
         assert batch.observation.tolist() == [[2, 1, 1, 3]]
 
 
-@pytest.mark.parametrize("end", ["abort", "drain"])
+@pytest.mark.parametrize("end", [{"abort": ()}, {"drain": (0.01,)}], ids=["abort", "drain"])
 @pytest.mark.parametrize("what", ["step", "call"])
-async def test_an_episode_tells_that_another_task_has_aborted_it(what: str, end: str) -> None:
+async def test_an_episode_tells_that_another_task_has_aborted_it(
+    what: str, end: dict[str, tuple[float, ...]]
+) -> None:
     """It is over, and further steps of it are refused."""
     async with rl.build_env_group(entry()) as group, group.episode("e-0", seed=3) as episode:
         Scripted.gates["e-0"] = asyncio.Event()
@@ -304,7 +306,8 @@ async def test_an_episode_tells_that_another_task_has_aborted_it(what: str, end:
         asking = asyncio.ensure_future(asked)
         while not group.get_workers()[0]["owed"]:  # noqa: ASYNC110  # Twice.
             await asyncio.sleep(0)
-        await getattr(group, end)()
+        ((name, arguments),) = end.items()
+        await getattr(group, name)(*arguments)
         with pytest.raises(EpisodeLost, match=f"the {what} of env 'e-0'"):
             await asking
         assert episode.is_over

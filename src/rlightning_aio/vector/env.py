@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import ResetNeeded
+from gymnasium.error import ResetNeeded as GymnasiumResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio._core.group.api.sync import due_for_reset
@@ -21,7 +21,7 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import lost_rows, reported_infos
 from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.envs.wrappers import name_of
-from rlightning_aio.errors import BadAction, EnvFault, SnapshotError
+from rlightning_aio.errors import BadAction, EnvFault, ResetNeeded, SnapshotError
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
@@ -54,6 +54,10 @@ __all__ = ["VectorEnv", "per_worker"]
 T = TypeVar("T")
 _PATIENCE: Final = 1e6
 """Seconds that `reset` waits for what an interrupted call has left: time limits end it before."""
+
+
+class _ResetNeeded(ResetNeeded, GymnasiumResetNeeded):
+    """As both trees of errors have it."""
 
 
 class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_random` is a tuple.
@@ -354,7 +358,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
 
     def _check_whole(self) -> None:
         if not self._is_whole:
-            raise ResetNeeded(
+            raise _ResetNeeded(
                 "the results of the last call were lost, as it failed, timed out or was "
                 "interrupted; call reset() without a mask to begin new episodes"
             )
