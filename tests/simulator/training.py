@@ -352,9 +352,11 @@ class Evaluations(InContext):
 
     Attributes:
         calls_left: of the policy until it raises.
+        cut_off: the last one was cut off while it ended what it had sent, after an error.
     """
 
     calls_left = math.inf
+    cut_off = False
 
     def drawn_limit(self, rng: Random) -> float | None:
         """None is finite with envs that reset themselves, of which it cuts several at once."""
@@ -390,7 +392,7 @@ class Evaluations(InContext):
         if self.any_gone():
             return
         self.calls_left = rng.randint(0, 20) if rng.random() < 0.3 else math.inf
-        self.pressed = self.num_interrupts
+        self.pressed, self.cut_off = self.num_interrupts, False
         try:
             if singles and rng.random() < 0.6:
                 await self._queue(rng)
@@ -407,11 +409,15 @@ class Evaluations(InContext):
             require(given_up, "no env is left", repr(error))
             for env_id in given_up:
                 self.by_id[env_id].gone = True
+        except KeyboardInterrupt as interrupt:
+            self.cut_off = isinstance(interrupt.__context__, Exception)
+            raise
 
     async def settle(self) -> None:
-        """Check that an evaluation has left nothing, unless Ctrl-C was pressed twice."""
+        """Check that an evaluation has left nothing, unless its end was cut off itself."""
         if self.group.pending:
-            require(self.num_interrupts > self.pressed + 1, "left in flight", self.group.pending)
+            again = self.num_interrupts > self.pressed + 1
+            require(again or self.cut_off, "left in flight", self.group.pending)
             with contextlib.suppress(EnvFault):
                 await self.done(self.group.drain(1.0))
         for env_id in self.given_up():
@@ -426,7 +432,8 @@ class Evaluations(InContext):
         playing.cancel()
         try:
             return await playing
-        except asyncio.CancelledError:
+        except asyncio.CancelledError as cancelled:
+            self.cut_off = isinstance(cancelled.__context__, Exception)
             self.counts["evaluations cancelled"] += 1
 
     async def _number(self, rng: Random) -> None:

@@ -118,8 +118,10 @@ class PolicyPlay:
 
     def abandon(self) -> Procedure[None]:
         """End what was sent, after an error: the group is idle then."""
-        with contextlib.suppress(RLightningError):  # Of envs whose episodes are lost anyway.
-            yield partial(self._group.drain, _PATIENCE_SECONDS)
+        for _ in self._group.env_ids:  # Each call may raise what another env has met.
+            with contextlib.suppress(RLightningError):  # Its episode is lost anyway.
+                if self._group.pending:
+                    yield partial(self._group.drain, _PATIENCE_SECONDS)
 
     def close(self) -> None:
         """Delete the films of episodes that have no end."""
