@@ -1,4 +1,4 @@
-"""Envs that owe a result for a minute, and that nothing ends, are named in the log."""
+"""An env that owes a result for a minute, and that nothing ends, is named in the log."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def entry(gate: Any, **fields: Any) -> dict[str, Any]:
 def test_a_call_that_waits_says_for_whom(
     gate: Any, fields: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once for each entry, in a synchronous group."""
+    """Once, in a synchronous group."""
     with sync.build_env_group(entry(gate, **fields)) as group:
         batch, _ = group.reset()
         watch(group, monkeypatch)
