@@ -29,10 +29,11 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from kit.driven import without_times
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.group.timeline.trace import Trace
+from rlightning_aio._core.group.timeline import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.protocol import kernel
@@ -244,7 +245,7 @@ class Twins(RuleBasedStateMachine):
             self.traces = []
             return
         path = Path(self.folder.name) / "run.json"
-        self.traces = [Trace(group.core, path, [], by_task=False) for group in self.groups]
+        self.traces = [Trace(group.core, path, []) for group in self.groups]
         for trace in self.traces:
             trace.start()
 
@@ -273,7 +274,10 @@ class Twins(RuleBasedStateMachine):
         assert ordinary.in_flight == general.in_flight
         for name in ("num_ready", "num_awaited"):
             assert getattr(ordinary.collector, name) == getattr(general.collector, name), name
-        stats = [group.core.stats.by_env() for group in self.groups]
+        stats = [
+            {env_id: without_times(own) for env_id, own in group.core.sums.by_env().items()}
+            for group in self.groups
+        ]
         assert stats[0] == stats[1]
         active = [group.conditions.unusual & ~UNLIKE_ENVS for group in self.groups]
         assert active[0] == active[1]
