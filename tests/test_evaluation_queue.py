@@ -248,7 +248,7 @@ class AwaitableTasks:
 
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
 @pytest.mark.parametrize("nobodys", [False, True])
-def test_each_suspect_is_charged_an_attempt_where_no_env_is_at_fault(
+def test_all_that_waited_are_charged_an_attempt_where_no_env_is_at_fault(
     tmp_path: Path, nobodys: bool, on_worker_death: str
 ) -> None:
     """Of awaitable envs that share a worker, only the one whose code ran, or all that waited."""

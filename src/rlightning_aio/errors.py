@@ -239,16 +239,13 @@ class WorkerDied(EnvFault):
     """The process of an env ended unexpectedly.
 
     One such error answers the requests of all its ``env_ids``. Its ``env_id`` is the env that the
-    process was executing. Of awaitable envs that share a process, all may have been waiting: then
-    there are `suspects`, and the first of them is ``env_id``.
+    process was executing, or the first of the process if it executed none.
 
     Attributes:
         exit_code: of the process; negative for a signal; None if unknown.
         stderr_tail: the end of what it wrote to stdout, then of what it wrote to stderr.
         env_ids: the envs whose requests this error answers: outstanding ones, or new ones that it
             refuses.
-        suspects: the envs that owed a reply to a process in which no env's code was running; empty
-            if one was.
     """
 
     def __init__(self, message: str, *, env_id: str) -> None:
@@ -256,7 +253,6 @@ class WorkerDied(EnvFault):
         self.exit_code: int | None = None
         self.stderr_tail = ""
         self.env_ids: tuple[str, ...] = ()
-        self.suspects: tuple[str, ...] = ()
 
 
 class EnvHung(WorkerDied):

@@ -19,6 +19,7 @@ __all__ = [
     "Outcome",
     "OutcomeKind",
     "TimeSpent",
+    "bystanders",
     "is_bystanders",
     "own_end",
 ]
@@ -106,9 +107,17 @@ class Outcome:
         return found
 
 
+_ELSEWHERE: Final = " (while it executed "
+
+
+def bystanders(cause: str, at_fault: str, env_id: str) -> Outcome:
+    """Return the outcome of an env whose worker died while it executed another one, `at_fault`."""
+    return Outcome("env_died", "infrastructure", f"{cause}{_ELSEWHERE}{at_fault})", env_id)
+
+
 def is_bystanders(outcome: Outcome) -> bool:
-    """Return True if another env of the worker is to blame, so it says nothing about this one."""
-    return outcome.kind == "env_died" and outcome.blame == "infrastructure"
+    """Return True if another env of the worker was executed, so it says nothing about this one."""
+    return outcome.kind == "env_died" and _ELSEWHERE in outcome.cause
 
 
 def own_end(
@@ -138,22 +147,19 @@ class Loss(NamedTuple):
         kind: of the outcome of the env at fault.
         blame: likewise.
         at_fault: the id of the env that was executing; None if unknown.
-        suspects: without one, ids of those that may be the cause.
     """
 
     cause: str
     kind: OutcomeKind
     blame: Blame
     at_fault: str | None = None
-    suspects: tuple[str, ...] = ()
 
     def concerns(self, env_id: str) -> bool:
         """Return True if an env itself may be at fault, and not another one of its worker."""
-        return env_id in self.suspects if self.suspects else self.at_fault in (None, env_id)
+        return self.at_fault in (None, env_id)
 
     def outcome(self, env_id: str) -> Outcome:
         """The outcome of the episode that an env has lost; see `is_bystanders`."""
         if self.concerns(env_id):
             return Outcome(self.kind, self.blame, self.cause, env_id)
-        cause = f"{self.cause} (while it executed {self.at_fault})"
-        return Outcome("env_died", "infrastructure", cause, env_id)
+        return bystanders(self.cause, str(self.at_fault), env_id)

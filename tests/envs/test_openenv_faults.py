@@ -43,11 +43,6 @@ def chosen(env_ids: list[str], which: set[int]) -> list[str]:
     return [env_ids[k] for k in sorted({k % len(env_ids) for k in which})] if env_ids else []
 
 
-def no_pause(losses: int) -> float:
-    del losses
-    return 0.0
-
-
 class Patience:
     """In place of `TimeLimit`: the time of a request is up when the test says so."""
 
@@ -253,7 +248,6 @@ class Machine(RuleBasedStateMachine):
 def test_whatever_a_server_does_each_request_ends_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No reply answers another request, no action runs twice, no slot leaks, all envs recover."""
     monkeypatch.setattr(awaited_envs, "TimeLimit", Patience)
-    monkeypatch.setattr(awaited_envs, "restart_pause", no_pause)
     monkeypatch.setattr(openenv_session, "_KEEPALIVE_SECONDS", 0.002)
     monkeypatch.setattr(openenv_session, "_PAUSE_SECONDS", (0.001, 0.01))
     steps = int(os.environ.get("RLIGHTNING_AIO_STEPS", "20"))

@@ -177,6 +177,6 @@ def test_a_replacement_that_raises_hides_no_death(build: Any) -> None:
     group = build(entry(task=Particular, num_workers=1))
     group.init()
     group.reset(options={"deed": GO})
-    with pytest.raises(rl.EnvRaised, match="its worker exited with code 3") as caught:
+    with pytest.raises(rl.EnvRaised, match="its worker or env exited with code 3") as caught:
         step(group, DIE)
     assert said(caught.value.outcome) == ("env_died", "env", "f-0")

@@ -10,7 +10,7 @@ from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.hosts.messages import Faulted, Withdrawn
+from rlightning_aio._core.hosts.messages import Lost, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     EnvBusy,
@@ -20,6 +20,7 @@ from rlightning_aio.errors import (
     NothingPending,
     WorkerDied,
 )
+from rlightning_aio.outcomes import Loss
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -312,25 +313,58 @@ def test_a_restore_is_one_request(new_group: NewGroup) -> None:
     assert len(group.hosts[0].asked) == num_asked + 2
 
 
-@pytest.mark.parametrize("kind", [Faulted, Withdrawn])
 def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
-    new_group: NewGroup, kind: type[Any]
+    new_group: NewGroup,
 ) -> None:
-    """Whatever ended the request that was to report its loss."""
+    """The request that was to report its loss ended without a result."""
     group = new_group(1, 1)
     run(group, group.core.reset(group.now, None, None, None))
     die(group, 0)
     stepping = group.begin(group.steps.step(steps(0), group.now))
     host, entry = group.hosts[0], group.core.requests.numbering.entry.item(0)
     host.waiting.clear()
-    fault = EnvHung("it hangs", env_id="fake-0")
-    host.answer(Faulted(0, entry, fault) if kind is Faulted else Withdrawn(0, entry))
+    host.answer(Withdrawn(0, entry))
     group.turn()
     with pytest.raises(EnvFault):
         stepping.result()
     batch, _ = run(group, group.core.reset(group.now, None, None, None))
     assert batch.ids() == ["fake-0", "fake-1"]
     assert not batch.restarted.any()
+
+
+def test_one_env_of_a_host_can_be_lost(new_group: NewGroup) -> None:
+    """Its request is sent again as a reset that reports it; those of others go on."""
+    group = new_group(2, max_restarts=1)
+    run(group, group.core.reset(group.now, None, None, None))
+    why = Loss("hung", "env_hung", "env", "fake-0")
+    host = group.hosts[0]
+    for turn in range(2):
+        stepping = group.begin(group.steps.step(steps(0, 1), group.now))
+        entry = group.core.requests.numbering.entry.item(0)
+        del host.waiting[0]
+        host.answer(Lost(0, 0, why, entry, "it hangs"))
+        group.turn()
+        group.finish(1)
+        if turn:
+            with pytest.raises(EnvHung, match="it hangs; it is not replaced after 1 restarts"):
+                stepping.result()
+            continue
+        group.finish(0)
+        batch, _ = stepping.result()
+        assert batch.restarted.tolist() == batch.is_reset.tolist() == [True, False]
+    batch, _ = run(group, group.steps.step(steps(0, 1), group.now))
+    assert batch.restarted.tolist() == [True, False]
+    stepping = group.begin(group.core.calls.call_one(group.now, 0, ("get", (), {})))
+    entry = group.core.requests.numbering.entry.item(0)
+    host.waiting.clear()
+    host.answer(Lost(0, 0, why, entry, "it hangs"))
+    group.turn()
+    with pytest.raises(EnvHung):
+        stepping.result()
+    host.answer(Lost(0, 1, why))  # Idle.
+    group.turn()
+    batch, _ = run(group, group.steps.step(steps(0, 1), group.now))
+    assert batch.restarted.tolist() == [True, True]
 
 
 @pytest.mark.parametrize("ordinary", [True, False])

@@ -306,7 +306,7 @@ def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet
 
 
 def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -> None:
-    """It says so while all envs wait. Once it stops, it is killed, and any of them is suspected."""
+    """It says so while all envs wait. Once it stops, it is killed, and nobody is named."""
     ours = fleet((3,), awaits=True, step_timeout=5.0)
     ours.ask(0, 2)
     for _ in range(3):
@@ -316,11 +316,11 @@ def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -
         ours.check()
     assert ours.log == []
     loss = ended_as_hung(ours)
-    assert loss.why[3:] == (None, ("fake-0", "fake-2"))
+    assert loss.why[2:] == ("infrastructure", None)
     assert loss.death.cause == "hung and was killed"
     error = loss.error(loss.owed)
     assert isinstance(error, EnvHung)
-    assert (error.env_id, error.suspects) == ("fake-0", ("fake-0", "fake-2"))
+    assert error.env_id == "fake-0"
     assert "no env's code was running; envs that owed a reply: fake-0, fake-2" in str(error)
 
 
@@ -335,7 +335,7 @@ def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Flee
     ours.check()
     assert ours.log == []
     loss = ended_as_hung(ours)
-    assert loss.why[3:] == ("fake-2", ())
+    assert loss.why[3:] == ("fake-2",)
     assert loss.death.cause == "hung in a step and was killed"
 
 
@@ -429,85 +429,57 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
 # -- deaths
 
 
-def test_a_worker_of_one_env_has_no_suspects(fleet: Callable[..., Fleet]) -> None:
-    """Nor has one that owed nothing."""
+def test_nobody_is_to_blame_where_several_envs_waited(fleet: Callable[..., Fleet]) -> None:
+    """The only env of a worker is, also while it waits."""
     ours = fleet((1, 2), awaits=True)
     losses = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
-    found = [v.why[3:] for v in losses if v]
-    assert found == [("fake-0", ()), (None, ())]
+    found = [v.why[2:] for v in losses if v]
+    assert found == [("env", "fake-0"), ("infrastructure", None)]
 
 
-def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None:
-    """A completed step of a suspect clears it."""
+def test_deaths_of_nobody_are_counted_until_any_env_completes_a_step(
+    fleet: Callable[..., Fleet],
+) -> None:
     ours = fleet((2,), awaits=True, max_restarts=2)
-    for _ in range(2):
+    for turn in range(4):
         ours.ask(0, 1)
         assert is_replaced(ours.die(0, 0))
         if ours.supervisor.next_check() is not None:
             ours.wait()
         for slot in (0, 1):  # Resets, which prove nothing.
             ours.reply(slot)
-    ours.ask(0)
-    ours.reply(0)
-    ours.ask(0)
-    assert is_replaced(ours.die(0, 0))
-    ours.reply(0)
-    ours.ask(1)
-    loss = ours.die(0, 0)
-    assert is_given_up(loss)
-    assert "after 2 restarts in a row" in str(loss.error(loss.owed))
+        if turn == 1:
+            ours.ask(1)
+            ours.reply(1)
+    ours.ask(0, 1)
+    assert is_given_up(ours.die(0, 0))
 
 
 @pytest.mark.parametrize("later", [False, True])
-def test_a_shortage_of_half_a_minute_costs_no_restarts(
+def test_a_start_that_the_system_refuses_is_one_more_death(
     fleet: Callable[..., Fleet], later: bool
 ) -> None:
-    """Attempts become rarer, other hosts continue, and only then it counts as a death."""
-    ours = fleet(max_restarts=2)
+    """With the same pauses; of another worker, nothing is delayed."""
+    ours = fleet(max_restarts=3)
     ours.hosts[0].refusals, ours.hosts[0].refused_later = math.inf, later
     ours.ask(0, 1)
     ours.die(0)
     assert is_replaced(ours.losses[0])
-    pauses = []
-    for _ in range(10):
+    pauses: list[float] = []
+    while not is_given_up(ours.losses[-1]):
         ours.reply(1)
         ours.ask(1)
         ours.now += 1e-3
-        ours.check()
         pauses.append(round(ours.wait() + 1e-3, 6))
-    assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0, 5.0]
-    attempts = 11 if later else 0
-    assert len(ours.losses) == 1 + attempts + 1, "the last attempt was one too many"
-    assert ours.losses[-1] is None, "a replacement that was never up owes nothing"
-    assert round(ours.wait(), 6) == 0.1, "this must be the second restart in a row"
+    assert pauses == [0.1, 0.2]
     loss = ours.losses[-1]
-    assert is_given_up(loss)
+    assert loss is not None
     assert loss.owed.tolist() == [0]
+    assert (loss.why.kind, loss.why.blame) == ("not_started", "infrastructure")
     error = str(loss.error(loss.owed))
-    why = "it could not be forked: no more processes" if later else "no more processes"
-    assert f"could not be replaced: can't start a worker for entry 'fake': {why}" in error
-    assert "after 2 restarts in a row" in error
+    assert "no more processes" in error
+    assert "after 3 restarts in a row" in error
     assert ours.requests.in_flight == [0, 1]
-    assert ours.supervisor.next_check() is None
-
-
-@pytest.mark.parametrize("later", [False, True])
-def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet], later: bool) -> None:
-    """A replacement that could be started ends the previous shortage."""
-    ours = fleet(max_restarts=1)
-    ours.hosts[0].refused_later = later
-    for _ in range(3):
-        ours.hosts[0].refusals = math.inf
-        (entry,) = ours.ask(0)
-        ours.die(0, entry)
-        while ours.now < ours.supervisor.records[0].refused_since + 20:
-            ours.wait()
-        ours.hosts[0].refusals = 0
-        ours.wait()
-        ours.reply(0)
-        ours.ask(0)
-        ours.reply(0)
-    assert ours.supervisor.records[0].restarts == 3
 
 
 def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
@@ -545,7 +517,7 @@ def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     ours.wait()
     assert ours.hosts[0].asked == [entry, *asked]
     assert ours.requests.in_flight == [2, 0]
-    assert [type(loss) for loss in ours.losses] == [HostLoss, type(None)]
+    assert [type(loss) for loss in ours.losses] == [HostLoss, *[type(None)] * 3]
     # The time begins when the replacement is up: until then it had nothing to execute.
     ours.check()
     assert ours.log[-2:] == ["start 0", "attach 0"]

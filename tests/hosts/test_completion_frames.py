@@ -13,7 +13,6 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
-    Faulted,
     Lost,
     NewSchema,
     NotBuilt,
@@ -55,6 +54,7 @@ def sent(completion: Completion, host_id: int = 5) -> Completion:
         Value(5, CALL, {"x": 1}),
         Raised(5, STEP, ERROR),
         Lost(5, 2, Loss("hung in a step", "env_hung", "either", "one-0")),
+        Lost(5, 2, Loss("hung", "env_hung", "either", "one-0"), STEP, "env 'one-0' took too long"),
         Closed(5, [(1, ERROR)]),
     ],
     ids=lambda completion: type(completion).__name__,
@@ -65,26 +65,13 @@ def test_a_completion_arrives_as_it_was(completion: Completion) -> None:
     assert sent(completion._replace(host_id=0)) == completion
 
 
-@pytest.mark.parametrize("restarted", [None, Loss("hung in a step", "env_hung", "either", "one-0")])
-def test_what_is_out_of_band_stays_pickled(restarted: Loss | None) -> None:
+def test_what_is_out_of_band_stays_pickled() -> None:
     """Whoever collects the result reads it."""
-    arrived = sent(Result(5, STEP, {"info": {"a": 1}}, restarted=restarted))
+    arrived = sent(Result(5, STEP, {"info": {"a": 1}}))
     assert isinstance(arrived, Result)
     assert isinstance(arrived.out_of_band, bytes)
-    out_of_band = pickle.loads(arrived.out_of_band)
-    assert arrived._replace(out_of_band=out_of_band) == (
-        *(5, STEP, {"info": {"a": 1}}),
-        *(False, restarted),
-    )
-
-
-def test_an_error_of_the_package_arrives_as_its_class() -> None:
-    """It says which env hung, and if it is for good."""
-    arrived = sent(Faulted(5, STEP, FAULT, for_good=True))
-    assert isinstance(arrived, Faulted)
-    assert isinstance(arrived.fault, EnvHung)
-    assert (arrived.host_id, arrived.entry, arrived.for_good) == (5, STEP, True)
-    assert arrived.fault.env_id == "one-0"
+    assert pickle.loads(arrived.out_of_band) == {"info": {"a": 1}}
+    assert (arrived.host_id, arrived.entry, arrived.is_loss) == (5, STEP, False)
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
 
 MARKS = {"worker_restarted", "client_lost"}
-AGAIN = " (in the reset after its env "
-"""So goes on what is raised in the reset of an awaitable env that hung before."""
+AGAIN = ", and was replaced)"
+"""So goes on what is said of an exception in a reset that was to report a loss."""
 COLLECTOR = "collector"
 """Owner of the requests whose results a collect returns."""
 
@@ -653,7 +653,7 @@ class Model:
             is_replaced = env.entry.on_death != "raise" or env.host.aborted
             require(is_replaced, "marked, where a death is to be raised")
         self.judge_heads(row)
-        self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
+        self._judge_blame(env, row.info.get("env_at_fault"))
         again = [Request("reset")]
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
@@ -675,22 +675,17 @@ class Model:
         self.counts["died while idle"] += was_idle
         self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
 
-    def _judge_blame(self, env: Env, at_fault: str | None, suspects: Sequence[str]) -> None:
+    def _judge_blame(self, env: Env, at_fault: str | None) -> None:
         """Check who is said to have ended the worker of an env."""
         host = env.host
-        named = [*suspects] if at_fault is None else [at_fault, *suspects]
-        for env_id in named:
-            own = env_id in self.envs and self.envs[env_id].host is host
-            require(own, "a stranger is blamed", env_id)
-        if suspects:
-            require(at_fault is None, "at fault, and others are suspects", at_fault, suspects)
-            together = [one for one in self.envs.values() if one.host is host]
-            waits = env.entry.form == "awaitable" and len(together) > 1
-            require(waits, "suspects, and one env's code must have been running", suspects)
-        self.counts["suspects"] += bool(suspects)
+        together = [one for one in self.envs.values() if one.host is host]
+        if at_fault is not None:
+            own = at_fault in self.envs and self.envs[at_fault].host is host
+            require(own, "a stranger is blamed", at_fault)
         if self.calm and host.knows and not (host.struck or env.torn):
-            deadly = at_fault is not None and self.envs[at_fault].deadly
-            require(deadly, "an innocent env is blamed, or none", at_fault, suspects)
+            waits = env.entry.form == "awaitable" and len(together) > 1
+            deadly = waits if at_fault is None else self.envs[at_fault].deadly
+            require(deadly, "an innocent env is blamed, or none", at_fault)
 
     # -- errors
 
@@ -788,7 +783,7 @@ class Model:
         self, env: Env, request: Request, fault: EnvRaised, raising: list[Act]
     ) -> None:
         """Check an exception that is one of those that an env was to raise."""
-        found = fault.exception_text.partition(AGAIN)[0]
+        found = fault.exception_text
         likely = [act for act in raising if raised_text(*act) == found]
         effect, token = (likely or raising)[0]
         check_raised(fault, effect, token)
@@ -796,10 +791,9 @@ class Model:
             check_outcome(fault, request, effect, token)
         if request.resets:  # An awaitable env that hangs after that is reset like this again.
             env.state.begun = request.seed, request.options
-        elif AGAIN in fault.exception_text:
+        elif AGAIN in str(fault):  # The loss is still to be reported.
             begun, env.state = env.state.begun, env.fresh()
             env.state.begun, env.loose = begun, []
-            env.seen = min(env.seen + 1, env.deaths)
         self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
 
     def _may_be_rebuilt(self, env: Env, request: Request) -> bool:
@@ -819,9 +813,6 @@ class Model:
         """Check an error that says that an env's worker has ended for good, or during a call."""
         host, entry = env.host, env.entry
         require(host.mortal and env.may_be_lost, "dead, and nothing has died", repr(fault))
-        if fault.suspects:
-            require(fault.env_id == fault.suspects[0], "another suspect", repr(fault))
-            self._judge_blame(env, None, fault.suspects)
         hung = isinstance(fault, EnvHung)
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind in ("call", "restore")
@@ -851,7 +842,7 @@ def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
         "ctrl-c": ("KeyboardInterrupt", EnvRaised),
     }[effect]
     text = raised_text(effect, token)
-    found = fault.exception_text.partition(AGAIN)[0]
+    found = fault.exception_text
     require(found == text, "another error", fault.exception_text, text)
     require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
     require(isinstance(fault, builtin), "another class", type(fault))

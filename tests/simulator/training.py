@@ -232,6 +232,8 @@ class Training(InContext):
             return
         dead = {id(env.host) for env in self.envs if env.gone}
         own = {id(self.by_id[env_id].host) for env_id in fault.env_ids}
+        if fault.exit_code is None:  # An awaitable env that is given up alone.
+            own = {id(self.by_id[env_id]) for env_id in fault.env_ids}
         left = any(id(env.host) not in dead | own for env in self.envs)
         needs_all = "wait_all" in self.options or self.begins
         again = not own.isdisjoint(self.raised_deaths)

@@ -27,7 +27,6 @@ __all__ = [
     "moved",
 ]
 
-_RATE = re.compile(r"\d{1,9}/(minute|hour|day)")
 MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
 """Backends whose `env_kwargs` go to `gymnasium.make`."""
 
@@ -100,9 +99,8 @@ class EnvConfig(_Fields):
     on_env_error: Literal["raise", "restart"] = "raise"
     """Reaction to an exception of an env's `reset` or `step`: raise it, or close and rebuild the
     env and begin another episode, whose first result is marked like that of a replaced worker."""
-    max_restarts: Annotated[int, Field(ge=0)] | str = 3
-    """Number of restarts in a row, without a step in between, before giving up; or that of a worker
-    and its envs within a ``minute``, ``hour`` or ``day``, such as ``"10/hour"``."""
+    max_restarts: int = Field(default=3, ge=0)
+    """Number of restarts in a row, without a completed step in between, before giving up."""
     imports: tuple[str, ...] = Field(default=(), strict=False)
     """Modules imported in the worker before the env is built."""
     interpreter: str | None = None
@@ -147,13 +145,6 @@ class EnvConfig(_Fields):
             return tuple(makers)
         text = as_text(cast("object", task))
         raise ValueError(f"should be a name, a callable or a list of callables, got {text}")
-
-    @field_validator("max_restarts")
-    @classmethod
-    def _know_rates(cls, max_restarts: int | str) -> int | str:
-        if isinstance(max_restarts, str) and not re.fullmatch(_RATE, max_restarts):
-            raise ValueError(f"should be a number or look like '10/hour', got {max_restarts!r}")
-        return max_restarts
 
     @field_validator("env_vars", mode="before")
     @classmethod

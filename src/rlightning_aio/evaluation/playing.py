@@ -19,7 +19,7 @@ import numpy as np
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.errors import EnvFault, RLightningError, WorkerDied
-from rlightning_aio.outcomes import Outcome, own_end
+from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
 if TYPE_CHECKING:
@@ -323,10 +323,9 @@ class PolicyPlay:
 
     def _note_fault(self, fault: EnvFault) -> None:
         """Note the episodes that an error ended; envs that are not replaced leave."""
-        struck, blamed = {fault.env_id}, {fault.env_id}
+        struck, is_named = {fault.env_id}, fault.outcome.blame != "infrastructure"
         if isinstance(fault, WorkerDied):
             self._queue.fault = fault
-            blamed.update(fault.suspects)
             # The env at fault may be another one, whose own request a replacement answers.
             struck = {*fault.env_ids}
             self._queue.players.refresh()
@@ -335,8 +334,8 @@ class PolicyPlay:
         # A ready result of an env that is gone can still be collected.
         for env_id in (struck | gone) - self._pending:
             outcome = replace(fault.outcome, env_id=env_id)
-            if env_id not in blamed:
-                outcome = replace(outcome, kind="env_died", blame="infrastructure")
+            if is_named and env_id != fault.env_id:
+                outcome = bystanders(outcome.cause, fault.env_id, env_id)
             self._begun.discard(env_id)
             self._lose(env_id, outcome)
         for env_id in gone:

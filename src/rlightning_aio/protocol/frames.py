@@ -34,10 +34,8 @@ class FrameKind(IntEnum):
     INFO_SCHEMA = 10  # worker; the schema's number: a new schema of infos
     CLOSE = 11  # trainer
     CLOSED = 12  # worker: errors of close(), by env
-    RESTARTED = 13  # worker; the request's entry: why its env was rebuilt, and as for RESULT
-    FAULTED = 14  # worker; the request's entry: an error of this package, and if it is for good
-    ABORT = 15  # trainer; the request's entry
-    LOST = 16  # worker; index of an env: why its episode is lost
+    ABORT = 13  # trainer; the request's entry
+    LOST = 14  # worker; index of an env: why it is gone, and the entry of its request
 
 
 class Frame(NamedTuple):

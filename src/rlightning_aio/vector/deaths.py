@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Stepped", "with_deaths"]
 
-_CAUSE: Final = ("worker_restarted", "env_at_fault", "suspects", "outcome")
+_CAUSE: Final = ("worker_restarted", "env_at_fault", "outcome")
 """Keys of an info that say why its env was restarted, and who was at fault."""
 
 

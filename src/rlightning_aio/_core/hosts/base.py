@@ -141,7 +141,7 @@ class Host(Protocol):
             arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
                 reset, (name, args, kwargs) of a call. None: they are in the rows.
 
-        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Faulted` or
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Lost` or
         `Withdrawn`, with the same entry; or the host's `Died` for all.
         """
         ...

@@ -16,7 +16,6 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
-    Faulted,
     Lost,
     NewSchema,
     NotBuilt,
@@ -70,14 +69,7 @@ def _encoded_result(result: Result) -> tuple[FrameKind, int, bytes]:
     payload = result.out_of_band
     if type(payload) is not bytes:
         payload = dumped(payload, "the result")
-    if result.restarted is not None:
-        return FrameKind.RESTARTED, result.entry, pickle.dumps((result.restarted, payload))
     return FrameKind.RESULT, result.entry, payload
-
-
-def _decoded_restart(host_id: int, number: int, payload: bytes) -> Result:
-    cause, out_of_band = pickle.loads(payload)
-    return Result(host_id, number, out_of_band, restarted=cause)
 
 
 _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
@@ -88,8 +80,7 @@ _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
     Result: _encoded_result,
     Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
     Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
-    Faulted: lambda it: (FrameKind.FAULTED, it.entry, pickle.dumps((it.fault, it.for_good))),
-    Lost: lambda it: (FrameKind.LOST, it.env_index, pickle.dumps(it.why)),
+    Lost: lambda it: (FrameKind.LOST, it.env_index, pickle.dumps(it[2:])),
     Closed: lambda it: (FrameKind.CLOSED, 0, pickle.dumps(it.errors)),
 }
 """By the class of a completion: kind, number and payload of its frame."""
@@ -104,11 +95,9 @@ _DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
         host, number, pickle.loads(payload)
     ),
     FrameKind.RESULT: Result,
-    FrameKind.RESTARTED: _decoded_restart,
     FrameKind.VALUE: lambda host, entry, payload: Value(host, entry, pickle.loads(payload)),
     FrameKind.ERROR: lambda host, entry, payload: Raised(host, entry, pickle.loads(payload)),
-    FrameKind.FAULTED: lambda host, entry, payload: Faulted(host, entry, *pickle.loads(payload)),
-    FrameKind.LOST: lambda host, index, payload: Lost(host, index, pickle.loads(payload)),
+    FrameKind.LOST: lambda host, index, payload: Lost(host, index, *pickle.loads(payload)),
     FrameKind.CLOSED: lambda host, _, payload: Closed(host, pickle.loads(payload)),
 }
 """By the kind of a frame: its completion, of a host, a number and a payload."""

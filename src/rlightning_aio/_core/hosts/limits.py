@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from typing import TYPE_CHECKING, Final, Literal
 
 from rlightning_aio.outcomes import Loss
@@ -13,7 +12,6 @@ if TYPE_CHECKING:
 
 __all__ = ["RestartPolicy", "hung", "limits_of", "restart_pause"]
 
-_SECONDS: Final = {"minute": 60.0, "hour": 3600.0, "day": 86400.0}
 _FIRST_SECONDS: Final = 0.1
 _LONGEST_SECONDS: Final = 5.0
 
@@ -50,47 +48,32 @@ class RestartPolicy:
     Args:
         config: of the entry.
         field: of the entry, says whether any is borne: ``on_worker_death`` or ``on_env_error``.
-        done: the participle of what follows a loss: "replaced", "rebuilt" or "restarted".
-        times: of the restarts that count for the rate of ``max_restarts``, where it is one.
+        done: the participle of what follows a loss: "replaced" or "restarted".
 
     Attributes:
-        raises: no loss is borne; times: as given.
+        raises: no loss is borne.
     """
 
     def __init__(
-        self,
-        config: EnvConfig,
-        field: Literal["on_worker_death", "on_env_error"],
-        done: str,
-        times: deque[float] | None = None,
+        self, config: EnvConfig, field: Literal["on_worker_death", "on_env_error"], done: str
     ) -> None:
         self.raises = getattr(config, field) == "raise"
         self._field = field
-        most, _, self._unit = str(config.max_restarts).partition("/")
-        self._most = int(most)
+        self._most = config.max_restarts
         self._done = done
-        self.times: deque[float] = deque() if times is None else times
 
-    def count(self, losses: int, now: float, *, pauses: bool = True) -> tuple[bool, str]:
+    def count(self, losses: int, *, pauses: bool = True) -> tuple[bool, str]:
         """Return True if a restart follows a loss, and say in a clause what follows.
 
         Args:
             losses: in a row, this one included.
-            now: monotonic seconds.
             pauses: a restart waits for `restart_pause`.
         """
         if self.raises:
             return False, f"{self._field} is 'raise', so it is not {self._done}"
-        count, span = losses, "in a row"
-        if self._unit:
-            while self.times and self.times[0] <= now - _SECONDS[self._unit]:
-                self.times.popleft()
-            count, span = len(self.times) + 1, f"within the last {self._unit}"
-        if count > self._most:
-            text = f"it is not {self._done} after {count - 1} restarts {span} (max_restarts)"
+        if losses > self._most:
+            text = f"it is not {self._done} after {losses - 1} restarts in a row (max_restarts)"
             return False, text
-        if self._unit:
-            self.times.append(now)
         pause = restart_pause(losses) if pauses else 0.0
-        text = f"restart {count} of {self._most} {span}" + (f", in {pause:g} s" if pause else "")
-        return True, text
+        after = f", in {pause:g} s" if pause else ""
+        return True, f"restart {losses} of {self._most} in a row{after}"

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.errors import EnvFault
     from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -45,7 +44,6 @@ __all__ = [
     "EnvStarted",
     "EnvState",
     "ErrorText",
-    "Faulted",
     "Joined",
     "Lost",
     "NewSchema",
@@ -240,15 +238,12 @@ class Result(NamedTuple):
 
     Attributes:
         is_loss: the result is not from the env, but marks that it is gone.
-        restarted: why the env was rebuilt, if it was: the result is the first of a new episode,
-            and the previous episode is lost.
     """
 
     host_id: int
     entry: int
     out_of_band: bytes | OutOfBand
     is_loss: bool = False
-    restarted: Loss | None = None
 
 
 class Value(NamedTuple):
@@ -267,25 +262,19 @@ class Raised(NamedTuple):
     error: ErrorText
 
 
-class Faulted(NamedTuple):
-    """A request ended in an error of ours, not of the env.
+class Lost(NamedTuple):
+    """One env of a host that goes on is gone; the next request makes another.
 
     Attributes:
-        for_good: no request reaches the env any more.
+        entry: of the request that it leaves without an answer; 0 if it was idle.
+        message: what has happened to it, for an error.
     """
-
-    host_id: int
-    entry: int
-    fault: EnvFault
-    for_good: bool = False
-
-
-class Lost(NamedTuple):
-    """An env was rebuilt to answer a call: its episode is lost, and the call begins no other."""
 
     host_id: int
     env_index: int
     why: Loss
+    entry: int = 0
+    message: str = ""
 
 
 class Withdrawn(NamedTuple):
@@ -315,7 +304,7 @@ class Joined(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Faulted | Lost | Withdrawn | Joined
+    | Reported | Result | Value | Raised | Lost | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

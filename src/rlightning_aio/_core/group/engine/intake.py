@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio._core.group.episodes.continuity import Report
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.supervision.fault_messages import without_terminal
 from rlightning_aio._core.hosts.messages import (
@@ -21,7 +20,6 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Died,
     ErrorText,
-    Faulted,
     Joined,
     Lost,
     NewSchema,
@@ -85,7 +83,6 @@ class Intake:
             Result: self._on_result,
             Value: self._on_value,
             Raised: self._on_raised,
-            Faulted: self._on_faulted,
             Lost: self._on_lost,
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
@@ -117,13 +114,8 @@ class Intake:
             self._results.keep(slot, completion.out_of_band)
         if completion.is_loss:
             self._results.mark_away(slot)
-        if completion.restarted is not None:
-            self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
-            self._results.mark_restarted(Report(slot, completion.restarted))
         if self._conditions.unusual:
-            self._note_answered(
-                self._requests.alone(slot), by_reset=completion.restarted is not None
-            )
+            self._note_answered(self._requests.alone(slot))
 
     def _on_value(self, completion: Value) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
@@ -152,16 +144,16 @@ class Intake:
         if self._requests.numbering.op(slot) == Operation.RESTORE:  # It is in no known state.
             self._continuity.lose([slot], _not_restored(fault))
             return fault
-        if not self._supervisor.env_errors.ends_env(slot, error):
+        if not self._supervisor.losses.ends_env(slot, error):
             return fault
         kind, blame = fault.outcome.kind, fault.outcome.blame
         why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
         self._continuity.lose([slot], why)
-        return None if self._supervisor.env_errors.count_restart(slot, error, fault) else fault
+        return None if self._supervisor.losses.count_restart(slot, error, fault) else fault
 
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
         """Make the error; `lost`: the loss that the result would have reported."""
-        after = f" (its worker {lost.cause}, and was replaced)" if lost is not None else ""
+        after = f" (its worker or env {lost.cause}, and was replaced)" if lost is not None else ""
         after += without_terminal(error, self._record_of(slot))
         op = self._requests.numbering.op(slot)
         doing = Operation(op).name.lower()
@@ -192,20 +184,23 @@ class Intake:
         )
         return raised
 
-    def _on_faulted(self, completion: Faulted) -> None:
-        slot = self._requests.end(completion.host_id, completion.entry)
-        if slot is None:
-            return
-        self._continuity.ended_without_result(slot)
-        if completion.for_good:
-            self._supervisor.note_lost_env(completion.host_id, slot)
-        self._fail(self._requests.alone(slot), lambda _: completion.fault)
-
     def _on_lost(self, completion: Lost) -> None:
-        slot = self._supervisor.records[completion.host_id].slots[completion.env_index]
-        if self._continuity.why_lost(slot) is None:  # Else that is known, as after an abort.
-            self._supervisor.note_rebuilt(completion.host_id, slot, completion.why)
-            self._continuity.lose([slot], completion.why)
+        """Carry out what the loss of one env means: as of a death, for it alone."""
+        host_id, why = completion.host_id, completion.why
+        slot = self._supervisor.records[host_id].slots[completion.env_index]
+        wanted = completion.entry and self._requests.end(host_id, completion.entry) is not None
+        if not wanted:
+            if self._continuity.why_lost(slot) is None:  # Else that is known, as after an abort.
+                self._continuity.lose([slot], why)
+            return
+        self._continuity.lose([slot], why)
+        replaced, fault = self._supervisor.losses.count_env(slot, why, completion.message)
+        alone = self._requests.alone(slot)
+        if replaced and self._requests.numbering.op(slot) in _ASKED_AGAIN:
+            self._requests.anything_ended = True
+            self._send_again(host_id, alone)
+        else:
+            self._fail(alone, lambda _: fault)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
@@ -278,17 +273,12 @@ class Intake:
         self._layout.write_seeds(slots, np.full(len(slots), AS_BEFORE))
         self._supervisor.submit(host_id, entries, None)
 
-    def _note_answered(self, slots: NDArray[np.intp], *, by_reset: bool = False) -> None:
-        """Mark results that report a loss, and let steps show that a replacement works.
-
-        Args:
-            slots: whose results are there.
-            by_reset: their hosts have answered by resets, whatever was asked.
-        """
+    def _note_answered(self, slots: NDArray[np.intp]) -> None:
+        """Mark results that report a loss, and let steps show that a replacement works."""
         if self._continuity.exceptional:
             for report in self._continuity.take_answers(slots):
                 self._results.mark_restarted(report)
-        if self._supervisor.any_deaths and not by_reset:
+        if self._supervisor.any_deaths:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:
                     self._supervisor.note_step(slot)

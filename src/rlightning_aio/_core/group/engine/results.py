@@ -127,8 +127,6 @@ class Results:
             info["worker_restarted"] = why.cause
             if why.at_fault is not None:
                 info["env_at_fault"] = why.at_fault
-            if why.suspects:
-                info["suspects"] = why.suspects
             info["outcome"] = why.outcome(self._envs.env_ids[report.slot])
         self._mark(report.slot)
 

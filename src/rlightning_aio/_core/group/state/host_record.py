@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         ErrorText,
     )
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.errors import WorkerDied
+    from rlightning_aio.errors import EnvFault, WorkerDied
     from rlightning_aio.outcomes import Loss
 
 __all__ = ["HostLoss", "HostRecord", "Stage", "last_lines"]
@@ -112,7 +112,6 @@ class HostLoss:
         error = self.kind(message + last_lines(tail), env_id=self.env_id)
         error.exit_code, error.stderr_tail = self.death.exit_code, tail
         error.env_ids = tuple(self._ids(slots))
-        error.suspects = self.why.suspects
         error.outcome = self.why.outcome(self.env_id)
         return error
 
@@ -131,20 +130,17 @@ class HostRecord:
         start_by: the deadline of its start; late: it missed that, and is being killed.
         traffic: see `Killable`, when `note_traffic` was last called.
         restart_at: the time of its next restart; restarts: the number so far.
-        refusals: consecutive attempts to start a replacement that the system refused;
-            refused_since: the time of the first.
         held: requests (entries and arguments) since its death, kept until a replacement is up.
         deaths: by slot, deaths of workers that this env is blamed for, and exceptions that it was
             restarted after, since it last completed a step; key None for deaths of unknown cause.
         culprit: the slot of the env that the last worker was executing when it died.
-        suspects: without one, the slots of those that owed a reply while none was executed.
         dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
         is_hung: its worker hung and is being killed.
         abort_by: by slot, when its worker is killed unless an aborted request has ended before;
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
-        lost_slots: of envs that are not rebuilt though their host continues.
+        gone: by slot, the errors of envs that are not replaced though their host goes on.
         last_loss: its last death.
         killable: the host, if it can be killed; membership: if envs join and leave it.
         limits: the time limits of requests, by operation.
@@ -164,12 +160,9 @@ class HostRecord:
     traffic: int = 0
     restart_at: float | None = None
     restarts: int = 0
-    refusals: int = 0
-    refused_since: float | None = None
     held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = field(default_factory=list[Any])
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
-    suspects: tuple[int, ...] = ()
     dying: bool = False
     die_by: float | None = None
     is_hung: bool = False
@@ -178,7 +171,7 @@ class HostRecord:
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
-    lost_slots: set[int] = field(default_factory=set[int])
+    gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     last_loss: HostLoss | None = None
     killable: Killable | None = field(init=False)
     membership: Membership | None = field(init=False)
@@ -196,8 +189,7 @@ class HostRecord:
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
         self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")
-        times = self.restart_policy.times
-        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted", times)
+        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted")
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
@@ -221,16 +213,6 @@ class HostRecord:
     def awaits_several(self) -> bool:
         """Its worker executes the requests of several envs at the same time."""
         return len(self.started) > 1 and any(env.is_awaitable for env in self.started)
-
-    @property
-    def blamed(self) -> tuple[int | None, ...]:
-        """The keys of `deaths` that the last death counts for."""
-        return self.suspects or (self.culprit,)
-
-    @property
-    def deaths_in_a_row(self) -> int:
-        """The deaths in a row of the env with the most, of those blamed for the last one."""
-        return max(self.deaths[slot] for slot in self.blamed)
 
     def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
         """Hold some requests no longer; return those that it has held."""

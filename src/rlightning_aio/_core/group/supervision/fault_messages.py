@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CrashLog",
     "cause_of",
-    "culprits_of",
+    "culprit_of",
     "host_loss",
     "late_fault",
     "start_fault",
@@ -72,34 +72,31 @@ def _starting(record: HostRecord, death: Death) -> int:
     return max(slot, record.slots.start)
 
 
-def culprits_of(
+def culprit_of(
     record: HostRecord,
     entries: Sequence[int],
     requests: Requests,
     unanswered: NDArray[np.intp],
-) -> tuple[int | None, tuple[int, ...]]:
-    """The slot of the env that a worker was executing when it hung or died, and suspects.
+) -> int | None:
+    """The slot of the env that a worker was executing when it hung or died; None if it is unknown.
 
     Args:
         record: of its host.
         entries: as in `Death.requests`.
         requests: of the group.
         unanswered: its slots with a request in flight.
-
-    Without such an env there is None, and the slots of those that may be the cause: all that owed
-    a reply.
     """
     if record.aborted_slot is not None:
-        return record.aborted_slot, ()
+        return record.aborted_slot
     if record.awaits_several:
         # The worker marks whose code runs, and that of one whose request is over may run, too.
         slot = slot_of(entries[0]) if entries and entries[0] else None
-        return (slot, ()) if slot in record.slots else (None, tuple(unanswered.tolist()))
+        return slot if slot in record.slots else None
     slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
     for entry in entries:
         if entry in slot_of_entry:
-            return slot_of_entry[entry], ()
-    return (int(unanswered[0]) if len(unanswered) else None), ()
+            return slot_of_entry[entry]
+    return int(unanswered[0]) if len(unanswered) else None
 
 
 def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
@@ -143,12 +140,11 @@ def host_loss(
     replaced: bool,
 ) -> HostLoss:
     """Describe a death; `then` says what happens to the worker now."""
-    slot = record.blamed[0]
-    slot = record.slots.start if slot is None else slot
+    slot = record.slots.start if record.culprit is None else record.culprit
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
     last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
     what = f"the worker of {envs.describe(slot)} {death.cause}"
-    if record.suspects:
+    if record.culprit is None and record.awaits_several:
         last = "no env's code was running"
     elif record.is_hung:
         # Of a stopped worker, whose env may have been called, the shortest one counts.
@@ -167,22 +163,27 @@ def host_loss(
         then=then,
         env_ids=envs.env_ids,
         env_id=envs.env_ids[slot],
-        why=_why(envs, requests, record, death.cause),
+        why=_why(envs, requests, record, death),
     )
 
 
-def _why(envs: EnvTable, requests: Requests, record: HostRecord, cause: str) -> Loss:
-    at_fault = None if record.culprit is None else envs.env_ids[record.culprit]
-    suspects = tuple(envs.env_ids[slot] for slot in record.suspects)
+def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -> Loss:
+    cause, at_fault = death.cause, None
+    if record.culprit is not None:
+        at_fault = envs.env_ids[record.culprit]
     if record.aborted_slot is not None:
-        return Loss(cause, "cancelled", "caller", at_fault, suspects)
+        return Loss(cause, "cancelled", "caller", at_fault)
     if record.is_hung:
         op = 0 if record.culprit is None else requests.numbering.op(record.culprit)
-        return hung(cause, op, at_fault)._replace(suspects=suspects)
-    if record.refused_since is not None:
-        return Loss(cause, "not_started", "infrastructure", at_fault, suspects)
-    kind = "not_started" if record.late or record.rebuild_error is not None else "env_died"
-    return Loss(cause, kind, "env", at_fault, suspects)
+        why = hung(cause, op, at_fault)
+    elif death.refused:
+        return Loss(cause, "not_started", "infrastructure", at_fault)
+    else:
+        kind = "not_started" if record.late or record.rebuild_error is not None else "env_died"
+        why = Loss(cause, kind, "env", at_fault)
+    if at_fault is None and record.awaits_several:
+        return why._replace(blame="infrastructure")  # All were waiting, so nobody is named.
+    return why
 
 
 class CrashLog:

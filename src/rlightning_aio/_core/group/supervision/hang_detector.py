@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio._core.group.state.host_record import Stage
-from rlightning_aio._core.group.supervision.fault_messages import culprits_of
+from rlightning_aio._core.group.supervision.fault_messages import culprit_of
 from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
@@ -155,10 +155,9 @@ class HangDetector:
             return
         record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
-        record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
-        slot = record.blamed[0]
-        if slot is not None:
-            self._tables.observed.note_fate("hung", record.host.host_id, slot, "")
+        record.culprit = culprit_of(record, (entry,), self._requests, busy)
+        if record.culprit is not None:
+            self._tables.observed.note_fate("hung", record.host.host_id, record.culprit, "")
         self.kill(record, dump=True)
 
     def _check_dying(self) -> None:

@@ -10,6 +10,7 @@ until then. `HangDetector` decides which workers are killed.
 from __future__ import annotations
 
 import logging
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -19,11 +20,11 @@ from rlightning_aio._core.group.drivers.wait import Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import DEATH
 from rlightning_aio._core.group.state.host_record import HostRecord, Stage
 from rlightning_aio._core.group.state.slab_layout import check_actions
-from rlightning_aio._core.group.supervision.env_errors import EnvErrors
+from rlightning_aio._core.group.supervision.env_losses import EnvLosses
 from rlightning_aio._core.group.supervision.fault_messages import (
     CrashLog,
     cause_of,
-    culprits_of,
+    culprit_of,
     host_loss,
     late_fault,
     start_fault,
@@ -59,7 +60,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.outcomes import Loss
 
 __all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
 
@@ -67,10 +67,6 @@ LOOK_SECONDS: Final = 0.02
 """Interval of checks in a trainer that never has to wait."""
 _DUMP_SECONDS: Final = 1.0
 """Limit for a late worker to write its stacks and exit."""
-
-_SHORTAGE_SECONDS: Final = 30.0
-"""Time for which the system may refuse to start a replacement before that counts as a death. A
-shortage of descriptors, processes or memory is not the env's fault, and may pass."""
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -86,7 +82,7 @@ class Supervisor:
         members: the envs that join and leave.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hint: on settings; crash_log: of
-            restarts; env_errors: of envs; overdue: names envs that owe a result for long.
+            restarts; losses: of single envs; overdue: names envs that owe a result for long.
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
             step yet.
@@ -113,7 +109,7 @@ class Supervisor:
         self.hint = Hint(tables)
         self.overdue = Overdue(tables)
         self.crash_log = CrashLog()
-        self.env_errors = EnvErrors(tables, self.crash_log, self._update_any_deaths)
+        self.losses = EnvLosses(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False
@@ -266,7 +262,6 @@ class Supervisor:
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
         if self._lifetime.open:
             record.rebuild_error, record.culprit = record.rebuild_error or error, slot
-            record.suspects = ()
             self.detector.kill(record, dump=False)
             return
         # ConfigError keeps its type, because the config is wrong for every process.
@@ -284,7 +279,10 @@ class Supervisor:
     # -- requests --------------------------------------------------------
 
     def check_usable(self, slots: NDArray[np.intp]) -> None:
-        """Raise the error of a host that will not be restarted, if it hosts any of `slots`."""
+        """Raise the error of a host, or an env, of `slots` that will not be replaced."""
+        for record in self.records if self.losses.any_gone else ():
+            for slot in record.gone.keys() & {*slots.tolist()}:
+                raise copy(record.gone[slot])
         if not self._any_given_up:
             return
         for record in self.records:
@@ -349,11 +347,7 @@ class Supervisor:
             self._fail_start(start_fault(self._envs, record, death))
             return None
         if death.refused:
-            record.restarts -= 1
-            self._on_refused(record, f"it {death.cause}", self._clock())
-            return None
-        if record.stage is not Stage.DOWN:
-            record.refusals, record.refused_since = 0, None  # It had started.
+            record.restarts -= 1  # It has not started.
         owed = self._requests.owed(np.array(record.slots, np.intp))
         was_up = record.stage is Stage.UP
         loss = record.last_loss = self._judged(record, death, owed)
@@ -364,7 +358,7 @@ class Supervisor:
             self._update_any_deaths()
             return loss
         record.stage = Stage.DOWN
-        record.restart_at = self._clock() + restart_pause(record.deaths_in_a_row)
+        record.restart_at = self._clock() + restart_pause(record.deaths[record.culprit])
         if was_up:
             return loss
         self.replace(record.host.host_id)
@@ -378,48 +372,31 @@ class Supervisor:
         if record.restart_at is None or record.restart_at > now:
             return
         record.restart_at = None
+        record.restarts += 1
         try:
             self._launch(record, Stage.REBUILDING)
         except OSError as error:
-            self._on_refused(record, error, now)
+            death = Death(f"could not be replaced: {_refusal(record, error)}", refused=True)
+            self._tables.completions.append(Died(record.host.host_id, death))
             return
-        record.restarts += 1
-        record.lost_slots.clear()
+        record.gone.clear()
         assert record.order is not None
         record.host.attach(record.order)
         record.give_time(self._clock())
-
-    def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:
-        """Schedule another attempt, because the system refused to start a replacement."""
-        refusal = _refusal(record, why)
-        record.stage = Stage.DOWN
-        record.start_by = None
-        if record.refused_since is None:
-            record.refused_since = now
-        record.refusals += 1
-        pause = restart_pause(record.refusals + 1)
-        if now + pause > record.refused_since + _SHORTAGE_SECONDS:
-            self._tables.completions.append(
-                Died(record.host.host_id, Death(f"could not be replaced: {refusal}"))
-            )
-            return
-        _log.warning("%s; the next attempt is in %g s", refusal, pause)
-        record.restart_at = now + pause
 
     def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Count a death, decide if the host is replaced, log that, and return what it means."""
         requests = self._requests
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
-            record.culprit, record.suspects = culprits_of(record, death.requests, requests, owed)
+            record.culprit = culprit_of(record, death.requests, requests, owed)
         is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
-        for slot in record.blamed:
-            record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
-        deaths = record.deaths_in_a_row
+        deaths = record.deaths.get(record.culprit, 0) + is_fault
+        record.deaths[record.culprit] = deaths
         self._note_deaths(True)
         replaced, then = True, "it is replaced"
         if is_fault:
-            replaced, then = record.restart_policy.count(deaths, self._clock())
+            replaced, then = record.restart_policy.count(deaths)
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
@@ -432,16 +409,6 @@ class Supervisor:
             self.crash_log.note(record.config.name, loss.message)
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return loss
-
-    def note_rebuilt(self, host_id: int, slot: int, why: Loss) -> None:
-        """Record that a host has rebuilt one of its envs."""
-        self.records[host_id].restarts += 1
-        fate: Fate = "hung" if why.kind == "env_hung" else "rebuilt"
-        self._tables.observed.note_fate(fate, host_id, slot, why.cause)
-
-    def note_lost_env(self, host_id: int, slot: int) -> None:
-        """Record that a host will not rebuild one of its envs."""
-        self.records[host_id].lost_slots.add(slot)
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""

@@ -45,7 +45,7 @@ class Workers:
         env_ids, requests = self._envs.env_ids, self._tables.requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
-        lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.lost_slots)
+        lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.gone)
         return {
             "entry": record.config.name,
             "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],

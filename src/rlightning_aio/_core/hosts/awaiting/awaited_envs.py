@@ -2,8 +2,8 @@
 
 The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each env has
 a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
-is then closed, rebuilt and reset, and that result answers the request, marked as a restart. So it
-is if a step raises `EnvAway`: the env has lost what it talks to.
+is then closed, and the group hears that it is lost; the next request makes another. So it is if a
+step raises `EnvAway`: the env has lost what it talks to.
 Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
 Left out: how requests and completions travel.
 """
@@ -13,8 +13,6 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from contextvars import Context, copy_context
-from copy import copy
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,17 +32,16 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     new_task,
     tasks_of,
     time_collector,
-    wait_fairly,
     watched,
 )
-from rlightning_aio._core.hosts.limits import RestartPolicy, hung, limits_of, restart_pause
-from rlightning_aio._core.hosts.messages import ErrorText, Faulted, Lost, NotBuilt, Raised, Result
+from rlightning_aio._core.hosts.limits import hung, limits_of
+from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raised
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
-from rlightning_aio.errors import EnvAway, EnvFault, EnvHung, WorkerDied
-from rlightning_aio.outcomes import Loss, Outcome
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.errors import EnvAway
+from rlightning_aio.outcomes import Loss
+from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
@@ -57,8 +54,6 @@ __all__ = ["CLOSE_SECONDS", "AwaitedEnvs"]
 
 CLOSE_SECONDS: Final = 0.6
 """How long envs may take to close, where their entry doesn't say."""
-_ABORTED: Final = Loss("was aborted", "cancelled", "caller")
-_CANCELLED: Final = Loss("ended while it was idle: something cancelled its task", "env_died", "env")
 _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
@@ -73,11 +68,9 @@ class _EnvRecord:
         runner: of that env, or of the one before.
         entry: of the request that is being executed; 0 while there is none.
         arguments: of that request.
-        losses: how often the env was replaced since it last completed a step.
-        lost: why there is no env.
+        is_ending: the env before has left by itself, and has not closed yet.
         leaving: the task that puts the env before away.
         rebuilding: the task that makes another env.
-        fault: why there will be no other env, if so.
     """
 
     def __init__(self, index: int, context: Context) -> None:
@@ -87,11 +80,9 @@ class _EnvRecord:
         self.runner: Any = None
         self.entry = 0
         self.arguments: Any = None
-        self.losses = 0
-        self.lost = _CANCELLED
+        self.is_ending = False
         self.leaving: asyncio.Task[None] | None = None
         self.rebuilding: asyncio.Task[None] | None = None
-        self.fault: EnvFault | None = None
 
     @property
     def name(self) -> str:
@@ -143,7 +134,6 @@ class AwaitedEnvs:
         self._ending = False
         config = order.config
         self._close_seconds = config.close_timeout or CLOSE_SECONDS
-        self._restarts = RestartPolicy(config, "on_worker_death", "rebuilt")
         self._renews = config.on_env_error == "restart"
         self._limits = {
             op: TimeLimit(seconds, self._expire) for op, seconds in limits_of(config).items()
@@ -273,17 +263,12 @@ class AwaitedEnvs:
     def _begin_queued(self) -> None:
         while self._queue and self.num_busy < self._most_busy:
             record, entry, arguments = self._queue.popleft()
-            if record.fault is not None:
-                # Not at once: a completion never comes before its request was handed over.
-                fault = Faulted(self._host_id, entry, copy(record.fault), for_good=True)
-                self._loop.call_soon(lambda it=fault: None if self._ending else self._post(it))
-                continue
             self.num_busy += 1
             record.entry, record.arguments = entry, arguments
-            if record.env is None:
-                self._rebuild(record)
-            else:
+            if record.env is not None:
                 self._give(record, record.env)
+            elif not record.is_ending:  # Else its end takes the request along.
+                record.rebuilding = self._spawn(self._rebuild(record))
 
     def _give(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Have an env execute the request in its record."""
@@ -296,14 +281,11 @@ class AwaitedEnvs:
         self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
     ) -> None:
         record = self._records[env.index]
-        if op_of(entry) == Operation.STEP:
-            if isinstance(error, EnvAway) and not self._ending:
-                why = Loss(str(error), "env_away", "infrastructure", record.name)
-                self._put_away(record, env, why)
-                self._rebuild(record, f"env {record.name!r} {error}", EnvAway)
-                return
-            if error is None:
-                record.losses = 0
+        if isinstance(error, EnvAway) and op_of(entry) == Operation.STEP:
+            self._put_away(record, env)
+            why = Loss(str(error), "env_away", "infrastructure", record.name)
+            self._report_loss(record, why, f"env {record.name!r} {error}")
+            return
         completion = completion_of(self._host_id, env.runner, entry, outcome, error)
         self._finish(record, completion, by=env)
 
@@ -314,11 +296,9 @@ class AwaitedEnvs:
 
         None: its row holds the whole result.
         """
-        if by is not None and self._renews and isinstance(completion, Raised):
-            error = completion.error
-            if error.ends_env(op_of(record.entry)):
-                why = Loss(f"raised {error.summary}", "env_raised", "either", record.name)
-                self._put_away(record, by, why)
+        raised = completion.error if isinstance(completion, Raised) and self._renews else None
+        if by is not None and raised is not None and raised.ends_env(op_of(record.entry)):
+            self._put_away(record, by)
         if self._ending:
             return
         entry, record.entry, record.arguments = record.entry, 0, None
@@ -350,7 +330,7 @@ class AwaitedEnvs:
             if record.rebuilding is not None:
                 record.rebuilding.cancel()
             if record.env is not None:
-                self._put_away(record, record.env, _ABORTED)
+                self._put_away(record, record.env)
             self._finish(record, aborted)
             return
         queued = [one for one in self._queue if one[1] != entry]
@@ -361,47 +341,57 @@ class AwaitedEnvs:
     # -- envs that are lost -------------------------------------------------------
 
     def _expire(self, record: _EnvRecord, seconds: float) -> None:
-        """Replace an env whose request takes too long."""
+        """Put an env away whose request takes too long."""
         env = record.env
         if self._ending or env is None:
             return
         op = op_of(record.entry)
         doing = Operation(op).name.lower()
-        waits_in = awaited_calls(env.answering)
         message = (
             f"env {record.name!r} took longer than {seconds} s for a {doing} and was cancelled"
         )
-        if waits_in:
+        if waits_in := awaited_calls(env.answering):
             message += f" while it waited in {waits_in}"
-        self._put_away(record, env, hung(f"hung in a {doing} and was cancelled", op, record.name))
-        self._rebuild(record, message)
+        self._put_away(record, env)
+        why = hung(f"hung in a {doing} and was cancelled", op, record.name)
+        self._report_loss(record, why, message)
+
+    def _report_loss(self, record: _EnvRecord, why: Loss, message: str) -> None:
+        """Report that an env is gone, and the request with it that it was executing."""
+        entry, record.entry, record.arguments = record.entry, 0, None
+        if self._ending:
+            return
+        self.num_busy -= entry != 0
+        self._post(Lost(self._host_id, record.index, why, entry, message))
+        self._begin_queued()
 
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""
         record = self._records[env.index]
         if self._ending or record.env is not env:
             return
-        record.env, record.lost = None, _CANCELLED
+        record.env, record.is_ending = None, True
         record.leaving = env.task
 
         late = self._loop.call_later(self._close_seconds, env.cut_short, self._close_seconds)
 
         def closed(_: object) -> None:
             late.cancel()
+            record.is_ending = False
+            cause = "ended while it was idle: something cancelled its task"
             if env.close_error is not None:
                 cause = f"ended while it was idle: {env.close_error.summary}"
-                record.lost = Loss(cause, "env_died", "env", record.name)
             self._note_closed(env)
+            why = Loss(cause, "env_died", "env", record.name)
+            self._report_loss(record, why, f"env {record.name!r} {cause}")
 
         # No task of ours waits for that: perhaps the event loop ends.
         env.task.add_done_callback(closed)
-        if record.entry:  # It has come at the same time.
-            self._rebuild(record)
 
-    def _put_away(self, record: _EnvRecord, env: AwaitedEnv, why: Loss) -> None:
+    def _put_away(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
         env.leave()
-        record.env, record.lost = None, why
+        record.env = None
         record.leaving = self._spawn(self._close(env))
 
     async def _close(self, env: AwaitedEnv) -> None:
@@ -433,94 +423,21 @@ class AwaitedEnvs:
         task.add_done_callback(self._tasks.discard)
         return task
 
-    def _rebuild(
-        self, record: _EnvRecord, message: str = "", kind: type[EnvFault] = EnvHung
-    ) -> None:
-        """Make another env, which answers the request; see `_rebuilt`."""
-        record.rebuilding = self._spawn(self._rebuilt(record, message, kind))
-
-    async def _rebuilt(self, record: _EnvRecord, message: str, kind: type[EnvFault]) -> None:
-        """Build another env. A step, and what the env before was lost in, is answered by its reset.
-
-        Args:
-            record: without an env, and with a request.
-            message: why the env was lost that has executed the request; empty if it was idle.
-            kind: of the error if that was one loss too many.
-        """
-        entry = record.entry
-        is_reset = bool(message) or op_of(entry) == Operation.STEP
-        while True:
-            if message:
-                failed = self._counted(record, kind, message)
-                if failed is not None:
-                    self._finish(record, failed)
-                    return
-                await asyncio.sleep(restart_pause(record.losses))
-            if record.leaving is not None:
-                await asyncio.wait({record.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
-            error, env = await self._build(record), record.env
-            if self._inline and isinstance(error, KeyboardInterrupt):
-                self._loop.call_soon(reraise, error)
-                self._finish(record, Raised(self._host_id, entry, ErrorText.of(error)))
-                return
-            if env is None:
-                kind, message = WorkerDied, f"env {record.name!r} could not be rebuilt: {error!r}"
-                continue
-            if not is_reset:
-                if answers_with_value(op_of(entry)):
-                    self._post(Lost(self._host_id, record.index, record.lost))
-                self._give(record, env)
-                return
-            outcome = await self._reset(record, env)
-            if outcome is not None:
-                self._finish(record, outcome, by=env)
-                return
-            kind, message = EnvHung, f"env {record.name!r} took too long for the reset after that"
-
-    async def _reset(self, record: _EnvRecord, env: AwaitedEnv) -> Result | Raised | None:
-        """Begin an episode like the one that was lost; None if that takes too long."""
-        entry, why = record.entry, record.lost
-        ended: asyncio.Future[Completion | None] = self._loop.create_future()
-
-        def then(env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None) -> None:
-            ended.set_result(completion_of(self._host_id, env.runner, entry, outcome, error))
-
-        env.give(Operation.RESET, entry, env.runner.reset_with, then)
-        limit = self._limits.get(Operation.RESET)
-        if limit is None:
-            await asyncio.wait({ended})
+    async def _rebuild(self, record: _EnvRecord) -> None:
+        """Make another env once the one before has closed, and give it the request."""
+        if record.leaving is not None:
+            seconds = self._close_seconds + 2 * CANCEL_SECONDS
+            await asyncio.wait({record.leaving}, timeout=seconds)
+        error, env = await self._build(record), record.env
+        if env is not None:
+            self._give(record, env)
+        elif self._inline and isinstance(error, KeyboardInterrupt):
+            self._loop.call_soon(reraise, error)
+            self._finish(record, Raised(self._host_id, record.entry, ErrorText.of(error)))
         else:
-            await wait_fairly({ended}, 1.1 * limit.seconds)  # As `TimeLimit` would have it.
-        if not ended.done():
-            self._put_away(record, env, why)
-            return None
-        found = ended.result()
-        if isinstance(found, Raised):
-            text = f"{found.error.text} (in the reset after its env {why.cause})"
-            return Raised(self._host_id, entry, replace(found.error, text=text))
-        out_of_band = found.out_of_band if isinstance(found, Result) else {}
-        return Result(self._host_id, entry, out_of_band, restarted=why)
-
-    def _counted(self, record: _EnvRecord, kind: type[EnvFault], message: str) -> Faulted | None:
-        """Count a loss of an env; return what ends its request if that was one too many."""
-        record.losses += 1
-        is_borne, then = self._restarts.count(record.losses, self._loop.time())
-        if is_borne:
-            log.warning("%s; %s", message, then)
-            return None
-        for_good = self._restarts.raises
-        if not for_good:
-            then += ", so this request ends here; the next one tries again"
-        fault = kind(f"{message}; {then}", env_id=record.name)
-        if isinstance(fault, WorkerDied):
-            fault.env_ids = (record.name,)
-        if kind is WorkerDied:
-            fault.outcome = Outcome("not_started", "env", message, record.name)
-        else:
-            fault.outcome = record.lost.outcome(record.name)
-        if for_good:
-            record.fault = fault
-        return Faulted(self._host_id, record.entry, fault, for_good)
+            cause = f"could not be rebuilt: {error!r}"
+            why = Loss(cause, "not_started", "env", record.name)
+            self._report_loss(record, why, f"env {record.name!r} {cause}")
 
 
 def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int) -> Any:
