@@ -439,19 +439,13 @@ def test_one_of_them_is_rendered() -> None:
 
 
 @pytest.mark.parametrize(
-    ("placement", "num_workers", "brief", "num_threads"),
-    [
-        ("inline", 1, False, 4),
-        ("inline", 2, False, 2),
-        ("inline", 8, False, 1),
-        ("inline", 2, True, 4),
-        ("process", 2, True, 2),
-    ],
+    ("placement", "num_workers", "num_threads"),
+    [("inline", 1, 4), ("inline", 2, 4), ("process", 2, 2), ("process", 8, 1)],
 )
 def test_batches_of_one_entry_share_the_cores(
-    placement: str, num_workers: int, brief: bool, num_threads: int, monkeypatch: pytest.MonkeyPatch
+    placement: str, num_workers: int, num_threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They compute at the same time, unless their steps are brief: then they take turns."""
+    """Workers compute at the same time; inline, one batch is stepped after the other."""
     asked: list[int] = []
 
     class Counted(Simulations):
@@ -461,7 +455,6 @@ def test_batches_of_one_entry_share_the_cores(
 
     monkeypatch.setattr("rlightning_aio.envs.mujoco.batch.Simulations", Counted)
     monkeypatch.setattr("rlightning_aio.envs.simulators.gymnasium.num_cores", lambda: 4)
-    monkeypatch.setattr("rlightning_aio.envs.mujoco.batch.is_brief", lambda *_: brief)
     config = EnvConfig.model_validate(
         {
             "name": "x", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2,

@@ -12,8 +12,6 @@ import ray_cluster
 from group import sample_envs
 from kit.driven import AWAITING, ON_RAY, PLACES, Place
 
-import rlightning_aio.sync
-
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
@@ -79,11 +77,3 @@ async def start(place: Place) -> AsyncIterator[Any]:
     yield start
     while groups:
         await groups.pop().close()
-
-
-@pytest.fixture
-def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
-    """Yield a group of one inline env whose steps have two halves."""
-    sample_envs.Halved.log.clear()
-    with rlightning_aio.sync.build_env_group(sample_envs.HALVED) as group:
-        yield group

@@ -457,9 +457,6 @@ class FakeInline(FakeHost):
         self.finish()
         return True
 
-    def step_now(self) -> Any:
-        raise AssertionError
-
 
 class FakeGroup:
     """A core over fake hosts, and the clock and driver that its procedures need.

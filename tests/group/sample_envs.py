@@ -247,20 +247,14 @@ class Sloppy(Probe):
         return result if policy_resp.action else None
 
 
-HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
+ADDING = {"name": "one", "backend": "adding", "task": "-", "placement": "inline"}
 
 
-@ENVS.register("halved")
-class Halved(FastPath, BaseEnv):
-    """Adds up its actions, in steps of two halves.
+@ENVS.register("adding")
+class Adding(BaseEnv):
+    """Adds up its actions, in the trainer's process."""
 
-    Attributes:
-        log: the executed halves.
-    """
-
-    RAISE_IN_START, RAISE_IN_WAIT, INTERRUPT, INTERRUPT_START = 9, 8, 7, 6
-
-    log: ClassVar[list[str]] = []
+    RAISE, INTERRUPT = 8, 7
 
     def get_observation_space(self) -> gym.Space[Any]:
         return spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -279,35 +273,15 @@ class Halved(FastPath, BaseEnv):
         return EnvRet(env_id=self.env_id, observation=self._observation(), info=info)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        return result_of(self.env_id, self.bare_step()(policy_resp.action))
-
-    def bare_step(self) -> BareStep:
-        def step(action: Any) -> Any:
-            self._start(action)
-            return self._wait()
-
-        return step
-
-    def bare_step_async(self) -> Any:
-        return self._start, self._wait
-
-    def _start(self, action: Any) -> None:
-        self.log.append("start")
-        self.action = int(action)
-        if self.action == self.RAISE_IN_START:
-            raise ValueError("no start")
-        if self.action == self.INTERRUPT_START:
-            raise KeyboardInterrupt
-
-    def _wait(self) -> Any:
-        self.log.append("wait")
-        if self.action == self.RAISE_IN_WAIT:
+        action = int(policy_resp.action)
+        if action == self.RAISE:
             raise ValueError("no end")
-        if self.action == self.INTERRUPT:
+        if action == self.INTERRUPT:
             raise KeyboardInterrupt
-        self.total += self.action
+        self.total += action
         info = {"nested": {"total": self.total}, "success": self.total == 20}
-        return self._observation(), float(self.action), self.total >= 20, False, info
+        parts = self._observation(), float(action), self.total >= 20, False, info
+        return result_of(self.env_id, parts)
 
 
 @ENVS.register("fresh")

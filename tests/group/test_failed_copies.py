@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from group.fake_host import PLAIN, RAISES, SENDS_INFO, TERMINATES, FakeGroup
-from group.sample_envs import HALVED
+from group.sample_envs import ADDING
 
 import rlightning_aio.sync
 from rlightning_aio._core.group.engine.steps import CollectRules
@@ -154,7 +154,7 @@ def test_an_unreadable_info_raises_only_when_it_is_read() -> None:
     group.close()
 
 
-@pytest.mark.parametrize("entry", [HALVED, HALVED | {"backend": "fresh", "task": "array"}])
+@pytest.mark.parametrize("entry", [ADDING, ADDING | {"backend": "fresh", "task": "array"}])
 def test_a_failed_step_of_a_single_env_leaves_its_result_to_collect(entry: dict[str, Any]) -> None:
     """Also if the env's own arrays are handed out."""
     with (

@@ -1,22 +1,18 @@
-"""Abilities of inline envs beyond those of workers: start early, and hand over their own arrays."""
+"""Abilities of inline envs beyond those of workers: they hand over their own arrays."""
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
-from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from group import sample_envs
-from group.sample_envs import HALVED
 from gymnasium import spaces
 from kit.contract import same
 from kit.scripted import Counts
 
 import rlightning_aio.sync
-from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:
@@ -30,40 +26,6 @@ def fresh(task: str, **fields: Any) -> dict[str, Any]:
 
 def step(group: Any, batch: BatchedData) -> BatchedData:
     return group.step(batch.respond(action=np.zeros(len(batch), int)))[0]
-
-
-def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.EnvGroup) -> None:
-    """The simulator computes while the trainer does something else."""
-    batch, _ = halved.reset()
-    halved.step_async(batch.respond(action=np.array([5])))
-    assert sample_envs.Halved.log == ["start"]
-    batch, _ = halved.collect_async()
-    assert sample_envs.Halved.log == ["start", "wait"]
-    assert batch.observation.tolist() == [[-1, 5]]
-    assert batch.info() == [{"nested": {"total": 5}, "success": False}]
-
-
-@pytest.mark.parametrize("action", [9, 8])
-def test_an_error_of_either_half_is_the_steps(
-    halved: rlightning_aio.sync.EnvGroup, action: int
-) -> None:
-    """It is raised in place of the result."""
-    batch, _ = halved.reset()
-    halved.step_async(batch.respond(action=np.array([action])))
-    with pytest.raises(EnvRaised, match=r"'one-0'.* raised in step: ValueError: no (start|end)"):
-        halved.collect_async()
-    batch, _ = halved.reset()
-    assert batch.observation.tolist() == [[-1, 0]]
-
-
-def test_an_interrupt_of_the_first_half_comes_with_the_result(
-    halved: rlightning_aio.sync.EnvGroup,
-) -> None:
-    """All requests are sent before anything is raised."""
-    batch, _ = halved.reset()
-    halved.step_async(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT_START])))
-    with pytest.raises(KeyboardInterrupt):
-        halved.collect_async()
 
 
 class Interrupting(Counts):
@@ -85,33 +47,6 @@ def test_a_drain_has_what_another_entry_did_before_an_interrupt() -> None:
             group.drain()
         assert raised.value.env_id == "loud-0"
         assert raised.value.results.env_ids() == ["quiet-0"]
-
-
-def test_time_between_the_halves_is_not_part_of_the_step() -> None:
-    """The time of a step is the sum of its two halves."""
-    clock = SimpleNamespace(now=0, monotonic_ns=lambda: clock.now)
-
-    class Timed(sample_envs.Halved):
-        def _start(self, action: Any) -> None:
-            clock.now += 5
-            super()._start(action)
-
-        def _wait(self) -> Any:
-            clock.now += 7
-            return super()._wait()
-
-    with (
-        patch.dict(rlightning_aio.ENVS._classes, {"halved": Timed}),
-        patch("rlightning_aio._core.hosts.running.env_steps.time", clock),
-        patch("rlightning_aio._core.hosts.running.runner.time", clock),
-        rlightning_aio.sync.build_env_group(HALVED) as group,
-    ):
-        batch, _ = group.reset()
-        group.step_async(batch.respond(action=np.array([1])))
-        clock.now += 1000
-        batch, _ = group.collect_async()
-        (part,) = parts_of(batch)
-        assert part.busy_ns.tolist() == [12]
 
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")

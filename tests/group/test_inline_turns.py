@@ -1,4 +1,4 @@
-"""Inline envs of several entries take turns."""
+"""Inline envs take turns, also with other tasks, and end a step that raises."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from group.sample_envs import ADDING, Adding
 from kit.driven import INLINE
 
 import rlightning_aio
 import rlightning_aio.sync
+from rlightning_aio.errors import EnvBusy, EnvRaised
 
 
 def test_inline_entries_take_turns() -> None:
@@ -77,3 +79,49 @@ async def test_a_call_delays_no_ordinary_step_on_one_core(monkeypatch: pytest.Mo
         batch, _ = await group.collect_async()
         assert batch.ids() == ["pole-1"]
         assert await value == 9.8
+
+
+async def test_other_tasks_have_their_turns() -> None:
+    """A loop over an env that never waits lets other tasks run."""
+    turns = 0
+
+    async def count() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async with rlightning_aio.build_env_group(ADDING) as group:
+        batch, _ = await group.reset()
+        task = asyncio.create_task(count())
+        for _ in range(50):
+            batch, _ = await group.step(batch.respond(action=np.array([0])))
+        task.cancel()
+    assert turns >= 50
+
+
+def test_a_step_that_raises_counts_towards_no_limit() -> None:
+    """The limit counts completed steps."""
+    with rlightning_aio.sync.build_env_group(ADDING) as group:
+        batch, _ = group.reset()
+        with group.auto_reset(max_episode_steps=3):
+            with pytest.raises(EnvRaised):
+                group.step(batch.respond(action=np.array([Adding.RAISE])))
+            for expected in (False, False, True):
+                batch, flags = group.step(batch.respond(action=np.array([1])))
+                assert flags == [expected]
+
+
+def test_an_interrupt_ends_the_step_that_it_strikes() -> None:
+    """The program gets it, and the group continues, once the error of the step is collected."""
+    with rlightning_aio.sync.build_env_group(ADDING) as group:
+        batch, _ = group.reset()
+        with pytest.raises(KeyboardInterrupt):
+            group.step(batch.respond(action=np.array([Adding.INTERRUPT])))
+        assert group.pending == group.env_ids
+        with pytest.raises(EnvBusy, match="collect it first"):
+            group.step(batch.respond(action=np.array([3])))
+        with pytest.raises(EnvRaised, match="KeyboardInterrupt"):
+            group.collect_async()
+        batch, _ = group.step(batch.respond(action=np.array([3])))
+        assert batch.reward.tolist() == [3]

@@ -71,9 +71,6 @@ class Inline(Host):
         self.log.append(self.host_id)
         return True
 
-    def step_now(self) -> None:
-        raise AssertionError
-
 
 class Scene:
     """A poller over hosts with given numbers of requests in flight, and a visible bell."""

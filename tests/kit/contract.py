@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.envs.fast_path import BareResult, BareStep
+    from rlightning_aio.envs.fast_path import BareStep
 
 __all__ = ["EnvContract"]
 
@@ -152,10 +152,6 @@ class EnvContract:
         """`bare_step`, where there is one, gives what `step` gives."""
         self._compare_steps(lambda env: fast_path_of(env).bare_step())
 
-    def test_bare_halves_are_steps(self) -> None:
-        """So do the two halves of `bare_step_async`, where there are any."""
-        self._compare_steps(_joined_halves)
-
     def _compare_steps(self, bare_of: Callable[[BaseEnv], BareStep | None]) -> None:
         if not self._offers(bare_of):
             raise SkipTest("not offered")
@@ -262,19 +258,6 @@ def _check_columns(outcome: Expected, agents: tuple[str, ...], shape: tuple[int,
         assert {one.shape for one in arrays} == {shape}, f"{name}: {value}"
         if name != "reward":
             assert {one.dtype.kind for one in arrays} == {"b"}, f"{name} is not boolean: {value}"
-
-
-def _joined_halves(env: BaseEnv) -> BareStep | None:
-    halves = fast_path_of(env).bare_step_async()
-    if halves is None:
-        return None
-    start, wait = halves
-
-    def bare(action: Any) -> BareResult:
-        start(action)
-        return wait()
-
-    return bare
 
 
 def _step(env: BaseEnv, action: Any) -> Any:

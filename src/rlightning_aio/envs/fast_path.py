@@ -13,8 +13,6 @@ __all__ = [
     "BareReset",
     "BareResult",
     "BareStep",
-    "BareStepAsync",
-    "BareStepWait",
     "FastPath",
     "fast_path_of",
 ]
@@ -22,8 +20,6 @@ __all__ = [
 BareReset = Callable[..., tuple[Any, dict[str, Any]]]
 BareResult = tuple[Any, Any, Any, Any, dict[str, Any]]
 BareStep = Callable[[Any], BareResult]
-BareStepAsync = Callable[[Any], None]
-BareStepWait = Callable[[], BareResult]
 
 
 class FastPath:
@@ -34,12 +30,9 @@ class FastPath:
     Attributes:
         fresh_results: `bare_step` returns new arrays and dicts, and keeps no reference to them.
             With inline placement, observation and info are then passed on without a copy.
-        steps_briefly: a step takes so little time that it isn't worth a switch of threads. An env
-            with `bare_step_async` is then stepped when its result is collected.
     """
 
     fresh_results: bool = False
-    steps_briefly: bool = False
 
     def bare_step(self) -> BareStep | None:
         """Return the simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
@@ -49,25 +42,6 @@ class FastPath:
         function owns the action: the runtime doesn't write to it again.
         """
         return None
-
-    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
-        """Return `bare_step` as two functions: one starts a step, the other waits for its end.
-
-        Return them, in addition to `bare_step`, if the simulator computes on its own in between.
-        With inline placement, a step whose action fits its row then starts when it is sent
-        instead of when it is collected. Ctrl-C during the first function is raised with the
-        result.
-        """
-        return None
-
-    def on_stepped(self, notify: Callable[[], None]) -> bool:
-        """Have `notify` called, in any thread, when a step that the first half of `bare_step_async`
-        started has ended, so that the second half doesn't have to wait.
-
-        Return False, the default, if the env can't do that: an event loop then waits with it.
-        """
-        del notify
-        return False
 
     def bare_reset(self) -> BareReset | None:
         """Return the simulator's own ``(seed=, options=) -> (obs, info)``, if `reset` adds nothing.

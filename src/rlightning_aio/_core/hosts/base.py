@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, OutOfBand, StartOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, StartOrder
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.exchange import Ring
     from rlightning_aio.protocol.rings import TrainerBell
@@ -216,13 +216,6 @@ class Executing(Protocol):
 
     def execute_next(self) -> bool:
         """Execute one waiting request and append its completion; return False if there is none."""
-        ...
-
-    def step_now(self) -> OutOfBand | None:
-        """Step its first env with the action in its row, without a request.
-
-        No request to that env may be waiting. Returns what of the result is out of band.
-        """
         ...
 
 

@@ -9,7 +9,6 @@ the other. Unlike in Gymnasium, a simulation that fails ends its episode.
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.mujoco.outputs import StepArrays
     from rlightning_aio.envs.mujoco.task import Task
 
-__all__ = ["FAILED", "MujocoBatch", "is_brief"]
+__all__ = ["FAILED", "MujocoBatch"]
 
 # Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
@@ -51,19 +50,8 @@ _FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
 _READERS: Final = ("get_wrapper_attr", "has_wrapper_attr")
 _NEXT_STEP: Final = AutoresetMode.NEXT_STEP
 _SAME_STEP: Final = AutoresetMode.SAME_STEP
-_BRIEF_NS: Final = 500_000
 _STATE: Final = ("_num_steps", "_last", "_ended")
 """Attributes that are part of the state, in addition to the simulations."""
-
-
-def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
-    """Return True if a step of this many simulations seems too short to switch threads for."""
-    inner: Any = env.unwrapped
-    data = mujoco.MjData(inner.model)
-    mujoco.mj_step(inner.model, data, inner.frame_skip)  # The first one is slower.
-    began = time.monotonic_ns()
-    mujoco.mj_step(inner.model, data, inner.frame_skip)
-    return (time.monotonic_ns() - began) * num_envs < _BRIEF_NS * num_threads
 
 
 class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
@@ -81,8 +69,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     Attributes:
         env: the unwrapped env, in the state of the simulation that used it last.
         fresh_results: see `FastPath`.
-        releases_gil: True, as steps may be computed in a thread.
-        steps_briefly: see `FastPath`.
 
     Raises:
         NotImplementedError: the task isn't one of Gymnasium's v5 tasks, or is wrapped; or MuJoCo is
@@ -90,7 +76,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     """
 
     fresh_results = True
-    releases_gil = True
 
     def __init__(
         self,
@@ -286,10 +271,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._unknown.add(k)
 
     # -- steps --------------------------------------------------------------------------
-
-    @property
-    def steps_briefly(self) -> bool:
-        return self._simulations.busy_ns < _BRIEF_NS
 
     def step(
         self, actions: NDArray[Any]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import time
 import weakref
 from ctypes import POINTER, byref, c_bool, c_char_p, c_int, c_int64, c_void_p
 from functools import cache
@@ -116,7 +115,6 @@ class Simulations:
         began: the clock at the last reset of each.
         has_judged: the last `advance` wrote rewards and ends.
         any_ended: if so, whether an episode has ended.
-        busy_ns: duration of the last call of `advance`; 0 before the first.
 
     Raises:
         NotImplementedError: MuJoCo is older than 3.17.
@@ -169,7 +167,6 @@ class Simulations:
         warnings = _array(library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2))
         self._warned, self._warnings = warnings.view(np.int64).reshape(-1), warnings[..., 1]
         self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
-        self.busy_ns = 0
 
     def _planned(self) -> AdvancePlan:
         """Return what the compiled function is to do for each simulation."""
@@ -282,7 +279,6 @@ class Simulations:
         Raises:
             RuntimeError: MuJoCo can't reset a simulation.
         """
-        began = time.monotonic_ns()
         plan = self._plan
         if plan is None:
             failures = self._advance_by_numpy(ids)
@@ -295,7 +291,6 @@ class Simulations:
             )
             failures = self._failures() if num_failed or plan.warned else {}
             self.any_ended, plan.warned = bool(plan.any_ended), 0
-        self.busy_ns = time.monotonic_ns() - began
         for k, cause in failures.items():
             if not self.num_steps[k]:
                 raise RuntimeError(f"MuJoCo can't reset: {cause}")

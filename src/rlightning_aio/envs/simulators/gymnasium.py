@@ -5,22 +5,20 @@ from __future__ import annotations
 import contextlib
 import importlib
 import warnings
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.vector import SyncVectorEnv
 
-from rlightning_aio.envs.background import Background
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
-from rlightning_aio.envs.fast_path import BareReset, BareStep, BareStepAsync, BareStepWait, FastPath
+from rlightning_aio.envs.fast_path import BareReset, BareStep, FastPath
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
 from rlightning_aio.sharing import check_threads, num_cores
 from rlightning_aio.trees import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Generator
 
     from gymnasium.envs.registration import EnvSpec
 
@@ -91,27 +89,6 @@ class GymnasiumEnv(FastPath, BaseEnv):
     def bare_step(self) -> BareStep | None:
         return self.env.step if type(self).step is GymnasiumEnv.step else None
 
-    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
-        background = self._background
-        return None if background is None else (background.start, background.wait)
-
-    @cached_property
-    def _background(self) -> Background | None:
-        """A thread for the steps of a simulator that releases the GIL (a `MujocoBatch`)."""
-        step = self.bare_step()
-        releases_gil = getattr(self.env.unwrapped, "releases_gil", False)
-        return Background(step) if step is not None and releases_gil else None
-
-    @property
-    def steps_briefly(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return getattr(self.env, "steps_briefly", False)
-
-    def on_stepped(self, notify: Callable[[], None]) -> bool:
-        if self._background is None:
-            return False
-        self._background.notify = notify
-        return True
-
     def bare_reset(self) -> BareReset | None:
         return self.env.reset if type(self).reset is GymnasiumEnv.reset else None
 
@@ -134,8 +111,6 @@ class GymnasiumEnv(FastPath, BaseEnv):
         return self.env.render()[sub_env] if own is None else own(sub_env)
 
     def close(self) -> None:
-        if self._background is not None:
-            self._background.close()
         self.env.close()
 
 
@@ -161,14 +136,13 @@ class MujocoEnv(GymnasiumEnv):
             if self.config.num_envs == 1:
                 return super()._make()
             # Not at the top: few workers need it.
-            from rlightning_aio.envs.mujoco.batch import MujocoBatch, is_brief
+            from rlightning_aio.envs.mujoco.batch import MujocoBatch
 
             one = self._make_one()
             if num_threads is None:
-                num_threads, config = num_cores(), self.config
-                if config.placement != "inline" or not is_brief(one, config.num_envs, num_threads):
-                    # The envs of an entry compute at the same time, here and in workers.
-                    num_threads = max(1, num_threads // config.num_workers)
+                num_threads = num_cores()
+                if self.config.placement != "inline":  # Workers compute at the same time.
+                    num_threads = max(1, num_threads // self.config.num_workers)
             try:
                 return MujocoBatch(one, self.config.num_envs, num_threads=num_threads)
             except NotImplementedError as error:

@@ -25,7 +25,6 @@ from rlightning_aio._core.group.engine.actions import (
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
-from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
 from rlightning_aio.errors import BadAction, EnvAway, NothingPending, RLightningError
@@ -107,19 +106,16 @@ class Steps:
         self._intake = waiting.intake
         self._sums = tables.sums
         self.collecting = False
-        # The host of the only env, which steps in the calls of a synchronous group.
-        self._alone: Executing | None = None
 
     def begin(self) -> None:
         """Note what kind of envs were started."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
-        here = hosts[0] if len(hosts) == 1 and isinstance(hosts[0], Executing) else None
-        self._alone = here if len(envs) == 1 and not self._tables.shares_thread else None
+        is_inline = len(hosts) == 1 and isinstance(hosts[0], Executing)
         self._requests.in_rings = None not in self._requests.rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
         ordinary = (
             in_one_slab
-            and (here is not None or self._requests.in_rings)
+            and (is_inline or self._requests.in_rings)
             and not envs.any_out_of_band
             and bool(slabs[0].action_columns)
         )
@@ -149,15 +145,12 @@ class Steps:
         began = now
         try:
             slots, packed = self.write(batch, now)
-            at_once = self._alone is not None and len(slots) > 0
-            at_once = at_once and not (self._conditions.unusual or self._continuity.due[0])
-            if not (at_once and self._step_at_once(now)):
-                send = partial(self.send, slots, packed, now)
-                if self._supervisor.members.possible:
-                    send, slots = self._with_back(batch, send, slots), self._arrivals.asked
-                ticket, now = yield from self._waiting.ask(now, slots, send)
-                if ticket.errors:
-                    self._raise_faults(ticket)
+            send = partial(self.send, slots, packed, now)
+            if self._supervisor.members.possible:
+                send, slots = self._with_back(batch, send, slots), self._arrivals.asked
+            ticket, now = yield from self._waiting.ask(now, slots, send)
+            if ticket.errors:
+                self._raise_faults(ticket)
             results, flags = self.hand_out(slots)
         finally:
             if self._observed.observer is not None:
@@ -329,34 +322,6 @@ class Steps:
             self._dispatch.hand_over_steps(slots, entries, packed, resets)
         if self._supervisor.members.possible:
             self._intake.apply_completions()  # Requests to absent envs are withdrawn immediately.
-
-    def _step_at_once(self, now: float) -> bool:
-        """Step the only env here and now: there is nobody to wait for.
-
-        Returns False if it raised and is restarted, which the first result of its next episode
-        reports.
-        """
-        assert self._alone is not None
-        requests, slots = self._requests, self._envs.all
-        try:
-            out_of_band = self._alone.step_now()
-        except BaseException as error:
-            requests.numbering.renew(slots, _STEP)
-            fault = self._intake.apply_error(0, ErrorText.of(error))
-            if fault is None:
-                return False
-            self._sums.note_failures(slots, fault.outcome.kind)
-            if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
-                requests.collector.keep(slots, fault)
-                raise
-            raise fault from None
-        if out_of_band:
-            self._results.keep(0, out_of_band)
-        requests.join(0, now, _STEP)
-        requests.collector.pop_ready(1)
-        if self._completions:
-            self._intake.apply_completions()  # An info has come in a new form.
-        return True
 
     # -- hand out ---------------------------------------------------------------------
 

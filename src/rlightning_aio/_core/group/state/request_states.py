@@ -36,7 +36,7 @@ class Event(Enum):
     SENT = auto()
     SENT_FOR_CALL = auto()
     JOINED = auto()
-    """A result came without a request: an env joined, or the only one here was stepped."""
+    """A result came without a request: an env joined."""
     CLAIMED = auto()
     """A call takes a first result that waited for the collector."""
     DROPPED = auto()

@@ -394,10 +394,10 @@ class Requests:
         self.unwanted.update(each)
         self.anything_ended = True
 
-    def join(self, slot: int, now: float, op: int = _JOIN) -> None:
+    def join(self, slot: int, now: float) -> None:
         """Record a result that lies in its row without a request; the slot is idle."""
         slots = self.alone(slot)
-        self.numbering.renew(slots, op)
+        self.numbering.renew(slots, _JOIN)
         self.sent_ns[slot] = int(now * 1e9)
         self.state[slot] = _READY_CODE
         self.collector.ready.append(slots)

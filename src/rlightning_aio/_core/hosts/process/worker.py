@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         StartOrder,
         WorkerPlace,
     )
-    from rlightning_aio._core.hosts.running.env_steps import Execute
+    from rlightning_aio._core.hosts.running.row_writer import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
 __all__ = ["Worker", "main"]

@@ -15,8 +15,7 @@ from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.protocol.entries import answers_with_value
 
 if TYPE_CHECKING:
-    from rlightning_aio._core.hosts.running.env_steps import Execute
-    from rlightning_aio._core.hosts.running.row_writer import ShownResult
+    from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
 
 __all__ = ["Abandoned", "AwaitedRunner"]
 

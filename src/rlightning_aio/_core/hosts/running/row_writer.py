@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -31,12 +31,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.messages import OutOfBand
-    from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput
     from rlightning_aio.envs.fast_path import BareResult, BareStep
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset, MultiAgentEnvRet
 
-__all__ = ["RowWriter", "ShownResult", "infos_out_of_band"]
+__all__ = ["Execute", "GetInput", "RowWriter", "ShownResult", "infos_out_of_band"]
+
+Execute: TypeAlias = "Callable[[], OutOfBand | None]"
+"""Executes a step or a reset; returns the part of the result that is out of band."""
+GetInput: TypeAlias = "Callable[[], Any]"
+"""Returns the input of one step."""
 
 
 def infos_out_of_band(schema: InfoSchema) -> int:

@@ -27,7 +27,6 @@ from rlightning_aio._core.hosts.messages import (
     OutOfBand,
 )
 from rlightning_aio._core.hosts.running.env_calls import call_env
-from rlightning_aio._core.hosts.running.env_steps import step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
@@ -50,8 +49,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
-    from rlightning_aio._core.hosts.running.env_steps import Execute
-    from rlightning_aio._core.hosts.running.row_writer import ShownResult
+    from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta
@@ -103,8 +101,6 @@ class EnvRunner:
         inline: it lives in the trainer's process.
         fast_path: what the env offers to save time.
         step: steps with the action in the row.
-        begin_step: starts a step that the simulator computes by itself, and returns a function
-            that ends it. None if the env has no such step.
         is_awaitable: its requests are awaited, together with those of other envs.
 
     """
@@ -122,9 +118,7 @@ class EnvRunner:
         self._rebuild = rebuild
         # The env has raised, and is to be rebuilt; it was closed for that.
         self._is_spent = self._has_closed = False
-        self._on_stepped: Callable[[], None] | None = None
         self.step: Execute = self._not_attached
-        self.begin_step: Callable[[], Execute] | None = None
         self._read_action: Callable[[], Any] = _no_action
         self._has_result = False
         self._attach_again: Callable[[], None]
@@ -142,8 +136,6 @@ class EnvRunner:
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
         self._input = input_of(env)
-        if self._on_stepped is not None:
-            self.fast_path.on_stepped(self._on_stepped)
 
     def started(self) -> EnvStarted:
         """Return the description of the env that the trainer gets."""
@@ -174,11 +166,6 @@ class EnvRunner:
         self._has_result = False
         if slab.action is not None:
             self._read_action = row_reader(slab.action, row)
-        self._bind()
-
-    def _bind(self) -> None:
-        """Choose the functions that step the env with the action in its row."""
-        self.begin_step = None
         self.step = self._stepper()
 
     def execute(self, op: int, arguments: Any) -> Any:
@@ -256,11 +243,6 @@ class EnvRunner:
         self._note_reset()
         return out_of_band
 
-    def on_stepped(self, stepped: Callable[[], None]) -> bool:
-        """Have the env call `stepped`, see `FastPath.on_stepped`; also one that is rebuilt."""
-        self._on_stepped = stepped
-        return self.fast_path.on_stepped(stepped)
-
     def note_error(self, op: int, error: ErrorText) -> None:
         """Record what a request has raised."""
         self._is_spent |= self._rebuild is not None and error.ends_env(op)
@@ -299,18 +281,13 @@ class EnvRunner:
     # -- steps --------------------------------------------------------------------
 
     def _stepper(self) -> Execute:
-        """Return a function that steps with the action in the row; set `begin_step`."""
-        env, step_env, store, clock = self.env, self._step_env, self._store_step, time.monotonic_ns
-        if self._is_bare:
-            halves, store = self.fast_path.bare_step_async(), self._writer.write_step
-        else:
-            halves = (env.step_async, env.collect_async) if is_async_first(env) else None
+        """Return a function that steps with the action in the row."""
+        step_env, store, clock = self._step_env, self._store_step, time.monotonic_ns
         read_action, make = self._read_action, self._input
-        is_action = self._is_bare and not has_preprocess_fn(env)
+        is_action = self._is_bare and not has_preprocess_fn(self.env)
         get_input = read_action if is_action else lambda: make(read_action(), {})
-        if halves is not None:
-            self.begin_step = step_in_halves(*halves, get_input, store)
-        elif self._is_bare:
+        if self._is_bare:
+            store = self._writer.write_step
             short = self._writer.short_stepper(step_env, get_input)
             if short is not None:
                 return short
@@ -371,7 +348,7 @@ class EnvRunner:
         if self._writer.is_bypassed and self._writer.whole is not None:
             # The results hold tensors that stay here, so the writer is needed from now on.
             self._writer.is_bypassed = False
-            self._bind()
+            self.step = self._stepper()
 
 
 def _no_action() -> None:
