@@ -496,27 +496,6 @@ def test_an_episode_cut_by_the_step_limit_is_done() -> None:
     assert batch.info("episode", None) == [{"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
 
 
-def test_results_passed_as_objects_can_be_done() -> None:
-    """Results of an inline env stay whole, and their ends count."""
-    rets = [
-        EnvRet(env_id=id_, observation=0.0, last_reward=1.0, last_terminated=k == 0)
-        for k, id_ in enumerate(IDS[:2])
-    ]
-    batch = results(
-        columns(
-            [0, 1],
-            None,
-            flags=flags((2,), terminated=[True, False], truncated=[False, True]),
-            limit_reached=np.array([False, True]),
-            out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
-            whole_results=True,
-        )
-    )
-    assert batch["pendulum-0"] is rets[0]
-    assert batch.done.tolist() == [True, True]
-    assert batch.is_reset.tolist() == [False, False]
-
-
 # -- sent columns
 
 
@@ -1113,34 +1092,6 @@ def test_an_empty_batch_of_results_has_columns() -> None:
     batch = results()
     for name in ("done", "is_reset", "limit_reached", "restarted", "index"):
         assert len(getattr(batch, name)) == 0
-
-
-def test_the_step_limit_cuts_results_of_tensors() -> None:
-    """Envs with results passed as objects reach it one by one."""
-    torch = pytest.importorskip("torch")
-    no = torch.zeros(3, dtype=torch.bool)
-    rets = [
-        EnvRet(
-            env_id=id_,
-            observation=torch.zeros(3, 2),
-            last_reward=torch.zeros(3),
-            last_terminated=no,
-            last_truncated=no,
-        )
-        for id_ in IDS[:2]
-    ]
-    batch = results(
-        columns(
-            [0, 1],
-            None,
-            reward=np.zeros((2, 3)),
-            flags=flags((2, 3), truncated=[[False] * 3, [True] * 3]),
-            limit_reached=np.array([False, True]),
-            out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
-            whole_results=True,
-        )
-    )
-    assert batch.truncated.tolist() == batch.done.tolist() == [[False] * 3, [True] * 3]
 
 
 def test_tensors_that_do_not_stack_can_be_attached_to_responses() -> None:

@@ -1,4 +1,4 @@
-"""Tensors of envs with a bare step: tensors at every result inline, arrays from a process."""
+"""Tensors of envs with a bare step: observations stay tensors inline; all else is arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from rlightning_aio import EnvConfig, EnvRaised, sync
-from rlightning_aio.trees import as_numpy
+from rlightning_aio.trees import as_numpy, holds_tensor
 
 BOX = spaces.Box(-99, 99, (2,), np.float64)
 
@@ -64,7 +64,7 @@ class Single(gym.Env[Any, Any]):
     def step(self, action: Any) -> Any:
         self.steps += 1
         ended = Tensor(np.full(self.head, self.steps >= 3))
-        return self._observation(), self._of(self.steps), ended, self._of(0), {}
+        return self._observation(), self._of(self.steps), ended, self._of(0), {"at": self._of(1)}
 
 
 class Several(Single, gym.vector.VectorEnv[Any, Any, Any]):
@@ -91,8 +91,9 @@ def test_every_result_has_the_type_that_the_placement_gives(make: Any, placement
         for value in batch.values():
             assert type(value.observation) is kind
             assert np.all(as_numpy(value.observation) == steps)
-            assert np.all(as_numpy(value.last_reward) == (0 if batch.is_reset.all() else steps))
-            assert np.all(as_numpy(value.last_terminated) == (steps == 3))
+            assert np.all(value.last_reward == (0 if batch.is_reset.all() else steps))
+            assert np.all(value.last_terminated == (steps == 3))
+            assert not holds_tensor((value.last_reward, value.last_terminated, value.info))
 
     action = np.zeros((2, *make.head), int)
     with sync.build_env_group(config) as group:
@@ -115,6 +116,61 @@ def test_every_result_has_the_type_that_the_placement_gives(make: Any, placement
         check(batch, 2)
         batch, _ = group.step(batch.respond(action=action))
         check(batch, 3)
+
+
+class Failing(Several):
+    """Raises in its second step."""
+
+    def step(self, action: Any) -> Any:
+        if self.steps:
+            raise ValueError("lost its balance")
+        return super().step(action)
+
+
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_an_env_of_tensors_that_is_rebuilt_says_why(placement: str) -> None:
+    """Its first result is marked: the episode before is no failure of the policy."""
+    config = EnvConfig(name="t", task=Failing, placement=placement, on_env_error="restart")
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        for _ in range(2):
+            batch, _ = group.step(batch.respond(action=np.zeros((1, 3), int)))
+        assert batch.restarted.all()
+        assert batch.truncated.all()
+        (outcome,) = {*batch.outcome.ravel()}
+        assert (outcome.kind, outcome.blame) == ("env_raised", "either")
+        assert "lost its balance" in outcome.cause
+        assert "lost its balance" in batch.info("worker_restarted")[0]
+        assert batch["t-0"].last_truncated.all()
+        assert batch["t-0"].info["outcome"] == outcome
+        assert np.all(as_numpy(batch["t-0"].observation) == 0)
+        counts = [n for name, n in group.metrics().items() if name.endswith("outcomes_env_raised")]
+        assert counts == [1]
+
+
+class Wavering(Several):
+    """Returns tensors and arrays in turn."""
+
+    def _observation(self) -> Any:
+        found = super()._observation()
+        return found if self.steps % 2 else found.array
+
+
+def test_an_env_may_return_tensors_and_arrays() -> None:
+    """Results that are handed out together come each as its env returned it."""
+    config = EnvConfig(name="t", task=Wavering, placement="inline", num_workers=2)
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        group.step_async(batch.take([1]).respond(action=np.zeros((1, 3), int)))
+        batch, _ = group.collect_async()
+        group.step_async(batch.respond(action=np.zeros((1, 3), int)))
+        group.reset_async(env_ids=["t-0"])
+        batch, _ = group.collect_async(wait_all=True)
+        assert batch.observation.tolist() == [[[0, 0]] * 3, [[2, 2]] * 3]
+        group.step_async(batch.take([1]).respond(action=np.zeros((1, 3), int)))
+        group.reset_async(env_ids=["t-0"])
+        batch, _ = group.collect_async(wait_all=True)
+        assert [type(value.observation) for value in batch.values()] == [np.ndarray, Tensor]
 
 
 class OneReward(Several):

@@ -167,17 +167,6 @@ def test_an_env_may_leave_out_what_has_a_default(placement: str) -> None:
         assert ret.last_terminated == ret.last_truncated == {"a": False, "b": False}
 
 
-def test_an_inline_env_of_two_halves_starts_when_its_step_is_sent() -> None:
-    """The trainer works in parallel until it collects."""
-    with sync.build_env_group([entry("later", num_workers=2)]) as group:
-        batch, _ = group.reset()
-        group.step_async(batch.respond(action=np.array([1, 2])))
-        envs = [runner.env for runner in group._core.supervisor.hosts[0]._runners]
-        assert [env.steps for env in envs] == [101, 101]
-        batch, _ = group.collect_async(wait_all=True)
-        assert batch.reward.tolist() == [1, 2]
-
-
 @pytest.mark.parametrize("space", [gym.spaces.Dict(), gym.spaces.Tuple(())])
 def test_an_action_space_may_be_empty(space: gym.Space[Any]) -> None:
     """Such an env acts without a choice."""
@@ -214,7 +203,7 @@ class Tensor:
 
 
 def test_defaults_also_hold_for_envs_that_return_tensors() -> None:
-    """Tensors of inline envs bypass the row; their rewards and ends are like any other's."""
+    """Only the observation bypasses the row."""
 
     class OfTensors(Tacit):
         def _observation(self) -> Any:

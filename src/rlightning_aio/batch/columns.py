@@ -38,7 +38,6 @@ class ResultColumns(msgspec.Struct):
         info_marks, info: see `protocol.info`; None if no row has an info.
         schemas: for each slot, the schemas of its worker by number.
         out_of_band: values that did not fit a row, by row, pickled or plain.
-        whole_results: True if `out_of_band` has complete results, which are never pickled.
         episode_return, episode_length: of episodes that have ended or were cut; None without any.
         limit_reached: ``[n]``, True if the step limit has cut the episode; None if it is nowhere.
         restarted: ``[n]``, True if the previous episode was lost with its worker; likewise.
@@ -66,7 +65,6 @@ class ResultColumns(msgspec.Struct):
     sent_ns: NDArray[np.int64] | None = None
     agents: tuple[str, ...] = ()
     observation_space: gym.Space[Any] | None = None
-    whole_results: bool = False
 
     def __len__(self) -> int:
         return len(self.slots)
@@ -160,12 +158,9 @@ class ResultColumns(msgspec.Struct):
 
     def observation_of(self, row: int) -> Any:
         """Observation of one env."""
-        kept = self.out_of_band_of(row) if self.out_of_band else {}
-        if "ret" in kept:
-            return kept["ret"].observation
         if self.observation is not None:
             return index(self.observation, row)
-        return kept["observation"]
+        return self.out_of_band_of(row)["observation"]
 
     def info_of(self, row: int) -> dict[str, Any]:
         """Info of one env, with the sums of its episode if that has just ended."""
@@ -176,8 +171,6 @@ class ResultColumns(msgspec.Struct):
     def reported_info_of(self, row: int) -> dict[str, Any]:
         """Info of one env, as the env reported it."""
         kept = self.out_of_band_of(row) if self.out_of_band else {}
-        if "ret" in kept:
-            return kept["ret"].info
         return kept["info"] if "info" in kept else self._info_in_row(row)
 
     def may_hold(self, row: int, keys: Iterable[str]) -> bool:

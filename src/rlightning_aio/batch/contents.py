@@ -22,8 +22,6 @@ from rlightning_aio.batch.parts import (
     reported_infos_of_parts,
     rows_in_order,
 )
-from rlightning_aio.batch.rets import rets_of
-from rlightning_aio.trees import walked, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,17 +74,8 @@ def are_over(batch: BatchedData) -> list[bool]:
 
 
 def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
-    if not part.whole_results:
-        done = part.done
-        return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
-    flags = [_all_flags(ret.last_terminated, ret.last_truncated) for ret in rets_of(part)]
-    return np.array(flags, np.bool_)
-
-
-def _all_flags(terminated: Any, truncated: Any) -> bool:
-    """Return True if one of the two is set for each agent and sub-environment."""
-    either = zipped(np.logical_or, terminated, truncated)
-    return all(np.all(flags) for _, flags in walked(either))
+    done = part.done
+    return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
 
 
 def lost_rows(batch: BatchedData) -> set[int]:

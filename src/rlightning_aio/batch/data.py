@@ -196,7 +196,7 @@ class BatchedData:
         """
         parts = self._parts
         if parts:
-            columns = None if len(parts) > 1 or parts[0].whole_results else parts[0].observation
+            columns = None if len(parts) > 1 else parts[0].observation
             return observations_of_parts(parts) if columns is None else columns
         return stacked_values([value.observation for value in self.values()])
 
@@ -226,7 +226,7 @@ class BatchedData:
 
         ``[n]`` bool, ``[n, num_envs]`` with sub-environments, or a dict of such by agent.
         """
-        if len(self._parts) == 1 and not self._parts[0].whole_results:
+        if len(self._parts) == 1:
             return self._parts[0].stacked_head("done")
         if not len(self):
             return self.limit_reached
@@ -437,7 +437,7 @@ def plain_columns(batch: BatchedData) -> ResultColumns | None:
     if len(parts) != 1:
         return None
     part = parts[0]
-    unlike = part.positions is not None or part.whole_results or part.agents
+    unlike = part.positions is not None or part.agents
     return None if unlike or part.observation is None or not len(part.slots) else part
 
 
@@ -515,7 +515,7 @@ def answer_of(batch: BatchedData, issuer: object) -> tuple[NDArray[np.intp], dic
 
 def _head(batch: BatchedData, column: str, attribute: str) -> Any:
     """A column of rewards or flags, by agent if there are agents."""
-    if len(batch._parts) == 1 and not batch._parts[0].whole_results:
+    if len(batch._parts) == 1:
         part = batch._parts[0]
         return part.stacked_head(column) if part.agents else getattr(part, column)
     return stacked_values([getattr(value, attribute) for value in batch.values()])

@@ -82,7 +82,7 @@ def _layout(part: ResultColumns) -> Any:
     The schemas are part of it, because a replaced worker's rows need the schemas of that worker.
     """
     forms = [(path, _form(array)) for path, array in walked(part.observation)]
-    if part.whole_results or any(form is None for _, form in forms):
+    if any(form is None for _, form in forms):
         return None
     return (
         key_of(part.observation, _form),

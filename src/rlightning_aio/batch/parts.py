@@ -87,7 +87,7 @@ def observations_of_parts(parts: Sequence[ResultColumns]) -> Any:
     """
     values = [part.observation_of(row) for part, row in rows_in_order(parts)]
     known = [part.observation_space for part in parts if part.observation_space is not None]
-    if parts[0].whole_results or len(known) < len(parts):
+    if len(known) < len(parts):
         return stacked_values(values)
     return _stacked_in(known, values)
 

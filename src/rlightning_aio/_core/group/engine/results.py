@@ -16,7 +16,7 @@ from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import Rows, gather
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import TRUNCATED
-from rlightning_aio.trees import mapped, stacked
+from rlightning_aio.trees import holds_tensor, index, mapped, stacked
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.sent import Sources
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.trees import Tree
 
 __all__ = ["Results"]
 
@@ -167,7 +168,7 @@ class Results:
 
         Takes nothing away: should memory run out, they can be gathered again.
         """
-        layout, width, restarted, whole = self._layout, self._info_width, None, False
+        layout, width, restarted = self._layout, self._info_width, None
         if len(layout.slabs) == 1:
             chosen: list[_Chosen] = [(layout.slabs[0], slots, None)]
         else:
@@ -191,13 +192,11 @@ class Results:
                 restarted = self._restarted[own]
                 # Here and not in the row, where envs write their flags only when they change.
                 flags[restarted, ..., TRUNCATED] = True
-            out_of_band, whole = (
-                self._out_of_band_of(own, marks) if self._out_of_band else ({}, False)
-            )
-            if in_rows:
-                observation = others[-1]
-            else:
-                observation, out_of_band = self._observations(slab, rows, out_of_band)
+            observation = others[-1] if in_rows else self._observations(slab, rows)
+            out_of_band: dict[int, Any] = {}
+            if self._out_of_band:
+                out_of_band = self._out_of_band_of(own, marks)
+                observation = _handed_over(slab, observation, out_of_band, len(own))
             parts.append(
                 ResultColumns(
                     slots=own,
@@ -215,7 +214,6 @@ class Results:
                     sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
                     agents=slab.layout.agents,
                     observation_space=slab.layout.observation_space,
-                    whole_results=whole,
                 )
             )
         return parts
@@ -269,58 +267,63 @@ class Results:
 
     def _out_of_band_of(
         self, slots: NDArray[np.intp], info_marks: NDArray[np.uint8] | None
-    ) -> tuple[dict[int, Any], bool]:
-        """Return out-of-band data of `slots` by batch row, and True if any is a whole result.
+    ) -> dict[int, Any]:
+        """Return out-of-band data of `slots` by batch row.
 
         Mark the infos among it in `info_marks`, gathered from rows that may still mark their own.
         """
         found: dict[int, Any] = {}
-        whole = False
         for row, slot in enumerate(slots.tolist()):
             kept = self._out_of_band.get(slot)
             if kept is None:
                 continue
             found[row] = kept
-            if type(kept) is dict:
-                whole = whole or "ret" in kept
-                if info_marks is not None and "info" in kept:
-                    info_marks[row] = PICKLED
-        return found, whole
+            if type(kept) is dict and info_marks is not None and "info" in kept:
+                info_marks[row] = PICKLED
+        return found
 
-    def _observations(
-        self, slab: Slab, rows: Rows, out_of_band: dict[int, Any]
-    ) -> tuple[Any, dict[int, Any]]:
-        """Fresh columns, and what is out of band beside them.
-
-        Read-only views where the group hands those out and the rows allow it. What envs have
-        handed over as it is becomes columns; that of one alone isn't copied.
-        """
+    def _observations(self, slab: Slab, rows: Rows) -> Any:
+        """Fresh columns, or read-only views where the group has those and the rows allow it."""
         if slab.observation is None:
-            handed_over = slab.layout.observations_out_of_band and len(out_of_band) > 0
-            if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
-                return None, out_of_band
-            if len(out_of_band) == 1:
-                ((row, kept),) = out_of_band.items()
-                beside = dict(kept)
-                return stacked([beside.pop("observation")]), {row: beside}
-            columns = stacked([kept["observation"] for kept in out_of_band.values()])
-            beside = {
-                row: {name: value for name, value in kept.items() if name != "observation"}
-                for row, kept in out_of_band.items()
-            }
-            return columns, beside
+            return None
         # The rows of envs that join change without a request.
         has_views = self._zero_copy and slab.sent_ns is None
         contiguous = _contiguous(rows) if has_views else None
         if contiguous is None:
-            return gather(slab.observation, rows), out_of_band
+            return gather(slab.observation, rows)
 
         def view(array: NDArray[Any]) -> NDArray[Any]:
             part = array[contiguous]
             part.flags.writeable = False
             return part
 
-        return mapped(view, slab.observation), out_of_band
+        return mapped(view, slab.observation)
+
+
+def _handed_over(
+    slab: Slab, observation: Any, out_of_band: dict[int, Any], count: int
+) -> Tree | None:
+    """Return the column of the observations of `count` rows, some of which may be out of band.
+
+    None if `out_of_band` has all of them, where tensors stay on their device. What envs hand over
+    as fresh arrays becomes a column; that of one alone isn't copied.
+    """
+    kept: dict[int, dict[str, Any]] = {
+        row: one for row, one in out_of_band.items() if type(one) is dict
+    }
+    beside = {row: one["observation"] for row, one in kept.items() if "observation" in one}
+    if not beside:
+        return observation
+    if slab.layout.observations_out_of_band and not any(map(holds_tensor, beside.values())):
+        for row in beside:
+            out_of_band[row] = {k: v for k, v in kept[row].items() if k != "observation"}
+        return stacked([*beside.values()])
+    if observation is not None and len(beside) < count:  # Some have returned arrays.
+        for row in set(range(count)) - beside.keys():
+            found = out_of_band.get(row, {})
+            own = pickle.loads(found) if isinstance(found, bytes) else found
+            out_of_band[row] = {**own, "observation": index(observation, row)}
+    return None
 
 
 def _without_rows(column: NDArray[Any]) -> NDArray[Any]:

@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
-from rlightning_aio.envs.base import result_of
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import fitted_tree, row_reader, row_writer
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.trees import as_numpy, copied, holds_tensor
-from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,7 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio.envs.fast_path import BareResult, BareStep
     from rlightning_aio.protocol.slab import Slab
-    from rlightning_aio.types import Autoreset, MultiAgentEnvRet
+    from rlightning_aio.types import Autoreset
 
 __all__ = ["Execute", "GetInput", "RowWriter", "ShownResult", "infos_out_of_band"]
 
@@ -55,13 +53,11 @@ class ShownResult:
 
     Attributes:
         observation, info: of the result.
-        whole: the result itself, where it was returned without a copy.
         returns, lengths, over: of the current episodes, in the shape of the row's columns.
     """
 
     observation: Any
     info: dict[str, Any]
-    whole: Any
     returns: NDArray[Any]
     lengths: NDArray[Any]
     over: NDArray[Any]
@@ -75,12 +71,11 @@ class RowWriter:
         env_id: named in errors.
         autoreset: when sub-environments reset themselves; see `EnvMeta`.
         announce: sends a new schema of infos to the trainer, and returns its number.
-        stays_here: data out of band stays in this process: it must be copied, and tensors, which
-            become NumPy arrays elsewhere, are handed over as they are.
+        stays_here: data out of band stays in this process: it must be copied, and an observation
+            that holds tensors, which become NumPy arrays elsewhere, is handed over as it is.
 
     Attributes:
-        whole: the last result if it was handed over whole, because it holds tensors that stay in
-            this process; otherwise None.
+        holds_tensor: the last observation does, and stays in this process.
         is_bypassed: the function of `short_stepper` writes into the row, too.
     """
 
@@ -108,7 +103,7 @@ class RowWriter:
             )
         self._infos = InfoWriter(memoryview(slab.info[row]), announce)
         self._last_out_of_band: OutOfBand = {}
-        self.whole: Any = None
+        self.holds_tensor = False
         self.is_bypassed = False
         self._times = _view(slab.times[row])
         # With an ellipsis, an element of a plain column is a view, too.
@@ -127,7 +122,6 @@ class RowWriter:
         result: BareResult,
         busy_ns: int,
         extra: dict[str, Any] | None = None,
-        whole: EnvRet | MultiAgentEnvRet | None = None,
     ) -> OutOfBand | None:
         """Write the result of a step, and return the part that is out of band.
 
@@ -138,7 +132,6 @@ class RowWriter:
                 over is not copied: `fresh_results` says that the env doesn't use it again.
             busy_ns: how long the env took.
             extra: `_extra` of the result.
-            whole: the result, if there is one already.
 
         Raises:
             ValueError: a shape doesn't fit.
@@ -147,14 +140,13 @@ class RowWriter:
         if self.is_bypassed:
             self._sums.row_changed()
         self._write_ends(*result[1:4])
-        return self._write_data(result, extra, whole, is_fresh=True)
+        return self._write_data(result, extra, is_fresh=self._hands_over)
 
     def write_reset(
         self,
         result: BareResult,
         busy_ns: int,
         extra: dict[str, Any] | None = None,
-        whole: EnvRet | MultiAgentEnvRet | None = None,
         *,
         is_loss: bool = False,
     ) -> OutOfBand | None:
@@ -169,7 +161,7 @@ class RowWriter:
         if is_loss:
             self._truncated[...] = True
         self._sums.begin()
-        return self._write_data(result, extra, whole, is_fresh=False)
+        return self._write_data(result, extra)
 
     def write_shown(self, shown_result: ShownResult) -> OutOfBand | None:
         """Write what `shown_result` has returned, and return the part that is out of band.
@@ -178,30 +170,26 @@ class RowWriter:
         """
         self._write_times(0)
         self._write_no_transition()
-        slab, row, whole = self._slab, self._row, shown_result.whole
+        slab, row = self._slab, self._row
         slab.over[row, ...] = shown_result.over
         slab.episode_return[row, ...] = shown_result.returns
         slab.episode_length[row, ...] = shown_result.lengths
         self._sums.row_changed()
-        if whole is not None:
-            self.whole = _without_transition(whole)
-            return {"ret": self.whole}
         result = shown_result.observation, 0.0, False, False, shown_result.info
-        return self._write_data(result, None, None, is_fresh=False)
+        return self._write_data(result, None)
 
     def shown_result(self) -> ShownResult:
         """Return a copy of the row and of what was out of band."""
-        slab, row, whole = self._slab, self._row, self.whole
+        slab, row = self._slab, self._row
         mark = int(slab.info_mark[row])
         last = self._last_out_of_band
         info = last.get("info", {}) if mark == PICKLED else self._infos.read(mark)
-        observation = None
-        if slab.observation is None:
+        if slab.observation is None or self.holds_tensor:
             observation = last.get("observation")
-        elif whole is None:
+        else:
             observation = row_reader(slab.observation, row)()
         sums = (slab.episode_return, slab.episode_length, slab.over)
-        return ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
+        return ShownResult(observation, info, *(column[row, ...].copy() for column in sums))
 
     def short_stepper(self, step: BareStep, get_input: GetInput) -> Execute | None:
         """Return a function that steps the env by `step` and writes the result by itself.
@@ -210,7 +198,7 @@ class RowWriter:
         """
         slab, row, write_observation = self._slab, self._row, self._write_observation
         resets_itself = self._autoreset == "same_step"
-        if slab.layout.head or write_observation is None or self.whole is not None:
+        if slab.layout.head or write_observation is None or self.holds_tensor:
             return None
         if self._autoreset != "disabled" and not resets_itself:
             return None
@@ -304,50 +292,40 @@ class RowWriter:
         self,
         result: BareResult,
         extra: dict[str, Any] | None,
-        whole: EnvRet | MultiAgentEnvRet | None,
         *,
-        is_fresh: bool,
+        is_fresh: bool = False,
     ) -> OutOfBand | None:
         """Write observation and info, and return the part that is out of band.
 
-        Where `is_fresh`, what is handed over is not copied.
+        Where `is_fresh`, that is not copied.
         """
         observation, info = result[0], result[4]
-        self.whole = None
-        if type(observation) is not np.ndarray and holds_tensor(observation):
-            if self._stays_here:
-                self.whole = result_of(self._env_id, result) if whole is None else whole
-                return {"ret": self.whole}
-            observation = as_numpy(observation)
-        if self._hands_over:
-            space = self._slab.layout.observation_space
-            observation = fitted_tree(space, observation, "observation")
-            return self._kept({"observation": observation, "info": info}, is_fresh=is_fresh)
         out_of_band: OutOfBand = {}
-        if self._write_observation is None:
+        self.holds_tensor = False
+        if type(observation) is not np.ndarray and holds_tensor(observation):
+            self.holds_tensor = self._stays_here
+            observation = observation if self._stays_here else as_numpy(observation)
+        if self.holds_tensor or self._write_observation is None:
+            if self._hands_over and not self.holds_tensor:
+                space = self._slab.layout.observation_space
+                observation = fitted_tree(space, observation, "observation")
             out_of_band["observation"] = observation
         else:
             self._write_observation(observation)
         mark = self._slab.info_mark[self._row] = self._infos.write(info)
         if mark == PICKLED:
-            out_of_band["info"] = as_numpy(info)
+            out_of_band["info"] = info
         if extra:
             out_of_band["extra"] = extra
-        return self._kept(out_of_band) if out_of_band else None
+        return self._kept(out_of_band, is_fresh=is_fresh) if out_of_band else None
 
     def _kept(self, out_of_band: OutOfBand, *, is_fresh: bool = False) -> OutOfBand:
         """Return `out_of_band` for the trainer to keep; pickling copies it for other processes."""
+        if "info" in out_of_band:
+            out_of_band["info"] = as_numpy(out_of_band["info"])
         copies = self._stays_here and not is_fresh
         self._last_out_of_band = copied(out_of_band) if copies else out_of_band
         return self._last_out_of_band
-
-
-def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:
-    """Copy a result without its reward and ends."""
-    nothing: dict[str, Any] = {}
-    reward, end = (0.0, False) if isinstance(result, EnvRet) else (nothing, nothing)
-    ends = {"last_terminated": end, "last_truncated": end}
-    return result.model_copy(update={"last_reward": reward, **ends})
 
 
 def _view(array: NDArray[Any]) -> memoryview[Any]:

@@ -93,8 +93,8 @@ class EnvRunner:
 
     Args:
         env: built, not yet initialised.
-        inline: results stay in this process. Results that hold torch tensors are then returned
-            without a copy; elsewhere tensors become NumPy arrays on the CPU.
+        inline: results stay in this process. Observations that hold torch tensors are then
+            returned without a copy; all other tensors become NumPy arrays on the CPU.
         rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
 
     Attributes:
@@ -340,13 +340,13 @@ class EnvRunner:
         ends = result.last_reward, result.last_terminated, result.last_truncated
         parts = result.observation, *ends, result.info
         write = self._writer.write_reset if method == "reset" else self._writer.write_step
-        return write(parts, busy_ns, result._extra, result)  # pyright: ignore[reportPrivateUsage]
+        return write(parts, busy_ns, result._extra)  # pyright: ignore[reportPrivateUsage]
 
     def _note_reset(self) -> None:
         """Record that the row holds a result that no transition has led to."""
         self._has_result = True
-        if self._writer.is_bypassed and self._writer.whole is not None:
-            # The results hold tensors that stay here, so the writer is needed from now on.
+        if self._writer.is_bypassed and self._writer.holds_tensor:
+            # The observations are tensors that stay here, so the writer is needed from now on.
             self._writer.is_bypassed = False
             self.step = self._stepper()
 
