@@ -145,7 +145,7 @@ def test_an_env_of_tensors_that_is_rebuilt_says_why(placement: str) -> None:
         assert batch["t-0"].info["outcome"] == outcome
         assert np.all(as_numpy(batch["t-0"].observation) == 0)
         counts = [n for name, n in group.metrics().items() if name.endswith("outcomes_env_raised")]
-        assert counts == [1]
+        assert counts == [3]
 
 
 class Wavering(Several):
