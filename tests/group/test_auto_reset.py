@@ -120,10 +120,8 @@ async def test_an_env_whose_episode_ended_is_reset(start: Any, what: int) -> Non
 
 
 @pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_a_reset_that_is_due_survives_from_one_context_to_the_next(
-    start: Any, what: int
-) -> None:
-    """With one context for each rollout, no step follows an end, wherever the end was seen."""
+async def test_an_end_is_remembered_from_one_context_to_the_next(start: Any, what: int) -> None:
+    """No step in a context follows an end, wherever it was seen; a cut episode goes on."""
     group = await start(ENTRY)
     await group.reset()
     await group.step(responses("probe-0", what=what))  # These end before the first context.
@@ -144,7 +142,7 @@ async def test_a_reset_that_is_due_survives_from_one_context_to_the_next(
     assert steps_of(batch) == [3], "steps outside a context have no flags"
     with group.auto_reset(max_episode_steps=4, on_done=False):
         batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([2, 0, 4], [False, False, True])
+        assert (steps_of(batch), flags) == ([2, 3, 4], [False, False, True])
 
 
 async def test_each_entry_has_its_own_limit(start: Any) -> None:
@@ -284,59 +282,3 @@ async def test_a_step_that_raises_does_not_count(start: Any) -> None:
         assert (await group.step(responses("probe-0")))[1] == [True]
         batch, _ = await group.step(responses("probe-0", what=RAISE))
         assert steps_of(batch) == [0], "the action of a reset is ignored"
-
-
-# -- outside
-
-
-def said(caplog: pytest.LogCaptureFixture) -> list[str]:
-    """Return the warnings of steps past an end, and forget them."""
-    found = [r.getMessage() for r in caplog.records if "although its episode is over" in r.message]
-    caplog.clear()
-    return found
-
-
-@pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_a_step_past_an_end_is_warned_of_once_for_each_entry(
-    start: Any, what: int, caplog: pytest.LogCaptureFixture
-) -> None:
-    """It names the env and what to do; the step itself is made."""
-    group = await start([ENTRY, {**ENTRY, "name": "other"}])
-    ids = group.env_ids
-    await group.reset()
-    await group.step(responses("probe-1", what=what))
-    await group.step(responses("probe-0", "probe-2", "other-0"))
-    assert said(caplog) == [], "those are not over"
-    group.step_async(responses(*ids))
-    batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(steps_of(batch)) == [1, 1, 2, 2, 2, 2]
-    (message,) = said(caplog)
-    assert message.startswith("env 'probe-1' (entry 'probe'")
-    assert "group.reset(env_ids=…)" in message
-    assert "auto_reset(" in message
-    for _ in range(2):
-        await group.step(responses(*ids[:3], what=what))
-    assert said(caplog) == [], "once for each entry"
-    await group["other-2"].step([what, 1.0])
-    await group["other-2"].step([DO_NOTHING, 1.0])
-    (message,) = said(caplog)
-    assert message.startswith("env 'other-2' (entry 'other'")
-
-
-async def test_no_step_past_an_end_is_warned_of_where_none_is_made(
-    start: Any, caplog: pytest.LogCaptureFixture
-) -> None:
-    """After a reset, and inside a context, with `on_done=False` too."""
-    group = await start(ENTRY)
-    await group.reset()
-    await group.step(responses(*IDS, what=END))
-    await group.reset()
-    await group.step(responses(*IDS, what=END))
-    with group.auto_reset(9):
-        await group.step(responses(*IDS))
-        await group.step(responses(*IDS, what=END))
-    with group.auto_reset(9, on_done=False):
-        await group.step(responses(*IDS))
-    assert said(caplog) == []
-    await group.step(responses(*IDS))
-    assert len(said(caplog)) == 1

@@ -97,9 +97,7 @@ def test_an_env_that_shows_a_saved_state_is_at_its_place_in_the_episode() -> Non
     continuity.begin(3, on_done=True)
     continuity.note_restores(SLOT, [Position(3, is_cut=True)])
     shown = part_of([0], [True], [False])
-    judged = continuity.judge(SLOT, [shown])
-    continuity.returned(SLOT, [shown], judged)
-    assert judged.is_cut is None
+    assert continuity.returned(SLOT, [shown]) is None
     assert continuity.positions(SLOT) == [Position(3, is_cut=True)]
     assert continuity.due.tolist() == [True]
 
@@ -114,7 +112,7 @@ def test_a_state_that_could_not_be_shown_does_not_count(lose: bool) -> None:
     else:
         continuity.ended_without_result(0)
     first = part_of([0], [True], [False])
-    continuity.returned(SLOT, [first], continuity.judge(SLOT, [first]))
+    continuity.returned(SLOT, [first])
     assert continuity.positions(SLOT) == [Position(0, is_cut=False)]
 
 

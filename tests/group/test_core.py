@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
 import pytest
-from group.fake_host import PLAIN, RAISES, FakeGroup
+from group.fake_host import PLAIN, RAISES, TERMINATES, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.hosts.messages import Lost, Withdrawn
+from rlightning_aio._core.hosts.messages import Lost, Result, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     EnvBusy,
@@ -244,25 +245,24 @@ def test_an_error_of_a_cancelled_call_keeps_its_env_busy(new_group: NewGroup) ->
     group.steps.step_async(steps(0, 1), group.now)
 
 
-def test_an_error_that_could_not_be_raised_keeps_its_env_busy(new_group: NewGroup) -> None:
-    """Something else was raised in its place; the next collect raises it."""
-    group = new_group(2)
-    actions = [PolicyResponse("fake-0", RAISES), PolicyResponse("fake-1", PLAIN)]
-    batch = BatchedData(["fake-0", "fake-1"], actions)
-    stepping = group.begin(group.steps.step(batch, group.now))
+def test_an_unreadable_info_raises_only_when_it_is_read(
+    new_group: NewGroup, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sums read it where an episode ends; the result is handed out all the same."""
+    group = new_group(1)
+    (host,) = group.hosts
+
+    def reply(entry: int, *_: Any, **__: Any) -> None:
+        host.answer(Result(host.host_id, entry, b"no pickle"))
+
+    monkeypatch.setattr(host, "_reply", reply)
+    group.steps.step_async(steps(0, action=TERMINATES), group.now)
+    host.slab.episode_length[0] = 1
     group.finish(0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(group.core.results, "gather", Mock(side_effect=MemoryError))
-        group.finish(1)
-        with pytest.raises(MemoryError):
-            stepping.result()
-    assert group.core.pending() == ["fake-0", "fake-1"]
-    with pytest.raises(EnvBusy, match="fake-0"):
-        group.steps.step_async(steps(0), group.now)
-    with pytest.raises(EnvRaised):
-        collect(group).result()
-    assert ids_of(collect(group)) == ["fake-1"]
-    assert group.core.pending() == []
+    batch, _ = collect(group).result()
+    assert batch.done.tolist() == [True]
+    with pytest.raises(pickle.UnpicklingError):
+        batch.info()
 
 
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])

@@ -125,7 +125,7 @@ class Request:
         kills: it ends the worker, unless that ends before.
         interrupted: Ctrl-C may have ended it, in an env of this process.
         deaths: of the host, before it was sent.
-        before: whether the env was in limbo, and cut, before it was sent.
+        before: whether the env was in limbo before it was sent.
         seeds: of which one is its seed: that of a client depends on who else is there.
     """
 
@@ -139,7 +139,7 @@ class Request:
     kills: bool = False
     interrupted: bool = False
     deaths: int = 0
-    before: tuple[bool, bool] = (False, False)
+    before: bool = False
     seeds: Sequence[int] = ()
     saved: Sequence[State] = ()
 
@@ -444,17 +444,14 @@ class Model:
             self.counts["asked as they were back"] += 1
         is_idle = env.idle or not (env.is_known or env.request)
         require(is_idle, "a busy env was asked again", env.env_id)
-        request.before, request.deaths = (env.limbo, env.state.cut), env.deaths
+        request.before, request.deaths = env.limbo, env.deaths
         context = self.context
         if env.client is not None:
             if request.kind == "reset" or context is not None:
                 env.client.asked.append(("reset", 0))
             env.client.asked.extend(request.acts)
-        if request.kind == "step":
-            if context is None:
-                env.state.cut = False
-            else:
-                request.due = env.state.cut or (context.on_done and env.state.ended)
+        if request.kind == "step" and context is not None:
+            request.due = env.state.cut or (context.on_done and env.state.ended)
         acts = env.state.copy().faults(request)
         effects = [effect for effect, _ in acts]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
@@ -469,7 +466,7 @@ class Model:
     def withdraw(self, env: Env) -> None:
         """Note that its request was not accepted after all."""
         assert env.request is not None
-        (env.limbo, env.state.cut), env.request = env.request.before, None
+        env.limbo, env.request = env.request.before, None
 
     def orphan(self, owner: Any) -> None:
         """Note that a call no longer waits: its results go to the collector, its values nowhere."""
@@ -574,6 +571,8 @@ class Model:
         compare(env, played[found[0]], row)
         env.adopt(*[states[k] for k in found])
         env.put_away = False
+        if self.context is None:
+            env.state.cut = False
         self.counts["restored"] += 1
 
     def limit_of(self, env: Env) -> float:

@@ -687,6 +687,8 @@ class Play(Session):
     def leave(self) -> None:
         self.context.__exit__(None, None, None)
         self.context = self.model.context = None
+        for env in self.model.envs.values():
+            env.state.cut = False
 
     # -- operations: calls and handles
 

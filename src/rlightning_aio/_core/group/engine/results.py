@@ -164,10 +164,7 @@ class Results:
     # -- what goes out ----------------------------------------------------------------
 
     def gather(self, slots: NDArray[np.intp]) -> list[ResultColumns]:
-        """Copy the results of `slots` out of their rows: one part for each layout.
-
-        Takes nothing away: should memory run out, they can be gathered again.
-        """
+        """Copy the results of `slots` out of their rows: one part for each layout."""
         layout, width, restarted = self._layout, self._info_width, None
         if len(layout.slabs) == 1:
             chosen: list[_Chosen] = [(layout.slabs[0], slots, None)]

@@ -22,7 +22,7 @@ from rlightning_aio._core.group.engine.actions import (
     write_actions,
     write_column,
 )
-from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, PAST_END, UNLIKE_ENVS
+from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
 from rlightning_aio.batch.contents import slots_of
@@ -279,8 +279,6 @@ class Steps:
         if self._supervisor.members.possible:
             batch, slots = self._arrivals.drop_gone(batch, slots)
         self._dispatch.check_sendable(now, slots, "step")
-        if self._conditions.unusual & PAST_END:
-            self._continuity.warn_of_ended(slots)
         if not len(slots):
             return slots, None
         out_of_band = write_actions(batch, slots, self._envs, self._layout)
@@ -308,7 +306,7 @@ class Steps:
             for ring in requests.publish(slots, self._continuity.due[slots], owner, now):
                 ring.wake()
             return
-        resets = self._continuity.begin_steps(slots)
+        resets = self._continuity.due[slots]
         if self._continuity.exceptional:
             reports = self._continuity.report_losses(slots)
             self._layout.write_seeds(slots[reports], np.full(np.count_nonzero(reports), AS_BEFORE))
@@ -336,32 +334,22 @@ class Steps:
         fault = ticket.faults[0]
         fault.others = tuple(ticket.faults[1:])
         if len(done):
-            try:
-                fault.results = self.hand_out(done)[0]
-            except BaseException:
-                for unraised, own in ticket.failures():
-                    self._requests.collector.keep(own, unraised)
-                raise
+            fault.results = self.hand_out(done)[0]
             others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
             fault.add_note(f"the results of {others} of the same call are in the error's `results`")
         self.note_freed(ticket.errors)
         raise fault
 
     def hand_out(self, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
-        """Return the results of `slots`, all ready.
-
-        They stay ready until the batch is complete: if memory runs out on the way, the next
-        collect returns them.
-        """
-        results, continuity, observer = self._results, self._continuity, self._observed.observer
+        """Return the results of `slots`, all ready."""
+        results, observer = self._results, self._observed.observer
         try:
             parts = results.gather(slots)
             flagged: list[ResultColumns] = []
             for part in parts:  # A comprehension is a call more.
                 if b"\1" in part.flags.tobytes():
                     flagged.append(part)  # noqa: PERF401
-            judged = continuity.judge(slots, flagged)
-            is_cut = judged.is_cut
+            is_cut = self._continuity.returned(slots, flagged)
             for part in flagged if is_cut is None else parts:
                 if is_cut is not None:
                     self._mark_cut(part, is_cut)
@@ -369,15 +357,11 @@ class Steps:
             batch = batch_of_results(
                 parts, self._tables, slots, self._envs.names, results.sources(slots)
             )
-            self._driver.check_interrupt()
             self._sums.add(parts)
-            continuity.returned(slots, flagged, judged)
+        finally:
             if self._conditions.unusual & BESIDE_ROWS:
                 results.let_go(slots)
             self._requests.hand_out(slots)
-        except BaseException:
-            self._requests.requeue(slots)
-            raise
         if observer is not None:
             observer.note_results(parts)
         if self._arrivals.held_back or self._sums.num_batches >= self._hint.due:

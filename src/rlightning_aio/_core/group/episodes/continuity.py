@@ -8,29 +8,22 @@ callers say what was sent, answered and returned.
 
 from __future__ import annotations
 
-import logging
 import math
 import operator
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio._core.group.state.conditions import (
-    CUT_BEFORE,
-    LOST_EPISODE,
-    PAST_END,
-    Conditions,
-)
+from rlightning_aio._core.group.state.conditions import LOST_EPISODE, Conditions
 from rlightning_aio.protocol.slab import IS_RESET, OVER
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio.batch.columns import ResultColumns
@@ -46,7 +39,6 @@ __all__ = [
     "as_int",
 ]
 
-_log = logging.getLogger("rlightning_aio")
 _NO_LIMIT: Final = 1 << 62
 
 
@@ -98,22 +90,6 @@ class Report(NamedTuple):
     why: Loss
 
 
-class Judged(msgspec.Struct):
-    """What a batch of results changes, once it is returned to the caller.
-
-    Attributes:
-        num_steps: of each slot's episode after the result.
-        is_cut: the step limit cuts the episode at this result; None if it cuts none.
-        restored: slots whose results show a state that was put back.
-        begun: of each part with flags, the slots that were reset with all their sub-environments.
-    """
-
-    num_steps: NDArray[np.int64]
-    is_cut: NDArray[np.bool_] | None
-    restored: Sequence[int]
-    begun: Sequence[NDArray[np.intp]]
-
-
 @dataclass(slots=True)
 class _Loss:
     """The phase of one env that is not intact, and why its episode was lost."""
@@ -140,8 +116,6 @@ class Continuity:
         # The last returned result reached the step limit; ended the episode by itself.
         self._cut = np.zeros(len(envs), np.bool_)
         self._ended = np.zeros(len(envs), np.bool_)
-        # Of entries that were warned of a step past an end.
-        self._warned = np.zeros(len(envs), np.bool_)
         self._limits: NDArray[np.int64] | None = None
         self._uses_own_limits = False
         self._resets_ended = True
@@ -172,7 +146,6 @@ class Continuity:
         self._margin = 0
         self._resets_ended = on_done
         self.auto_reset_is_open = True
-        self._conditions.note(CUT_BEFORE | PAST_END, False)
         self._update_due()
 
     def _chosen_limits(self, given: float | None, *, needs_limits: bool) -> NDArray[np.int64]:
@@ -208,10 +181,16 @@ class Continuity:
         return np.where((limits == 0) | self._envs.resets_itself[slots], _NO_LIMIT, limits)
 
     def end(self) -> None:
-        """Close the context: steps are plain again."""
+        """Close the context: steps are plain again, and no env is due for a reset."""
         self._limits = None
         self.auto_reset_is_open = False
-        self._update_due()
+        self.due[:] = self._cut[:] = False
+
+    def _update_due(self) -> None:
+        if self._resets_ended:
+            np.logical_or(self._cut, self._ended, out=self.due)
+        else:
+            self.due[:] = self._cut
 
     def note_joined(self, slot: int) -> None:
         """Use the limit of the env that has just joined at `slot`."""
@@ -220,39 +199,6 @@ class Continuity:
             self._margin = 0
 
     # -- requests ---------------------------------------------------------------------
-
-    def begin_steps(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Note steps that are about to be sent; return which of `slots` are reset instead."""
-        if not self.auto_reset_is_open and len(self._cut[slots].nonzero()[0]):
-            self._cut[slots] = False  # Outside the context a step continues the episode.
-            self._update_due()
-        return self.due[slots]
-
-    def warn_of_ended(self, slots: NDArray[np.intp]) -> None:
-        """Warn, once for each entry, that envs of `slots` are stepped although they are over."""
-        entries = self._envs.names.entries
-        over: list[int] = slots[self._ended[slots] & ~self._warned[slots]].tolist()
-        for slot in over:
-            if not self._warned[slot]:
-                self._warned |= entries == entries[slot]
-                _log.warning(
-                    "%s is stepped although its episode is over: reset it (group.reset(env_ids=…))"
-                    ", or step inside `with group.auto_reset(math.inf):`, where envs are reset in "
-                    "place of such a step; this is not said again of its entry",
-                    self._envs.describe(slot),
-                )
-        self._update_due()
-
-    def _update_due(self) -> None:
-        if not self.auto_reset_is_open:
-            self.due[:] = False
-            self._conditions.note(CUT_BEFORE, len(self._cut.nonzero()[0]) > 0)
-            over = self._ended & ~self._warned
-            self._conditions.note(PAST_END, len(over.nonzero()[0]) > 0)
-        elif self._resets_ended:
-            np.logical_or(self._cut, self._ended, out=self.due)
-        else:
-            self.due[:] = self._cut
 
     def report_losses(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Report lost episodes with the requests that are about to be sent to `slots`.
@@ -328,8 +274,10 @@ class Continuity:
 
     # -- results ----------------------------------------------------------------------
 
-    def judge(self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]) -> Judged:
-        """Decide what returning the results of `slots` will mean; `returned` carries it out.
+    def returned(
+        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]
+    ) -> NDArray[np.bool_] | None:
+        """Record that results are returned; return which the step limit cuts, or None for none.
 
         Args:
             slots: of all results, each once.
@@ -337,38 +285,46 @@ class Continuity:
         """
         num_steps = self._num_steps[slots] + 1
         restored: list[int] = []
-        begun: list[NDArray[np.intp]] = []
-        for part in flagged:  # A comprehension is a call more.
-            begun.append(self._judge_flags(part, slots, num_steps, restored))  # noqa: PERF401
-        if self._limits is None:
-            return Judged(num_steps, None, restored, begun)
-        self._margin -= 1
+        for part in flagged:
+            self._note_flags(part, slots, num_steps, restored)
+        self._num_steps[slots] = num_steps
         is_cut = None
-        if self._margin <= 0:
-            # The steps of this batch are not counted yet.
-            self._margin = int((self._limits - self._num_steps).min()) - 1
-            is_cut = num_steps >= self._limits[slots]
-            if restored:  # The limit was reported when the state was new.
-                is_cut &= ~np.isin(slots, restored)
-            is_cut = is_cut if len(is_cut.nonzero()[0]) else None
-        return Judged(num_steps, is_cut, restored, begun)
+        if self._limits is not None:
+            self._margin -= 1
+            if self._margin <= 0:
+                self._margin = int((self._limits - self._num_steps).min())
+                is_cut = num_steps >= self._limits[slots]
+                if restored:  # The limit was reported when the state was new.
+                    is_cut &= ~np.isin(slots, restored)
+                is_cut = is_cut if len(is_cut.nonzero()[0]) else None
+        for slot in restored:
+            self._cut[slot] = self._restored.pop(slot).is_cut and self.auto_reset_is_open
+            self._margin = 0
+        if is_cut is not None:
+            self._cut[slots[is_cut]] = True
+        if self.auto_reset_is_open and (flagged or is_cut is not None):
+            self._update_due()
+        return is_cut
 
-    def _judge_flags(
+    def _note_flags(
         self,
         part: ResultColumns,
         slots: NDArray[np.intp],
         num_steps: NDArray[np.int64],
         restored: list[int],
-    ) -> NDArray[np.intp]:
-        """Restart the counts of episodes that begin in `part`; return the slots that were reset.
+    ) -> None:
+        """Note which episodes of `part` have ended, and restart the counts of those that begin.
 
         An env that resets itself needs no request for that: its next episode must not be cut for
         the steps of the one that ends here.
         """
         flags = part.flags
         begins = resets = flags[:, IS_RESET] if flags.ndim == 2 else _all_reset(part)
+        ended = flags[:, OVER] if flags.ndim == 2 else part.over
         if self._envs.any_resets_itself:
-            begins = resets | (part.over & self._envs.resets_itself[part.slots])
+            resets_itself = self._envs.resets_itself[part.slots]
+            begins = resets | (ended & resets_itself)
+            ended = ended & ~resets_itself
         places = begins.nonzero()[0]
         if part.positions is not None:
             places = part.positions[places]
@@ -379,28 +335,8 @@ class Continuity:
                 if position is not None:
                     num_steps[place] = position.num_steps
                     restored.append(slots.item(place))
-        return part.slots[resets]
-
-    def returned(
-        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns], judged: Judged
-    ) -> None:
-        """Record that results were returned, as `judge` has decided."""
-        self._num_steps[slots] = judged.num_steps
-        for part, begun in zip(flagged, judged.begun, strict=True):
-            self._note_flags(part, begun)
-        for slot in judged.restored:
-            self._cut[slot] = self._restored.pop(slot).is_cut
-            self._margin = 0
-        if judged.is_cut is not None:
-            self._cut[slots[judged.is_cut]] = True
-        if flagged or judged.is_cut is not None:
-            self._update_due()
-
-    def _note_flags(self, part: ResultColumns, begun: NDArray[np.intp]) -> None:
+        begun = part.slots[resets]
         self._cut[begun] = self._ended[begun] = False
-        ended = part.flags[:, OVER] if part.flags.ndim == 2 else part.over
-        if self._envs.any_resets_itself:
-            ended = ended & ~self._envs.resets_itself[part.slots]
         self._ended[part.slots[ended]] = True
 
     def positions(self, slots: NDArray[np.intp]) -> list[Position]:

@@ -20,13 +20,11 @@ if TYPE_CHECKING:
 __all__ = [
     "BESIDE_ROWS",
     "CLOSED",
-    "CUT_BEFORE",
     "DEATH",
     "FAULT",
     "LOST_EPISODE",
     "NO_SPAN",
     "OF_HOSTS",
-    "PAST_END",
     "UNLIKE_ENVS",
     "Conditions",
     "Fate",
@@ -44,15 +42,11 @@ DEATH: Final = 1 << 2
 """A worker was replaced and has not shown that it works, or was given up."""
 LOST_EPISODE: Final = 1 << 3
 """An env lost its episode or was restored, and a result has still to show it."""
-CUT_BEFORE: Final = 1 << 4
-"""An env reached the step limit of an `auto_reset` context that is closed now."""
-BESIDE_ROWS: Final = 1 << 5
+BESIDE_ROWS: Final = 1 << 4
 """A result that is ready is not, or not only, what its row holds."""
-FAULT: Final = 1 << 6
+FAULT: Final = 1 << 5
 """An error waits for the collector."""
-PAST_END: Final = 1 << 7
-"""Outside `auto_reset` an env is over, of an entry that was not warned that a step would go on."""
-OF_HOSTS: Final = ~(UNLIKE_ENVS | CUT_BEFORE | BESIDE_ROWS | PAST_END)
+OF_HOSTS: Final = ~(UNLIKE_ENVS | BESIDE_ROWS)
 """All that say something of hosts: while one is set, a waiting call looks at them at each turn."""
 
 

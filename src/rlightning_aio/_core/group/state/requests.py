@@ -166,11 +166,6 @@ class CollectorQueue(UncollectedErrors):
         found.sort()
         return found
 
-    def requeue(self, slots: NDArray[np.intp]) -> None:
-        """Make taken results the next ones."""
-        self.ready.appendleft(slots)
-        self.num_ready += len(slots)
-
     def remove(self, slots: NDArray[np.intp]) -> None:
         """Remove results that the collector does not get."""
         self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
@@ -476,12 +471,6 @@ class Requests:
     def hand_out(self, slots: NDArray[np.intp]) -> None:
         """Record that results were returned: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
-
-    def requeue(self, slots: NDArray[np.intp]) -> None:
-        """Make results of `slots` that were not returned wait for the collector again."""
-        kept = self.ready(slots)
-        if len(kept):
-            self.collector.requeue(kept)
 
     def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Return which of `slots` have a first result that has not been collected."""
