@@ -285,8 +285,7 @@ class Play(Session):
     def refuse_busy(self, requests: dict[str, Request]) -> None:
         """A call that was given up may still run in an env."""
         limbo = any(
-            request.before
-            and self.model.envs[env_id].host.mortal  # Others end it by themselves.
+            request.before and self.model.envs[env_id].host.mortal  # Others end it by themselves.
             for env_id, request in requests.items()
         )
         limbo = limbo or any(client.may_be_back for client in self.clients)
