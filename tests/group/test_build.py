@@ -77,7 +77,6 @@ def test_a_placement_whose_package_is_missing_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The error comes before anything starts."""
-    monkeypatch.delitem(sys.modules, "rlightning_aio._core.hosts.ray.cluster", raising=False)
     monkeypatch.delitem(sys.modules, "rlightning_aio._core.hosts.ray.host", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"entry 'e'.*pip install 'rlightning-aio\[ray\]'"):

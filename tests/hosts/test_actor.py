@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pickle
-import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from group.sample_envs import Gate, Probe
+from group.sample_envs import Probe
 
 from rlightning_aio import EnvConfig
 from rlightning_aio._core.hosts.completion_frames import completion_in
@@ -17,8 +16,6 @@ from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.pickling import dumped_with_code
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pytest
 
     from rlightning_aio._core.hosts.messages import Completion
@@ -35,8 +32,8 @@ def order(num_envs: int = 2, **fields: Any) -> bytes:
     return dumped_with_code(StartOrder(config, None, indices, fns, spins=False))
 
 
-def actor(limits: dict[int, float] | None = None, **fields: Any) -> EnvActor:
-    made = EnvActor(FIRST_SLOT, limits or {}, [])
+def actor(**fields: Any) -> EnvActor:
+    made = EnvActor(FIRST_SLOT, [])
     built = completion_in(HOST_ID, made.build(order(**fields)))
     assert isinstance(built, Built)
     assert [env.meta.env_id for env in built.started] == ["one-0", "one-1"]
@@ -92,33 +89,14 @@ def test_arguments_may_be_out_of_band() -> None:
 
 def test_an_env_that_cannot_be_built_is_reported_by_index() -> None:
     """An order that can't be unpickled is reported, too."""
-    made = EnvActor(FIRST_SLOT, {}, [])
+    made = EnvActor(FIRST_SLOT, [])
     failure = completion_in(HOST_ID, made.build(order(env_kwargs={"fails": 1})))
     assert isinstance(failure, NotBuilt)
     assert (failure.env_index, failure.error.summary) == (1, "RuntimeError: no simulator here")
-    unreadable = EnvActor(FIRST_SLOT, {}, []).build(b"cnot_there\nEnv\n.")
+    unreadable = EnvActor(FIRST_SLOT, []).build(b"cnot_there\nEnv\n.")
     failure = completion_in(HOST_ID, unreadable)
     assert isinstance(failure, NotBuilt)
     assert "not_there" in failure.error.summary
-
-
-def test_a_late_request_is_reported_with_stacks(tmp_path: Path) -> None:
-    """The report has its entry and duration; operations without a limit are never late."""
-    gate = Gate(str(tmp_path), "one-1").make()
-    made = actor({Operation.STEP: 0.05}, backend="gated", env_kwargs={"gates": str(tmp_path)})
-    reset = entry(1, FIRST_SLOT, Operation.RESET)
-    made.execute(Batch(np.array([reset]), [np.zeros(1, np.int64)], None))
-    request = entry(2, FIRST_SLOT + 1, Operation.STEP)
-    stepping = threading.Thread(
-        target=made.execute, args=[Batch(np.array([request]), [np.zeros((1, 2))], None)]
-    )
-    stepping.start()
-    late = made.watch()
-    gate.open()
-    stepping.join()
-    assert late.entry == request
-    assert late.taken_ns >= 0.05e9
-    assert "wait_at_gate" in late.stacks
 
 
 def test_all_envs_are_closed_even_if_one_raises(monkeypatch: pytest.MonkeyPatch) -> None:

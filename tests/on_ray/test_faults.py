@@ -54,12 +54,11 @@ def start() -> Iterator[Start]:
 def test_a_death_in_a_step_gives_marked_results(start: Start) -> None:
     """One for each env of the actor, whose results are lost; the other actor just steps."""
     group, tokens = start(), Tokens()
-    deaths = {"sigkill": "was killed or crashed", "exit 3": "was killed or crashed"}
-    for death, cause in deaths.items():
+    for death in ("sigkill", "exit 3"):
         batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": death}))
         assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
         assert batch.restarted.tolist() == [True, True, False, False]
-        assert batch.values()[1].info["worker_restarted"].startswith(cause)
+        assert "worker process has died" in batch.values()[1].info["worker_restarted"]
         batch, _ = group.step(tokens.steps(group.group.env_ids))
         tokens.check(batch)
 
@@ -67,7 +66,7 @@ def test_a_death_in_a_step_gives_marked_results(start: Start) -> None:
 def test_a_death_is_raised_where_that_is_asked_for(start: Start) -> None:
     """With what was owed; the envs of other actors go on."""
     group, tokens = start(on_worker_death="raise"), Tokens()
-    with pytest.raises(WorkerDied, match=r"env 'faulty-0'.*was killed.*faulty-0, faulty-1") as told:
+    with pytest.raises(WorkerDied, match=r"env 'faulty-0'.*was lost.*faulty-0, faulty-1") as told:
         group.step(tokens.steps(group.group.env_ids, {"faulty-0": "sigkill"}))
     assert told.value.results.ids() == ["faulty-2", "faulty-3"]
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
@@ -103,33 +102,28 @@ def test_whatever_an_env_raises_the_actor_stays(start: Start) -> None:
     assert pid_of(group, "faulty-1") == pid
 
 
-def test_an_env_that_hangs_is_named_with_its_stack(start: Start) -> None:
-    """The actor itself tells, and is replaced."""
-    group, tokens = start(step_timeout=LIMIT), Tokens()
-    for hang in ("sleep", "deadlock"):
-        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
-        assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
-        assert batch.values()[1].info["worker_restarted"] == "hung in a step and was killed"
-    strict = start(step_timeout=LIMIT, on_worker_death="raise")
-    with pytest.raises(
-        EnvHung, match=rf"env 'faulty-3'.*longer than {LIMIT} s for a step"
-    ) as caught:
-        strict.step(tokens.steps(strict.group.env_ids, {"faulty-3": "sleep"}))
-    assert "faulty.py" in caught.value.stderr_tail
-    assert caught.value.results.ids() == ["faulty-0", "faulty-1"]
-
-
-@pytest.mark.parametrize("hang", ["deadlock with the GIL", "stop"])
-def test_an_actor_that_can_tell_nothing_is_found_as_well(start: Start, hang: str) -> None:
-    """After the time that all of its envs might have taken."""
+@pytest.mark.parametrize("hang", ["sleep", "deadlock with the GIL", "stop"])
+def test_an_actor_that_hangs_is_killed(start: Start, hang: str) -> None:
+    """After the time that all envs of the call might have taken."""
     group, tokens = start(step_timeout=LIMIT), Tokens()
     watch = os.pidfd_open(pid_of(group, "faulty-1"))
     try:
         batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
         assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
+        assert batch.values()[1].info["worker_restarted"] == "hung in a step and was killed"
         assert select.select([watch], [], [], HANG)[0], "it lives"
     finally:
         os.close(watch)
+
+
+def test_a_hang_is_raised_where_that_is_asked_for(start: Start) -> None:
+    """With what others owed; who steps alone in a call is named."""
+    group, tokens = start(step_timeout=LIMIT, on_worker_death="raise"), Tokens()
+    with pytest.raises(
+        EnvHung, match=rf"env 'faulty-3'.*longer than {LIMIT} s for a step"
+    ) as caught:
+        group.step(tokens.steps(["faulty-0", "faulty-3"], {"faulty-3": "sleep"}))
+    assert caught.value.results.ids() == ["faulty-0"]
 
 
 TRAINER = """
@@ -205,7 +199,7 @@ def test_a_replacement_without_a_place_says_what_it_lacks(nodes: Any) -> None:
         record = group.group._core.supervisor.records[0]
         record.config = record.config.model_copy(update={"start_timeout": 5.0})
         nodes.remove_node(node, allow_graceful=False)
-        lacks = r"did not start again within 5\.0 s.*could not be placed: it asks for 1 only"
+        lacks = r"did not start again within 5\.0 s.*could not be placed: it asks for .*'only': 1"
 
         def step_on() -> None:
             while True:  # The actor lives for some steps more than its node.

@@ -67,28 +67,3 @@ def test_a_group_may_live_in_an_actor() -> None:
 
     here, there = ray.get(collect.remote())
     assert here == there
-
-
-def test_an_address_where_nothing_listens_fails_at_once(tmp_path: Path) -> None:
-    """Ray itself would try for minutes, and then end the process."""
-    (tmp_path / "refused.py").write_text(REFUSED)
-    said = output_of(tmp_path / "refused.py", folder=tmp_path, asyncio_debug=False)
-    assert re.findall("no Ray cluster answers at .*refused", said) == [
-        "no Ray cluster answers at 127.0.0.1:9: [Errno 111] Connection refused",
-        "no Ray cluster answers at ray://127.0.0.1:9: [Errno 111] Connection refused",
-    ]
-    assert "interpreter" not in said
-
-
-REFUSED = """
-from rlightning_aio import StartFailed
-from rlightning_aio.sync import build_env_group
-
-entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "placement": "ray"}
-for address in ("127.0.0.1:9", "ray://127.0.0.1:9"):
-    options = {"ray_options": {"address": address}, "num_workers": 3, "start_timeout": 20}
-    try:
-        build_env_group(entry | options).init()
-    except StartFailed as error:
-        print(error)
-"""

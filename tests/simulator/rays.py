@@ -1,6 +1,6 @@
 """A simulated Ray: actors in processes of the world, and the calls between them and the trainer.
 
-It is what `hosts.ray.cluster` uses of Ray. Calls reach an actor in order, their values travel as
+It is what `hosts.ray.host` uses of Ray. Calls reach an actor in order, their values travel as
 pickles, and their outcomes arrive in order, late. An actor may not find a node at first, and may
 end, alone or with its node; calls that have not returned then end in Ray's errors.
 """
@@ -24,35 +24,35 @@ if TYPE_CHECKING:
 
     from simulator.world import World
 
-__all__ = ["MODULES", "SimulatedRay", "importable"]
+__all__ = ["MODULE", "SimulatedRay", "importable"]
 
-_NAMES = ("rlightning_aio._core.hosts.ray.cluster", "rlightning_aio._core.hosts.ray.host")
+_NAME = "rlightning_aio._core.hosts.ray.host"
 _ENDS = {-signal.SIGKILL: "Worker unexpectedly exits with a connection error code 2. End of file."}
 
 
-def _modules() -> dict[str, ModuleType]:
-    """Import the package's modules for Ray, also where Ray is not installed."""
+def _module() -> ModuleType:
+    """Import the package's module for Ray, also where Ray is not installed."""
     is_installed = importlib.util.find_spec("ray") is not None
     if not is_installed:
         sys.modules["ray"] = ModuleType("ray")
-    found = {name: importlib.import_module(name) for name in _NAMES}
+    found = importlib.import_module(_NAME)
     if not is_installed:
-        for name in ("ray", *_NAMES):
+        for name in ("ray", _NAME):
             del sys.modules[name]
     return found
 
 
-MODULES = _modules()
+MODULE = _module()
 
 
 @contextmanager
 def importable() -> Iterator[None]:
-    """Have the modules found by their names, also where Ray is not installed."""
-    added = {name: module for name, module in MODULES.items() if name not in sys.modules}
-    sys.modules.update(added)
+    """Have the module found by its name, also where Ray is not installed."""
+    is_added = _NAME not in sys.modules
+    sys.modules.setdefault(_NAME, MODULE)
     yield
-    for name in added:
-        del sys.modules[name]
+    if is_added:
+        del sys.modules[_NAME]
 
 
 class _Call(NamedTuple):
@@ -101,12 +101,6 @@ class SimulatedRay:
     def kill(self, handle: _Handle) -> None:
         handle.actor.end(-signal.SIGKILL)
 
-    def available_resources(self) -> dict[str, float]:
-        return {"CPU": 0.0}
-
-    def cluster_resources(self) -> dict[str, float]:
-        return {"CPU": 8.0}
-
 
 class _ActorClass:
     """See what `ray.remote` returns."""
@@ -132,37 +126,19 @@ class _Handle:
         self.actor = actor
 
     def __getattr__(self, name: str) -> _Method:
-        return _Method(self.actor, name, is_concurrent=False)
+        return _Method(self.actor, name)
 
 
 class _Method:
     """See `ray.actor.ActorMethod`."""
 
-    def __init__(self, actor: _Actor, name: str, *, is_concurrent: bool) -> None:
-        self._actor, self._name, self._is_concurrent = actor, name, is_concurrent
-
-    def options(self, *, concurrency_group: str) -> _Method:
-        del concurrency_group
-        return _Method(self._actor, self._name, is_concurrent=True)
+    def __init__(self, actor: _Actor, name: str) -> None:
+        self._actor, self._name = actor, name
 
     def remote(self, *arguments: Any) -> _Reference:
         call = _Call(self._name, pickle.dumps(arguments), _Reference())
-        self._actor.call(call, is_concurrent=self._is_concurrent)
+        self._actor.call(call)
         return call.outcome
-
-
-class _Thread(Process):
-    """A second thread of an actor, which ends and stops with the actor alone."""
-
-    def __init__(self, actor: _Actor, main: Callable[[], int]) -> None:
-        self._actor = actor
-        super().__init__(actor.world, "a thread of an actor", main, lambda *_: None)
-
-    def later(self, seconds: float, callback: Callable[[], object]) -> list[Any]:
-        return self._actor.later(seconds, callback)
-
-    def point(self) -> None:
-        self.sleep(self.world.delay())
 
 
 class _Actor(Process):
@@ -171,35 +147,23 @@ class _Actor(Process):
     def __init__(self, world: World, actor_class: type, arguments: bytes) -> None:
         super().__init__(world, "an actor", self._serve, self._on_end)
         self._make = lambda: actor_class(*pickle.loads(arguments))
-        self._instance: Any = None
         self._waiting: deque[_Call] = deque()
         self._unanswered: list[_Call] = []
-        self._threads: list[_Thread] = []
 
-    def call(self, call: _Call, *, is_concurrent: bool) -> None:
-        """Take a call; a concurrent one has a thread of its own."""
+    def call(self, call: _Call) -> None:
+        """Take a call, which is executed after all others."""
         if not self.alive:
             self._answer(call, _Gone("The actor is dead: ray.kill"))
             return
         self._unanswered.append(call)
-        if is_concurrent:
-            self._threads.append(_Thread(self, partial(self._run_thread, call)))
-        else:
-            self._waiting.append(call)
-            self.wake()
+        self._waiting.append(call)
+        self.wake()
 
     def _serve(self) -> int:
         self._instance = self._make()
-        for thread in self._threads:
-            thread.wake()
         while True:
             self.wait_for(lambda: self._waiting, None)
             self._execute(self._waiting.popleft())
-
-    def _run_thread(self, call: _Call) -> int:
-        self.world.wait_for(lambda: self._instance is not None, None)
-        self._execute(call)
-        return 0
 
     def _execute(self, call: _Call) -> None:
         self.world.point()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import Counter
 from contextlib import suppress
 from functools import partial
@@ -55,8 +56,7 @@ def config(**fields: Any) -> rl.EnvConfig:
     return rl.EnvConfig(
         name="counting",
         backend="callable",
-        task=CountingEnv,
-        **{"num_workers": 4, "envs_per_process": 2, **fields},
+        **{"task": CountingEnv, "num_workers": 4, "envs_per_process": 2, **fields},
     )
 
 
@@ -186,6 +186,25 @@ def test_actors_of_ray_and_their_deaths_are_simulated() -> None:
         faulty = world(seed, deaths=0.05)
         assert faulty.trace == world(seed, deaths=0.05).trace
         assert faulty.counts["deaths"]
+
+
+class TimedEnv(CountingEnv):
+    """A step takes as many seconds as its action says."""
+
+    def does(self, action: Any) -> None:
+        time.sleep(int(action))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "end"), [([9] * 4, None), ([0, 99, 0, 0], "hung in a step and was killed")]
+)
+def test_an_actor_has_the_time_limits_of_all_its_steps(seconds: list[int], end: Any) -> None:
+    """It executes them in turn, and doesn't tell which of them takes so long."""
+    one = {"placement": "ray", "envs_per_process": 4, "step_timeout": 10.0}
+    with World(1, Faults()), sync.build_env_group(config(task=TimedEnv, **one)) as group:
+        batch, _ = group.reset()
+        batch, _ = group.step(batch.respond(action=seconds))
+        assert [info.get("worker_restarted") for info in batch.info()] == [end] * 4
 
 
 def test_clients_of_an_env_server_are_simulated() -> None:

@@ -218,12 +218,7 @@ class World:
             (rings, "new_fence", lambda: self.point),
             # A call that would wait for ever must be found to.
             (overdue, "OWED_SECONDS", math.inf),
-            # So that steps are ordinary sooner.
-            (
-                rays.MODULES["rlightning_aio._core.hosts.ray.cluster"],
-                "ray",
-                rays.SimulatedRay(self),
-            ),
+            (rays.MODULE, "ray", rays.SimulatedRay(self)),
             (secrets, "randbits", self.rng.getrandbits),
             # The sizes of messages decide where they are cut, so none depends on the machine.
             (error_text, "traceback", _TRACEBACKS),

@@ -8,11 +8,8 @@ Rule: one call executes the requests of a batch in turn, and answers each of the
 
 from __future__ import annotations
 
-import faulthandler
 import pickle
 import sys
-import tempfile
-import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -24,12 +21,12 @@ from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import close_all, give_rows
-from rlightning_aio.protocol.entries import op_of, slot_of
+from rlightning_aio.protocol.entries import slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.slab import Slab, rows_for
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -38,7 +35,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.protocol.frames import Frame
 
-__all__ = ["Batch", "EnvActor", "Late", "Reply"]
+__all__ = ["Batch", "EnvActor", "Reply"]
 
 
 class Batch(NamedTuple):
@@ -70,26 +67,8 @@ class Reply(NamedTuple):
 
     def with_rows(self) -> NDArray[np.int64]:
         """Return the entries of the results in `columns`, in order."""
-        return _with_rows(self.done, self.frames)
-
-
-def _with_rows(done: NDArray[np.int64], frames: list[Frame]) -> NDArray[np.int64]:
-    partial = [frame.number for frame in frames if frame.kind == FrameKind.RESULT]
-    return np.array([*done.tolist(), *partial], np.int64) if partial else done
-
-
-class Late(NamedTuple):
-    """A request exceeds its time limit.
-
-    Attributes:
-        entry: of the request.
-        taken_ns: how long it has taken so far.
-        stacks: of all threads.
-    """
-
-    entry: int
-    taken_ns: int
-    stacks: str
+        partial = [frame.number for frame in self.frames if frame.kind == FrameKind.RESULT]
+        return np.array([*self.done.tolist(), *partial], np.int64) if partial else self.done
 
 
 class EnvActor:
@@ -97,19 +76,15 @@ class EnvActor:
 
     Args:
         first_slot: slot of its first env in the group.
-        limits: in seconds, by operation.
         path: `sys.path` of the trainer; folders that are missing here are appended.
     """
 
-    def __init__(self, first_slot: int, limits: Mapping[int, float], path: Sequence[str]) -> None:
+    def __init__(self, first_slot: int, path: Sequence[str]) -> None:
         sys.path += [place for place in path if place not in sys.path]
         self._first_slot = first_slot
-        self._limits = limits
         self._runners: list[EnvRunner] = []
         self._frames: list[Frame] = []
         self._info_width = 0
-        # The current entry and its start (monotonic ns); another thread reads them.
-        self._executing = (0, 0)
 
     def _post(self, completion: Completion) -> None:
         """Have the next reply report a completion."""
@@ -148,7 +123,6 @@ class EnvActor:
         self._table.put_requests(entries, columns, seeds=arguments is None)
         in_rows: list[int] = []
         for position, entry in enumerate(entries.tolist()):
-            self._executing = entry, time.monotonic_ns()
             runner = self._runners[slot_of(entry) - self._first_slot]
             given = None if arguments is None else arguments[position]
             completion = execute(SENDER, runner, entry, given)
@@ -156,25 +130,9 @@ class EnvActor:
                 in_rows.append(entry)
             else:
                 self._post(completion)
-        self._executing = 0, 0
-        done = np.array(in_rows, np.int64)
-        frames, self._frames = self._frames, []
-        return Reply(done, frames, self._table.results(_with_rows(done, frames), self._info_width))
-
-    def watch(self) -> Late:
-        """Return when a request exceeds its time limit; runs in its own thread."""
-        shortest = min(self._limits.values())
-        while True:
-            entry, since_ns = self._executing
-            limit = self._limits.get(op_of(entry))
-            taken_ns = time.monotonic_ns() - since_ns
-            if limit is None:
-                # A request that begins now has at least this long.
-                time.sleep(shortest)
-            elif taken_ns < limit * 1e9:
-                time.sleep(limit - taken_ns / 1e9)
-            else:
-                return Late(entry, taken_ns, _stacks())
+        reply = Reply(np.array(in_rows, np.int64), self._frames, [])
+        self._frames = []
+        return reply._replace(columns=self._table.results(reply.with_rows(), self._info_width))
 
     def close(self) -> list[tuple[int, ErrorText]]:
         """Close the envs; return what that raised, with their indices."""
@@ -187,11 +145,3 @@ def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[EnvRunner, Slab
     slabs = [Slab(one, memoryview(bytearray(one.size(rows))), rows) for one, rows in sizes]
     for runner, (slab, row) in zip(runners, places, strict=True):
         yield runner, slabs[slab], row
-
-
-def _stacks() -> str:
-    """Return the stacks of all threads."""
-    with tempfile.TemporaryFile() as file:
-        faulthandler.dump_traceback(file, all_threads=True)
-        file.seek(0)
-        return file.read().decode(errors="replace")

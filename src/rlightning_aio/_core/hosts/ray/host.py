@@ -3,18 +3,22 @@
 One remote call carries a batch of requests, with one array for each column, and its reply has the
 same form. Threads of Ray put outcomes into an `Inbox`, whose descriptor wakes the trainer. A node
 that dies is a worker that dies, and its replacement is another actor.
-Left out on purpose: calls to Ray (see `cluster`), and the execution of requests (see `actor`).
+Rule: no other module of the package imports Ray. Only connecting to a cluster blocks, once.
+Left out on purpose: the execution of requests (see `actor`).
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.completion_frames import completion_in
@@ -29,18 +33,10 @@ from rlightning_aio._core.hosts.messages import (
     ErrorText,
     Reported,
 )
-from rlightning_aio._core.hosts.ray.actor import Batch, Late, Reply
-from rlightning_aio._core.hosts.ray.cluster import (
-    RayConnection,
-    actor_class,
-    call,
-    concurrent,
-    ending,
-    kill,
-    shortage,
-)
+from rlightning_aio._core.hosts.ray.actor import Batch, EnvActor, Reply
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.runner import placed
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.entries import op_of
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
@@ -52,17 +48,59 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, StartOrder
+    from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.frames import Frame
 
 __all__ = ["RayHost"]
 
-_ON_THE_WAY_NS: Final = 2_000_000_000
-"""Time for a batch and its reply to travel, in addition to the time of the envs."""
+# Untyped, because `make check` runs without Ray.
+ray: Any = import_module("ray")
+
+_OURS: Final = {
+    "num_cpus": "is a field of the entry",
+    "num_gpus": "is a field of the entry",
+    "max_restarts": "is a field of the entry, and Ray itself restarts nothing",
+    "max_task_retries": "would execute a step twice",
+    "lifetime": "would let actors outlive the trainer",
+    "name": "belongs to one actor, and an entry may have several",
+    "get_if_exists": "would share an actor with others",
+    "max_concurrency": "would execute several requests at a time",
+    "concurrency_groups": "would execute several requests at a time",
+    "allow_out_of_order_execution": "would execute requests in another order",
+}
+"""Options of an actor that users must not set, with the reasons."""
 
 _OF_ANOTHER_PROCESS: Final[list[_Life]] = []
 """Actors that a forked process inherited. It keeps them, because Ray would report their release to
 the cluster, over sockets that the parent uses.
 """
+
+
+class _Connection:
+    """The connection of this process to a cluster; see `base.Shared`.
+
+    A connection that the program made itself is used and left open. Otherwise one connection serves
+    all groups and ends with the last of them, as does a cluster that was started for it.
+    """
+
+    _users: ClassVar[int] = 0
+    _is_ours: ClassVar[bool] = False
+
+    def __init__(self, address: str | None) -> None:
+        if not ray.is_initialized():
+            ray.init(address=address)
+            _Connection._is_ours = True
+        _Connection._users += 1
+
+    def release(self, seconds: float) -> None:
+        del seconds
+        _Connection._users -= 1
+        if _Connection._is_ours and not _Connection._users:
+            _Connection._is_ours = False
+            ray.shutdown()
+
+    def disown(self) -> None:
+        """Do nothing: a forked process has no threads of Ray."""
 
 
 @dataclass
@@ -87,9 +125,7 @@ class _Life:
         is_placed: a node has started it.
         is_built: its envs are built.
         sent: unanswered batches, in the order of execution.
-        began_ns: estimated start of the first of them.
-        late: a request that it reported as late, and the start of that request.
-        stacks: of all its threads when it reported that.
+        began_ns: when the first of them was sent, or became the first.
     """
 
     def __init__(self, actor: Any) -> None:
@@ -98,9 +134,8 @@ class _Life:
         self.is_placed = self.is_built = False
         self.sent: deque[_Sent] = deque()
         self.began_ns = 0
-        self.late: tuple[int, int] | None = None
-        self.stacks = ""
-        # Objects to keep until a call returns, by the number of the call.
+        # References to keep until a call returns, by the number of the call. The trainer's thread
+        # must drop them: one of Ray's threads would wait for a lock that it holds.
         self._kept: dict[int, object] = {}
         self._num_calls = 0
 
@@ -112,7 +147,14 @@ class _Life:
         def completed(outcome: Any) -> None:
             put(lambda: self._completed(number, then, outcome))
 
-        self._kept[number] = call(method, completed, *arguments)
+        self._kept[number] = None
+        try:
+            self._kept[number] = reference = method.remote(*arguments)
+        except Exception as error:  # We are no longer connected to a cluster.
+            completed(error)
+        else:
+            # `reference.future()` uses this, too, but would add a lock and a condition.
+            reference._on_completed(completed)  # noqa: SLF001
 
     def _completed(self, number: int, then: Callable[[_Life, Any], None], outcome: Any) -> None:
         del self._kept[number]
@@ -122,7 +164,9 @@ class _Life:
         """Kill the actor, and drop its replies."""
         self.inbox.close()
         self._kept.clear()
-        kill(self.actor)
+        if ray.is_initialized():
+            with suppress(Exception):  # It has ended by itself.
+                ray.kill(self.actor)
 
 
 class RayHost(Host):
@@ -138,7 +182,7 @@ class RayHost(Host):
         self.num_envs = len(order.worker_indices)
         self._config = order.config
         self._limits = limits_of(order.config)
-        self._actor_class = actor_class(order.config, watched=bool(self._limits))
+        self._actor_class = _actor_class(order.config)
         self._start_payload = dumped_with_code(order)
         self._wiring = wiring
         self._post = wiring.completions.append
@@ -154,20 +198,17 @@ class RayHost(Host):
 
     def start(self) -> None:
         self._closing = False
+        resources = self._wiring.resources
         try:
-            RayConnection.share(self._config, self._wiring)
-            actor = self._actor_class.remote(self.first_slot, self._limits, list(sys.path))
-        except ConnectionError:
-            raise  # As for any worker that can't be started: there is no second attempt.
+            if _Connection not in resources:
+                resources[_Connection] = _Connection(self._config.ray_options.get("address"))
+            actor = self._actor_class.remote(self.first_slot, list(sys.path))
         except Exception as error:
-            self._post(Died(self.host_id, Death(f"has no Ray cluster to live in: {error}")))
-            return
+            raise ConnectionError(f"Ray made no actor: {error}") from error
         life = self._life = _Life(actor)
         self._wiring.driver.watch(self)
         life.call(actor.hello, self._on_placed)
         life.call(actor.build, self._on_built, self._start_payload)
-        if self._limits:
-            life.call(concurrent(actor.watch), self._on_late)
 
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""
@@ -180,14 +221,12 @@ class RayHost(Host):
             self._post(Attached(self.host_id))
 
     def kill(self, *, dump: bool) -> None:
-        """Kill the actor; it sent its stacks when it reported a late request."""
+        """Kill the actor, which writes no stacks."""
         del dump
-        if self._life is None:
-            return
         if self._closing:
             self._end("did not close in time and was killed")
-        elif not self._life.is_placed:
-            self._end(f"could not be placed: {shortage(self._config)}")
+        elif self._life is not None and not self._life.is_placed:
+            self._end(f"could not be placed: it asks for {_asked(self._config)}")
         else:
             self._end("was killed", -9)
 
@@ -222,11 +261,11 @@ class RayHost(Host):
         requests: list[int] = [entry for sent in life.sent for entry in sent.entries.tolist()]
         self.release()
         if self._closing:
-            text = ErrorText("WorkerDied", f"its worker {cause}", life.stacks)
+            text = ErrorText("WorkerDied", f"its worker {cause}", "")
             errors = [(index, text) for index in range(self.num_envs)]
             self._post(Closed(self.host_id, errors))
         else:
-            death = Death(cause, exit_code, life.stacks, tuple(requests))
+            death = Death(cause, exit_code, requests=tuple(requests))
             self._post(Died(self.host_id, death))
 
     # -- requests -----------------------------------------------------------------
@@ -250,21 +289,20 @@ class RayHost(Host):
     def current_request(self) -> tuple[int, int]:
         """Return the entry being executed and its start, as of `base.Killable`.
 
-        An actor reports a late request itself. Without a report, a batch may take as long as the
-        limits of all its requests together, so an actor that is stopped or cut off is found, too.
+        Only the actor knows them. Time counts from sending, and a batch may take as long as the
+        limits of all its requests together, because they are executed in turn: so whichever has
+        used up the time of those before it counts as being executed.
         """
         life = self._life
         if life is None or not life.sent:
             return 0, 0
-        if life.late is not None:
-            return life.late
         entries: list[int] = life.sent[0].entries.tolist()
-        now_ns, since_ns = time.monotonic_ns(), life.began_ns + _ON_THE_WAY_NS
+        now_ns, since_ns = time.monotonic_ns(), life.began_ns
         for entry in entries[:-1]:
-            limit = self._limits.get(op_of(entry))
-            if limit is None or now_ns < since_ns + limit * 1e9:
+            limit_ns = self._limits.get(op_of(entry), math.inf) * 1e9
+            if now_ns < since_ns + limit_ns:
                 return entry, since_ns
-            since_ns += int(limit * 1e9)
+            since_ns += int(limit_ns)
         return entries[-1], since_ns
 
     def catch_up(self) -> bool:
@@ -290,7 +328,9 @@ class RayHost(Host):
     def _has_returned(self, outcome: Any) -> bool:
         """Return True if a call returned a value; otherwise handle the end of the actor."""
         if isinstance(outcome, BaseException):
-            self._end(*ending(outcome))
+            # Ray names the actor first, and says in the last line why it ended.
+            why = str(outcome).strip().rpartition("\n")[2]
+            self._end(f"was lost: {why[:300]}")
             return False
         return True
 
@@ -310,12 +350,6 @@ class RayHost(Host):
         life.is_built = True
         if self._table is not None:  # A replacement has its rows already.
             self._post(Attached(self.host_id))
-
-    def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
-        if self._has_returned(outcome):
-            assert isinstance(outcome, Late)
-            life.late = outcome.entry, time.monotonic_ns() - outcome.taken_ns
-            life.stacks = outcome.stacks
 
     def _on_reply(self, sent: _Sent, life: _Life, outcome: Reply | Exception) -> None:
         """Apply replies in the order of execution: results need the schemas of earlier ones.
@@ -345,3 +379,32 @@ class RayHost(Host):
         if self._has_returned(outcome):
             self.release()
             self._post(Closed(self.host_id, outcome))
+
+
+def _actor_class(config: EnvConfig) -> Any:
+    """Return the class of an entry's actors, whose ``.remote(...)`` makes one.
+
+    Raises:
+        ConfigError: `ray_options` has an option that is unknown, wrong, or not allowed.
+    """
+    options = {name: value for name, value in config.ray_options.items() if name != "address"}
+    for name in options.keys() & _OURS.keys():
+        raise ConfigError(
+            f"entry {config.name!r}, ray_options.{name}: leave it out; it {_OURS[name]}"
+        )
+    if config.env_vars:
+        runtime_env = dict(options.get("runtime_env") or {})
+        env_vars = {**runtime_env.get("env_vars", {}), **config.env_vars}
+        options["runtime_env"] = {**runtime_env, "env_vars": env_vars}
+    remote = ray.remote(max_restarts=0)(EnvActor)
+    try:
+        return remote.options(num_cpus=config.num_cpus, num_gpus=config.num_gpus, **options)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"entry {config.name!r}, ray_options: {error}") from error
+
+
+def _asked(config: EnvConfig) -> str:
+    """Return what decides where an actor of an entry may live."""
+    asked = {"num_cpus": config.num_cpus, "num_gpus": config.num_gpus, **config.ray_options}
+    elsewhere = ("address", "runtime_env")
+    return ", ".join(f"{name}={value}" for name, value in asked.items() if name not in elsewhere)
