@@ -20,7 +20,7 @@ from kit.checked import CheckedRequests
 from rlightning_aio._core.group.drivers.wait import Parked
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
-from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.episodes.episodes import Episodes
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
@@ -496,14 +496,14 @@ class FakeGroup:
         observed = Observed()
         requests = CheckedRequests(np.repeat(np.arange(len(rows)), rows), len(rows), conditions)
         layout = SlabLayout(size)
-        continuity = Continuity(envs, conditions)
+        episodes = Episodes(envs, conditions)
         lifetime = Lifetime(conditions)
         records: list[Any] = []
         tables = Tables(
             envs,
             requests,
             layout,
-            continuity,
+            episodes,
             conditions,
             observed,
             lifetime,

@@ -226,14 +226,14 @@ class Twins(RuleBasedStateMachine):
     @rule(limit=st.sampled_from((None, 1, 3)), on_done=st.booleans())
     def auto_reset(self, limit: int | None, on_done: bool) -> None:
         for group in self.groups:
-            continuity = group.core.continuity
+            episodes = group.core.episodes
             if self.in_context:
-                continuity.end()
+                episodes.end()
             elif limit is None or limit == group.config.max_episode_steps:
-                continuity.begin(None, on_done=on_done)
+                episodes.begin(None, on_done=on_done)
             else:
                 with pytest.warns(UserWarning, match="overrides"):
-                    continuity.begin(limit, on_done=on_done)
+                    episodes.begin(limit, on_done=on_done)
         self.in_context = not self.in_context
 
     @rule()

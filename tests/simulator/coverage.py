@@ -14,7 +14,7 @@ from kit.checked import CheckedRequests
 from simulator.program import OPS
 
 from rlightning_aio import errors
-from rlightning_aio._core.group.episodes import continuity
+from rlightning_aio._core.group.episodes import episodes
 from rlightning_aio._core.group.state.request_states import LEGAL, Owner, State
 
 if TYPE_CHECKING:
@@ -102,13 +102,13 @@ def watch(counts: Counter[str]) -> None:
             counts[f"loss {key[0].name} {key[1].name}"] += 1
             return super().get(key, default)
 
-    continuity.LEGAL = Counting(continuity.LEGAL)  # type: ignore[misc]
+    episodes.LEGAL = Counting(episodes.LEGAL)  # type: ignore[misc]
 
 
 def possible() -> dict[str, list[tuple[str, str]]]:
     """What can be reached, by kind: a name of each, and what is counted where it is."""
     requests = [f"{state.name} {owner.name} {event.name}" for state, owner, event in LEGAL]
-    losses = [f"{phase.name} {event.name}" for phase, event in continuity.LEGAL]
+    losses = [f"{phase.name} {event.name}" for phase, event in episodes.LEGAL]
     kinds = [name for name in errors.__all__ if name not in NOT_OF_GROUPS]
     faults = [(re.sub(r"`", "", key), ROWS[key]) for key in map(row_key, rows())]
     return {

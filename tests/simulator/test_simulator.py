@@ -15,7 +15,7 @@ from simulator.coverage import ROWS, row_key, rows
 from simulator.program import draw
 from simulator.runs import run, run_twice, shown, shrunk
 
-from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.episodes.episodes import Episodes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -79,12 +79,12 @@ def test_the_same_happens_in_another_folder(tmp_path: Path) -> None:
 
 def test_a_defect_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:
     """A group that forgets to report the step limit is found soon, by few operations."""
-    original = Continuity.returned
+    original = Episodes.returned
 
-    def forgetful(self: Continuity, slots: Any, flagged: Any) -> Any:
+    def forgetful(self: Episodes, slots: Any, flagged: Any) -> Any:
         original(self, slots, flagged)
 
-    monkeypatch.setattr(Continuity, "returned", forgetful)
+    monkeypatch.setattr(Episodes, "returned", forgetful)
     runs = (run(draw(seed)) for seed in range(200))
     failed = next(found for found in runs if "limit_reached" in (found.error or ""))
     small = shrunk(failed, run)

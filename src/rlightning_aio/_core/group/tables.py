@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio._core.group.episodes.continuity import Continuity
+    from rlightning_aio._core.group.episodes.episodes import Episodes
     from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.host_record import HostRecord
@@ -28,7 +28,7 @@ class Tables:
     """The state of a group.
 
     Attributes:
-        envs, requests, layout, continuity: tables over the slots.
+        envs, requests, layout, episodes: tables over the slots.
         conditions: the reasons why a step can't take the fast path.
         observed: holds the observer.
         lifetime: whether the group is open.
@@ -47,7 +47,7 @@ class Tables:
     envs: EnvTable
     requests: Requests
     layout: SlabLayout
-    continuity: Continuity
+    episodes: Episodes
     conditions: Conditions
     observed: Observed
     lifetime: Lifetime

@@ -76,7 +76,7 @@ def response_to(env_id: str, response: PolicyResponse | Any) -> PolicyResponse:
 class AutoResetContext(Scope):
     """The context of `EnvGroup.auto_reset`: envs are reset at their limit from entry to exit.
 
-    It can be entered again after an exit. For the arguments see `Continuity.begin`.
+    It can be entered again after an exit. For the arguments see `Episodes.begin`.
     """
 
     def __init__(
@@ -93,12 +93,12 @@ class AutoResetContext(Scope):
         self._needs_limits = needs_limits
 
     def _enter(self) -> None:
-        self._core.continuity.begin(
+        self._core.episodes.begin(
             self._limit, on_done=self._on_done, needs_limits=self._needs_limits
         )
 
     def _leave(self) -> None:
-        self._core.continuity.end()
+        self._core.episodes.end()
 
 
 def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
@@ -108,7 +108,7 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     applies, if it has one.
     """
     core: Core = group._core  # noqa: SLF001
-    if core.continuity.auto_reset_is_open:
+    if core.episodes.auto_reset_is_open:
         return nullcontext()
     return AutoResetContext(core, None, on_done=True, needs_limits=False)
 

@@ -179,7 +179,7 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
 def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:
     """Return for each env whether its next step is a reset, while `auto_reset` is open."""
     core = group._core  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
-    return core.tables.continuity.due.copy()
+    return core.tables.episodes.due.copy()
 
 
 def build_env_group(

@@ -45,7 +45,7 @@ class Aborts:
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._supervisor = supervisor
         self._results = results
         self._arrivals = arrivals
@@ -90,7 +90,7 @@ class Aborts:
 
     def _is_wanted(self, slot: int) -> bool:
         """Return False if nobody wants the reply of `slot`, because it was aborted."""
-        is_aborted = self._continuity.why_lost(slot) is _WHY
+        is_aborted = self._episodes.why_lost(slot) is _WHY
         return not (is_aborted and slot in self._requests.unwanted)
 
     def _fault(self, slot: int) -> EpisodeLost:
@@ -110,4 +110,4 @@ class Aborts:
         for slot in chosen:
             backend = self._envs.configs[slot].backend
             if slot < len(self._envs.all) and not ENVS.is_hardware(backend):
-                self._continuity.lose([slot], _WHY)
+                self._episodes.lose([slot], _WHY)

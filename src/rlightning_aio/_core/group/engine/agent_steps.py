@@ -135,7 +135,7 @@ class AgentSteps:
 
     def loss(self, env_id: str) -> Outcome | None:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
-        why = self._tables.continuity.why_lost(self._tables.envs.find_one(env_id))
+        why = self._tables.episodes.why_lost(self._tables.envs.find_one(env_id))
         return None if why is None else why.outcome(env_id)
 
     def serve(self, now: float) -> Procedure[None]:

@@ -39,7 +39,7 @@ class Arrivals:
         self._envs = tables.envs
         self._requests = tables.requests
         self._layout = tables.layout
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._results = results
         self.held_back: dict[int, Joined] = {}
         self._withdrawn: set[int] = set()
@@ -67,7 +67,7 @@ class Arrivals:
             self._withdrawn.discard(slot)
         has_row = self._layout.of(slot)[0].action is not None
         self._envs.note_joined(slot, first_slot, meta, completion.traits, has_row=has_row)
-        self._continuity.note_joined(slot)
+        self._episodes.note_joined(slot)
         self._requests.join(slot, now)
         if slot in self._withdrawn:
             # This result answers the response that the env was away for.

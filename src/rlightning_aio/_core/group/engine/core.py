@@ -51,7 +51,7 @@ class Core:
         zero_copy: return observations as views if their rows are contiguous.
 
     Attributes:
-        tables, supervisor: as given; envs, requests, continuity, observed, lifetime, sums: of the
+        tables, supervisor: as given; envs, requests, episodes, observed, lifetime, sums: of the
             tables; results, intake, waiting, steps, agent_steps, calls: made here.
     """
 
@@ -62,7 +62,7 @@ class Core:
         self.supervisor = supervisor
         self.envs = tables.envs
         self.requests = tables.requests
-        self.continuity = tables.continuity
+        self.episodes = tables.episodes
         self.observed = tables.observed
         self.lifetime = tables.lifetime
         self.sums = tables.sums

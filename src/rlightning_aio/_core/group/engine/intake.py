@@ -75,7 +75,7 @@ class Intake:
         self._layout = tables.layout
         self._supervisor = supervisor
         self._results = results
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._arrivals = arrivals
         self._sums = tables.sums
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -139,16 +139,16 @@ class Intake:
 
         None if the env is restarted instead: its episode is lost, which its next result reports.
         """
-        lost = self._continuity.ended_without_result(slot)
+        lost = self._episodes.ended_without_result(slot)
         fault = self._fault_of(slot, error, lost)
         if self._requests.numbering.op(slot) == Operation.RESTORE:  # It is in no known state.
-            self._continuity.lose([slot], _not_restored(fault))
+            self._episodes.lose([slot], _not_restored(fault))
             return fault
         if not self._supervisor.losses.ends_env(slot, error):
             return fault
         kind, blame = fault.outcome.kind, fault.outcome.blame
         why = lost or Loss(f"raised {error.summary}", kind, blame, fault.env_id)
-        self._continuity.lose([slot], why)
+        self._episodes.lose([slot], why)
         return None if self._supervisor.losses.count_restart(slot, error, fault) else fault
 
     def _fault_of(self, slot: int, error: ErrorText, lost: Loss | None) -> EnvRaised:
@@ -190,10 +190,10 @@ class Intake:
         slot = self._supervisor.records[host_id].slots[completion.env_index]
         wanted = completion.entry and self._requests.end(host_id, completion.entry) is not None
         if not wanted:
-            if self._continuity.why_lost(slot) is None:  # Else that is known, as after an abort.
-                self._continuity.lose([slot], why)
+            if self._episodes.why_lost(slot) is None:  # Else that is known, as after an abort.
+                self._episodes.lose([slot], why)
             return
-        self._continuity.lose([slot], why)
+        self._episodes.lose([slot], why)
         replaced, fault = self._supervisor.losses.count_env(slot, why, completion.message)
         alone = self._requests.alone(slot)
         if replaced and self._requests.numbering.op(slot) in _ASKED_AGAIN:
@@ -206,7 +206,7 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
-        self._continuity.ended_without_result(slot)
+        self._episodes.ended_without_result(slot)
         if self._requests.owner[slot] == COLLECTOR:
             self._arrivals.withdraw(slot)
             return
@@ -239,19 +239,19 @@ class Intake:
         loss = self._supervisor.handle_exit(completion)
         if loss is None:
             return
-        requests, continuity = self._requests, self._continuity
+        requests, episodes = self._requests, self._episodes
         requests.in_flight[loss.host_id] = 0  # It answers none of them.
         unwanted = requests.unwanted & {*loss.owed.tolist()}
         owed = requests.drop_unwanted(loss.owed)
         if not loss.replaced:
-            continuity.give_up(loss.slots)
+            episodes.give_up(loss.slots)
             self._fail(owed, loss.error)
             return
         self._keep_ready(loss.slots)
         if loss.resets:
             # The episodes of aborted requests were lost before.
-            over = {slot for slot in unwanted if continuity.why_lost(slot) is not None}
-            continuity.lose([slot for slot in loss.slots if slot not in over], loss.why)
+            over = {slot for slot in unwanted if episodes.why_lost(slot) is not None}
+            episodes.lose([slot for slot in loss.slots if slot not in over], loss.why)
         # A replacement answers steps and resets only.
         again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN) & loss.resets
         self._fail(owed[~again], loss.error)
@@ -268,15 +268,15 @@ class Intake:
         """Send the steps and resets that a dead worker owed, as resets."""
         if not len(slots):
             return
-        self._continuity.report_losses(slots)
+        self._episodes.report_losses(slots)
         entries = self._requests.ask_again(host_id, slots)
         self._layout.write_seeds(slots, np.full(len(slots), AS_BEFORE))
         self._supervisor.submit(host_id, entries, None)
 
     def _note_answered(self, slots: NDArray[np.intp]) -> None:
         """Mark results that report a loss, and let steps show that a replacement works."""
-        if self._continuity.exceptional:
-            for report in self._continuity.take_answers(slots):
+        if self._episodes.exceptional:
+            for report in self._episodes.take_answers(slots):
                 self._results.mark_restarted(report)
         if self._supervisor.any_deaths:
             for slot in slots.tolist():

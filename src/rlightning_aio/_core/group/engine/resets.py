@@ -47,7 +47,7 @@ class Resets:
         self._envs = tables.envs
         self._requests = tables.requests
         self._layout = tables.layout
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._supervisor = supervisor
         self._members = supervisor.members
         self._dispatch = dispatch
@@ -167,8 +167,8 @@ class Resets:
         A mask resets a part of an env, so it can't make up for a lost episode: such an env is
         reset as a whole, and its result reports the loss.
         """
-        if packed and "reset_mask" in (options or {}) and self._continuity.exceptional:
-            lost = self._continuity.report_losses(slots)
+        if packed and "reset_mask" in (options or {}) and self._episodes.exceptional:
+            lost = self._episodes.report_losses(slots)
             as_before = np.full(np.count_nonzero(lost), AS_BEFORE)
             self._submit_resets(slots[lost], as_before, None, owner, now)
             slots, seeds = slots[~lost], seeds[~lost]

@@ -1,7 +1,7 @@
 """`Snapshots`: take the state of envs out of them, and put it back.
 
 A restore is a reset to saved states: one request for each env, whose result is its last
-observation. `Continuity` knows the places in the episodes; `snapshot_format` has the bytes.
+observation. `Episodes` knows the places in the episodes; `snapshot_format` has the bytes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from rlightning_aio._core.group.engine.calls import values_of
-from rlightning_aio._core.group.episodes.continuity import Position
+from rlightning_aio._core.group.episodes.episodes import Position
 from rlightning_aio._core.group.episodes.snapshot_format import (
     EnvSnapshot,
     check_same,
@@ -56,7 +56,7 @@ class Snapshots:
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._supervisor = supervisor
         self._dispatch = dispatch
         self._calls = calls
@@ -75,8 +75,8 @@ class Snapshots:
         def send(ticket: Ticket) -> None:
             self._calls.send(now, slots, op, nothing, "nothing", ticket)
             # A worker that has replied may die before others reply.
-            positions.extend(self._continuity.positions(slots))
-            losses.extend(self._continuity.why_lost(slot) for slot in each)
+            positions.extend(self._episodes.positions(slots))
+            losses.extend(self._episodes.why_lost(slot) for slot in each)
 
         ticket, _ = yield from self._waiting.ask(now, slots, send, "snapshot")
         replies = zip(each, positions, losses, values_of([ticket]), strict=True)
@@ -130,7 +130,7 @@ class Snapshots:
         positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
 
         def send(ticket: Ticket) -> None:
-            self._continuity.note_restores(slots, positions)
+            self._episodes.note_restores(slots, positions)
             entries = self._requests.issue(slots, Operation.RESTORE, ticket.owner, now)
             self._results.note_unasked(slots)
             self._dispatch.hand_over(slots, entries, packed)

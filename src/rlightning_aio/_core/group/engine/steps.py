@@ -92,7 +92,7 @@ class Steps:
         self._conditions = tables.conditions
         self._envs = tables.envs
         self._requests = tables.requests
-        self._continuity = tables.continuity
+        self._episodes = tables.episodes
         self._observed = tables.observed
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
@@ -155,7 +155,7 @@ class Steps:
         finally:
             if self._observed.observer is not None:
                 self._observed.observer.note_call("step", began)
-        return results, flags if self._continuity.auto_reset_is_open else None
+        return results, flags if self._episodes.auto_reset_is_open else None
 
     def _with_back(
         self, batch: BatchedData, send: Callable[[Ticket], None], slots: NDArray[np.intp]
@@ -303,12 +303,12 @@ class Steps:
         requests = self._requests
         owner = COLLECTOR if ticket is None else ticket.owner
         if requests.in_rings and len(slots) and not self._conditions.unusual:
-            for ring in requests.publish(slots, self._continuity.due[slots], owner, now):
+            for ring in requests.publish(slots, self._episodes.due[slots], owner, now):
                 ring.wake()
             return
-        resets = self._continuity.due[slots]
-        if self._continuity.exceptional:
-            reports = self._continuity.report_losses(slots)
+        resets = self._episodes.due[slots]
+        if self._episodes.exceptional:
+            reports = self._episodes.report_losses(slots)
             self._layout.write_seeds(slots[reports], np.full(np.count_nonzero(reports), AS_BEFORE))
             resets = resets | reports
         entries = requests.issue(slots, _STEP, owner, now)
@@ -349,7 +349,7 @@ class Steps:
             for part in parts:  # A comprehension is a call more.
                 if b"\1" in part.flags.tobytes():
                     flagged.append(part)  # noqa: PERF401
-            is_cut = self._continuity.returned(slots, flagged)
+            is_cut = self._episodes.returned(slots, flagged)
             for part in flagged if is_cut is None else parts:
                 if is_cut is not None:
                     self._mark_cut(part, is_cut)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from rlightning_aio._core.group.episodes.continuity import as_int
+from rlightning_aio._core.group.episodes.episodes import as_int
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
-from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.episodes.episodes import Episodes
 from rlightning_aio._core.group.setup.plan import host_class, placement_for
 from rlightning_aio._core.group.setup.start_orders import start_orders
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
@@ -117,7 +117,7 @@ def _tables(
         envs=envs,
         requests=requests,
         layout=SlabLayout(len(envs)),
-        continuity=Continuity(envs, conditions),
+        episodes=Episodes(envs, conditions),
         conditions=conditions,
         observed=Observed(),
         lifetime=Lifetime(conditions),

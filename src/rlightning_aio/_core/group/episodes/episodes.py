@@ -1,4 +1,4 @@
-"""`Continuity`: where each env is in its episode, and what its next result must report.
+"""`Episodes`: where each env is in its episode, and what its next result must report.
 
 For every env it counts steps, up to the limits of `auto_reset`, and remembers whether the last
 returned result ended the episode; these are arrays, updated when a batch is returned. For the few
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LEGAL",
-    "Continuity",
+    "Episodes",
     "LossEvent",
     "LossPhase",
     "Position",
@@ -98,7 +98,7 @@ class _Loss:
     why: Loss
 
 
-class Continuity:
+class Episodes:
     """See the module.
 
     Attributes:
