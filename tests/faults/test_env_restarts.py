@@ -59,7 +59,7 @@ def test_an_exception_in_a_step_ends_one_episode(start: Start, form: str) -> Non
         check_marked(batch, "faulty-1", cause, "env_raised")
         others = [k for k, key in enumerate(batch.ids()) if key != "faulty-1"]
         tokens.check(batch.take(others))
-        assert group.group.num_restarts == number + 1
+        assert group.group.metrics()["envs/restarts"] == number + 1
         batch, _ = group.step(tokens.steps(group.group.env_ids))
         tokens.check(batch)
     assert [ret.observation[1] for ret in batch.values()] == pids
@@ -103,7 +103,7 @@ def test_exceptions_in_a_row_are_raised_at_last(start: Start, tmp_path: Path, pl
     tokens.check(group.step(tokens.steps(env_ids))[0])
     batch, _ = group.step(tokens.steps(env_ids, {"faulty-1": "raise"}))
     check_marked(batch, "faulty-1", CAUSES["raise"], "env_raised")
-    assert group.group.num_restarts == 3
+    assert group.group.metrics()["envs/restarts"] == 3
 
 
 @on_one_driver
@@ -113,7 +113,7 @@ def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
         group.call("faulty-1", "do", "raise")
     with pytest.raises(EnvRaised):
         group.step(tokens.steps(group.group.env_ids, {"faulty-1": "keyboard interrupt"}))
-    assert group.group.num_restarts == 0
+    assert group.group.metrics()["envs/restarts"] == 0
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     tokens.check(batch)
 

@@ -93,9 +93,9 @@ async def test_no_call_is_answered_for_an_episode_by_an_env_that_was_built_since
             await episode.step(CRASH)
             with pytest.raises(EpisodeLost, match="ended while it was idle: hosts"):
                 await episode.call("get_attr", "env_id")
-        assert group.num_restarts == 1
+        assert group.metrics()["envs/restarts"] == 1
         batch, _ = await group.step(steps(e_0=ADD))
         assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
         assert "ended while it was idle: hosts.spanning.Crash" in batch.info("worker_restarted")[0]
         assert (batch.info("seed"), batch.info("options")) == ([5], [None])
-        assert group.num_restarts == 1
+        assert group.metrics()["envs/restarts"] == 1

@@ -161,11 +161,14 @@ class _GroupStand:
         self._sent_at = np.zeros(len(latest))
 
     async def measure(self, rule: Rule, seconds: float) -> Round:
-        least, before = rule.min_results, self._group.num_restarts
+        least, before = rule.min_results, self._restarts()
         one_round = self._step if least is None else partial(self._collect, least)
         await one_round(seconds / 10)
         measured = await one_round(seconds)
-        return replace(measured, restarts=self._group.num_restarts - before)
+        return replace(measured, restarts=self._restarts() - before)
+
+    def _restarts(self) -> int:
+        return int(self._group.metrics()["envs/restarts"])
 
     async def _step(self, seconds: float) -> Round:
         latencies, steps = list[float](), 0

@@ -356,11 +356,6 @@ class Facade:
         """
         return self._driver.look(self._core.sums.by_env)
 
-    @property
-    def num_restarts(self) -> int:
-        """Number of workers that were replaced, and of envs that were rebuilt, so far."""
-        return sum(record.restarts for record in self._core.supervisor.records)
-
     def get_workers(self) -> list[dict[str, Any]]:
         """The current state of each host: each worker, this process, and each env_server.
 

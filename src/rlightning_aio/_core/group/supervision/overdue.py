@@ -16,8 +16,6 @@ from rlightning_aio._core.group.drivers.wait import Patient
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.config import EnvConfig
 
@@ -54,13 +52,14 @@ class Overdue:
     def look(self, now: float) -> None:
         """Log which env owes a result for too long, if there is one."""
         requests, envs = self._tables.requests, self._tables.envs
-        configs: Sequence[EnvConfig] = envs.configs
         due = now + OWED_SECONDS
-        for slot in requests.owed(np.arange(len(envs))).tolist():
+        owed: list[int] = requests.owed(np.arange(len(envs))).tolist()
+        for slot in owed:
+            config: EnvConfig = envs.configs[slot]
             is_reset = requests.numbering.op(slot) in _RESETS
             setting = "reset_timeout" if is_reset else "step_timeout"
             seconds = now - requests.sent_ns.item(slot) / 1e9
-            if getattr(configs[slot], setting) is not None:
+            if getattr(config, setting) is not None:
                 continue
             if seconds < OWED_SECONDS:
                 due = min(due, now - seconds + OWED_SECONDS)
