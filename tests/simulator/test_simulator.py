@@ -62,7 +62,7 @@ def test_programs_do_what_the_model_says(chunk: int) -> None:
 def test_the_same_happens_in_another_folder(tmp_path: Path) -> None:
     """Envs raise errors, whose tracebacks name files; another process has another pid."""
     folder = tmp_path / "a folder of another length"
-    for path in ("src/rlightning_aio", "tests/simulator"):
+    for path in ("src/rlightning_aio", "tests/simulator", "tests/kit"):
         shutil.copytree(ROOT / path, folder / path, ignore=shutil.ignore_patterns("__pycache__"))
     here, there = (
         subprocess.run(
