@@ -258,7 +258,7 @@ class WorkerDied(EnvFault):
 class EnvHung(WorkerDied):
     """An env exceeded its timeout, and its worker was killed.
 
-    ``stderr_tail`` ends with the stacks of the worker's threads.
+    ``stderr_tail`` ends with the stacks of the worker's threads, unless it was an actor of Ray.
     """
 
     _outcome = "env_hung", "either"

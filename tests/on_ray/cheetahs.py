@@ -1,25 +1,15 @@
 """HalfCheetahs over three nodes, held against local ones while nodes are killed and added.
 
-    python cheetahs.py --steps 100000 --every 2000
-
 Rule: whatever an env of the cluster returns is what its local twin returns, to the last bit. One
 that has lost its episode says so, and both are reset with a seed.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import ray_cluster
 
 from rlightning_aio import sync
@@ -43,13 +33,10 @@ class Told:
 
     Attributes:
         steps: transitions that were equal; restarts: results that told of a lost episode.
-        causes: why; batch_seconds: how long each batch took, from its request on.
     """
 
     steps: int = 0
     restarts: int = 0
-    causes: set[str] = field(default_factory=set[str])
-    batch_seconds: list[float] = field(default_factory=list[float], repr=False)
 
 
 def entry(**placed: Any) -> dict[str, Any]:
@@ -102,11 +89,9 @@ def step_both(
     with group.auto_reset(), twins.auto_reset():
         for number in range(num_batches):
             action = draw.uniform(-1, 1, (NUM_ENVS, 6))
-            began = time.monotonic()
             group.step_async(batch.respond(action=action))
             strike(number)
             batch, _ = group.collect_async(wait_all=True)
-            told.batch_seconds.append(time.monotonic() - began)
             local, _ = twins.step(batch.respond(action=action))
             check(told, batch, local)
             begin_anew(group, twins, batch, seed=number)
@@ -121,10 +106,6 @@ def check(told: Told, batch: Any, local: Any) -> None:
     assert all(here == there for (here, there), same in zip(infos, kept, strict=True) if same)
     told.steps += int(np.sum(kept & ~batch.is_reset))
     told.restarts += int(np.sum(batch.restarted))
-    lost = [
-        ret.info["worker_restarted"] for ret in batch.values() if "worker_restarted" in ret.info
-    ]
-    told.causes.update(lost)
 
 
 def begin_anew(group: Any, twins: Any, batch: Any, seed: int) -> None:
@@ -143,18 +124,3 @@ def equal(here: Any, there: Any, which: Any) -> None:
     for name in ("observation", "reward", "terminated", "truncated", "is_reset", "limit_reached"):
         mine, other = getattr(here, name)[which], getattr(there, name)[which]
         np.testing.assert_array_equal(mine, other, strict=True, err_msg=name)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=100_000, help="transitions of all envs")
-    parser.add_argument("--every", type=int, default=2000, help="batches between two dead nodes")
-    chosen = parser.parse_args()
-    with ray_cluster.cluster(num_cpus=0) as made:
-        told = run(made, -(-chosen.steps // NUM_ENVS), chosen.every)
-        ray_cluster.no_actor_left()
-    sys.stdout.write(f"{told}\n")
-
-
-if __name__ == "__main__":
-    main()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +10,6 @@ from group.test_snapshots import Fragile, Run, entry_of
 
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvRaised
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from kit.driven import Place
 
 pytestmark = pytest.mark.ray
 
@@ -47,28 +42,6 @@ def test_a_restored_env_continues_as_the_original(kind: str) -> None:
                 shown, _ = group.restore(snapshot)
                 snapshot = group.snapshot()
                 np.testing.assert_equal(Run(group, 5).proceed(shown, 20, 1)[1], expected)
-
-
-async def test_a_snapshot_is_a_file_like_any_other(facade: Place, tmp_path: Path) -> None:
-    """For an actor that was never reset, too; some envs only, or into others."""
-    entry = entry_of("gymnasium", **IN_ACTORS)
-    async with facade.build(entry) as group:
-        await group.reset(seed=3)
-        (tmp_path / "kept").write_bytes(await group.snapshot())
-        before, _ = await group.step(group_actions(group))
-    async with facade.build(entry) as group:
-        await group.restore((tmp_path / "kept").read_bytes())
-        after, _ = await group.step(group_actions(group))
-        np.testing.assert_equal(after.observation, before.observation)
-        snapshot = await group.snapshot(["e-0"])
-        shown, _ = await group.restore(snapshot, ["e-1"])
-        np.testing.assert_equal(shown.observation[0], after.observation[0])
-
-
-def group_actions(group: Any) -> Any:
-    from rlightning_aio import BatchedData, PolicyResponse
-
-    return BatchedData(group.env_ids, [PolicyResponse(env_id, 1) for env_id in group.env_ids])
 
 
 def test_an_env_that_cannot_be_restored_is_lost_and_the_others_are_restored() -> None:
