@@ -27,6 +27,7 @@ import uvloop
 from hypothesis import HealthCheck, settings
 from kit import checked
 
+from rlightning_aio._core.group.drivers import sync_driver
 from rlightning_aio.registry import BACKENDS
 
 if TYPE_CHECKING:
@@ -245,6 +246,14 @@ def python_raises() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def pressed_again(python_raises: None, monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Return a list that gets an item in place of each Ctrl-C that comes again after a call."""
+    pressed: list[bool] = []
+    monkeypatch.setattr(sync_driver, "press_again", lambda: pressed.append(True))
+    return pressed
 
 
 @pytest.fixture

@@ -6,8 +6,6 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-import pytest
-
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
@@ -21,13 +19,8 @@ def press() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def interrupt() -> None:
-    """Raise what a second Ctrl-C raises at once, also where the first one is held back."""
-    raise KeyboardInterrupt
-
-
 class Strike:
-    """A trace function that calls `strike` at the n-th line of this library.
+    """A trace function that presses Ctrl-C at the n-th line of this library.
 
     Lines of the driver count only while it holds Ctrl-C back: where it doesn't any more, nothing is
     called before it returns, so Python doesn't look for signals there.
@@ -36,9 +29,8 @@ class Strike:
         left: lines until then; 0 afterwards.
     """
 
-    def __init__(self, line: int, strike: Callable[[], None]) -> None:
+    def __init__(self, line: int) -> None:
         self.left = line
-        self._strike = strike
 
     def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
         return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
@@ -47,7 +39,7 @@ class Strike:
         if event == "line" and self.left and self._counts(frame.f_code.co_filename):
             self.left -= 1
             if not self.left:
-                self._strike()
+                press()
         return self._line
 
     def _counts(self, path: str) -> bool:
@@ -55,14 +47,12 @@ class Strike:
         return holds_back or not path.endswith(DRIVER)
 
 
-def struck(
-    line: int, call: Callable[[], Any], how: Callable[[], None] = press
-) -> tuple[bool, bool, Any]:
+def struck(line: int, call: Callable[[], Any]) -> tuple[bool, bool, Any]:
     """Make a call with Ctrl-C at that line.
 
     Returns True if the line was reached, True if the call was interrupted, and what it returned.
     """
-    strike, interrupted, returned = Strike(line, how), False, None
+    strike, interrupted, returned = Strike(line), False, None
     sys.settrace(strike)
     try:
         returned = call()
@@ -73,9 +63,3 @@ def struck(
     reached = strike.left == 0
     assert reached or not interrupted
     return reached, interrupted, returned
-
-
-def hear_of_interrupt(call: Callable[[], object]) -> None:
-    """Check that the next call raises an interrupt that the last one has not raised."""
-    with pytest.raises(KeyboardInterrupt):
-        call()

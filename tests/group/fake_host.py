@@ -577,9 +577,6 @@ class FakeGroup:
     def read(self) -> None:
         """See `hosts.base.Driver`: there is nothing to read."""
 
-    def check_interrupt(self) -> None:
-        """See `hosts.base.Driver`: nobody interrupts it."""
-
     def wake(self) -> None:
         """See `hosts.base.Driver.wake`."""
         for running in self.running:

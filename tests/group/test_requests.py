@@ -72,7 +72,6 @@ class Driven:
             Event.METHOD_GIVEN_UP: self._give_up,
             Event.CLAIMED: self._claim,
             Event.DROPPED: self._drop,
-            Event.KEPT: lambda: self.table.collector.keep(self.table.alone(SLOT), fault()),
             Event.FREED: self._free,
             Event.ABORTED: self._abort,
         }
@@ -241,7 +240,7 @@ def test_any_other_event_is_refused_or_has_no_effect(
     table = driven.table
     slots = table.alone(SLOT)
     needs_idle = (
-        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.KEPT,
+        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED,
     )  # fmt: skip
     if event in needs_idle:
         assert table.first_not_idle(slots) == SLOT

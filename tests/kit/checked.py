@@ -90,7 +90,6 @@ _OF_REQUESTS: Final[Rules] = {
 }
 """The changes that each method makes, by its arguments."""
 _OF_QUEUE: Final[Rules] = {
-    "keep": lambda _, args: [(Event.KEPT, args[0])],
     "free": lambda it, args: [(Event.FREED, it.with_errors(args[0]))],
 }
 

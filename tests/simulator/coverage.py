@@ -47,9 +47,9 @@ ROWS: Final[dict[str, str]] = {
     "a collect while nothing": "NothingPending",
     "`deadline` passes": "deadline",
     "an agent leaves `group.episode`": "attempts cancelled",
-    "Ctrl-C while a synchronous group waits": "Ctrl-C in a wait",
+    "Ctrl-C while a synchronous group waits": "Ctrl-C",
     "… while an inline environment steps": "Ctrl-C in an env",
-    "… while the group sends": "Ctrl-C in a send",
+    "… while a call moves data": "interrupts again",
     "the process that drives a robot": ELSEWHERE + "tests/envs/test_piper_guard.py",
     "the trainer dies": ELSEWHERE + "tests/faults/test_shutdown.py, which kills trainers",
 }

@@ -566,11 +566,33 @@ class Play(Session):
         require(places == sorted(places), "not in the group's order", places)
 
     async def op_reset(self, rng: Random) -> None:
+        if self.model.pending() and rng.random() < 0.8 and self.may_drop():
+            await self.drop(rng)
+            return
         envs = self.some(rng, self.model.idle())
         if envs:
             await self.reset(envs, rng)
 
-    async def reset(self, envs: list[Env], rng: Random | None = None) -> bool:
+    def may_drop(self) -> bool:
+        """A reset of all envs drops what is in flight, and nothing stops it on the way."""
+        envs = self.model.envs.values()
+        gone = any(env.gone for env in envs)
+        known = not ("interrupts" in self.features or self.clients or gone)
+        return known and self.may_abort() and all(map(self.is_abortable, self.model.pending()))
+
+    async def drop(self, rng: Random) -> None:
+        """Reset all envs, of which some are busy: their results and errors are dropped."""
+        envs = list(self.model.envs.values())
+        for env in envs:
+            if env.limbo or env.request is not None:
+                self.model.abort(env)
+                env.kept.clear()
+        self.counts["dropped by a reset"] += 1
+        await self.reset(envs, rng, drops=True)
+
+    async def reset(
+        self, envs: list[Env], rng: Random | None = None, *, drops: bool = False
+    ) -> bool:
         others = [env for env in self.model.envs.values() if all(env is not e for e in envs)]
         in_order = [env.env_id for env in envs] == [
             env_id for env_id in self.model.envs if env_id in {env.env_id for env in envs}
@@ -584,7 +606,7 @@ class Play(Session):
                 env.request = None
         seed, options, requests = self.resets(envs, rng)
         if rng is not None and not self.clients:
-            everyone = everyone and rng.random() < 0.7
+            everyone = drops or (everyone and rng.random() < 0.7)
         ids = None if everyone else [*requests]
 
         def take(found: Any) -> None:

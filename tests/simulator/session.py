@@ -133,8 +133,8 @@ class Session:
             warnings.simplefilter("always")
             try:
                 await self.done(self.close_group())
-            except KeyboardInterrupt:  # No call came after it that could raise it.
-                raised = self.counts["Ctrl-C in a wait"] + self.counts["Ctrl-C in a send"]
+            except KeyboardInterrupt:
+                raised = self.counts["Ctrl-C"]
                 require(self.num_interrupts > raised, "nobody has pressed Ctrl-C")
         texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
         self.counts["close raised"] += len(texts)
@@ -153,18 +153,17 @@ class Session:
             self.world.reseed(op.seed)
             self.world.storm()
         self.say(f"{number}: {op.name}")
-        await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)), op.name)
+        await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)))
         self.counts[f"op {op.name}"] += 1
         if self.world is not None:
             require(not self.world.wrongs, "wrong", *self.world.wrongs)
 
-    async def interruptible(self, doing: Coroutine[Any, Any, Any], name: str = "") -> Any:
+    async def interruptible(self, doing: Coroutine[Any, Any, Any]) -> Any:
         """Do something that Ctrl-C may interrupt; None if it did."""
         try:
             return await doing
         except KeyboardInterrupt:
-            sends = name in ("step_async", "reset_async")
-            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
+            self.counts["Ctrl-C"] += 1
             self.say("   Ctrl-C was raised")
             self.note_interrupt()
 
@@ -173,8 +172,9 @@ class Session:
 
     @property
     def num_interrupts(self) -> int:
-        """How often Ctrl-C was pressed; it is raised now or by a later call."""
-        return 0 if self.world is None else self.world.counts["interrupts"]
+        """How often Ctrl-C was pressed, and raised in the call."""
+        counts: Counter[str] = Counter() if self.world is None else self.world.counts
+        return counts["interrupts"] - counts["interrupts again"]
 
     async def done(self, answer: Any) -> Any:
         """What a call returns, whichever kind of group it is of."""

@@ -51,6 +51,7 @@ from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, WakeUp, run_in_process
 
 from rlightning_aio import sharing
+from rlightning_aio._core.group.drivers import sync_driver
 from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import hint, overdue
 from rlightning_aio._core.hosts import inbox
@@ -211,6 +212,7 @@ class World:
             (gc, "collect", nothing),
             (gc, "freeze", nothing),
             (os, "fsync", nothing),
+            (sync_driver, "press_again", self.press_again),
             # As on a processor that reorders accesses to memory, so that there are more fences.
             (exchange, "IN_ORDER", False),
             (rings, "IN_ORDER", False),
@@ -400,6 +402,11 @@ class World:
         self.note("Ctrl-C")
         self.running = None  # The trainer handles it.
         signal.raise_signal(signal.SIGINT)
+
+    def press_again(self) -> None:
+        """Note that Ctrl-C comes again, after the call that held it back has returned."""
+        self.note("Ctrl-C comes again")
+        self.counts["interrupts again"] += 1
 
     def interrupt_at(self, seconds: float) -> None:
         """Press Ctrl-C after some seconds."""

@@ -15,7 +15,7 @@ from rlightning_aio.vector import VectorEnv, make_vec
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-pytestmark = pytest.mark.usefixtures("python_raises")
+pytestmark = pytest.mark.usefixtures("pressed_again")
 STRIDE = int(os.environ.get("RLIGHTNING_AIO_STRIDE", "61"))
 """Every so many lines, Ctrl-C is pressed; 1 takes minutes."""
 NUM_LINES = 9000
@@ -44,14 +44,6 @@ def first(envs: Any) -> Any:
     return envs.reset()
 
 
-def after_reset(envs: Any) -> Any:
-    """As `first`, after an interrupt that may not have been raised yet."""
-    try:
-        return first(envs)
-    except KeyboardInterrupt:
-        return first(envs)
-
-
 @pytest.mark.parametrize("call", ["step", "reset", "get_attr"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_reset_goes_on_wherever_a_call_was_interrupted(kind: str, call: str) -> None:
@@ -69,7 +61,7 @@ def test_a_reset_goes_on_wherever_a_call_was_interrupted(kind: str, call: str) -
         }
         for line in range(1, NUM_LINES, STRIDE):
             reached, _, _ = struck(line, uses[call])
-            np.testing.assert_array_equal(after_reset(envs), expected)
+            np.testing.assert_array_equal(first(envs), expected)
             np.testing.assert_array_equal(envs.step(actions)[0], following)
             if not reached:
                 break

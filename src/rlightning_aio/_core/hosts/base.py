@@ -84,10 +84,6 @@ class Driver(Protocol):
         """Call a function that runs an env; Ctrl-C may interrupt it."""
         ...
 
-    def check_interrupt(self) -> None:
-        """Raise a Ctrl-C that was held back; results that are not handed out yet are kept."""
-        ...
-
 
 class Host(Protocol):
     """Envs in one place, with indices from 0.

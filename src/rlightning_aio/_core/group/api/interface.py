@@ -49,6 +49,10 @@ class GroupInterface(Facade):
     ) -> Any:
         """Start a new episode in all envs, or in those of `env_ids`, and wait for all of them.
 
+        Without `env_ids` it always works: what is still in flight, after Ctrl-C, a cancellation or
+        an error, is awaited within its time limits and dropped, and so are errors that nobody has
+        collected; only what another call waits for is not.
+
         Args:
             seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
                 gives one seed for each env, a mapping seeds by id.
@@ -61,7 +65,8 @@ class GroupInterface(Facade):
         to `collect_async`.
 
         Raises:
-            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
+            EnvBusy: one of `env_ids` has a reply outstanding, or appears twice; or another call
+                waits for an env. Nothing was sent.
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
             TypeError: the options are no dict, or can't be sent to a worker or a client.

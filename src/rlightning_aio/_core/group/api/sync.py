@@ -7,7 +7,6 @@ works in a script, in a thread, and in a notebook cell whose loop is running.
 from __future__ import annotations
 
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar, TypeVarTuple
 
 from rlightning_aio._core.group.api.facade import only_result, steps_of
@@ -20,7 +19,7 @@ from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -44,10 +43,11 @@ class EnvGroup(GroupInterface):
         with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
             batch, _ = group.reset(seed=0)
 
-    Each method blocks the calling thread until it is done. Ctrl-C raises KeyboardInterrupt, leaves
-    outstanding results to `collect_async`, and the group remains usable (docs/faults.md). If it
-    comes while results are being handed out, the next call raises it. Any thread may use the group,
-    one at a time: a call while another thread is in one raises RLightningError.
+    Each method blocks the calling thread until it is done. Ctrl-C raises KeyboardInterrupt where
+    the call waits, or in the code of an inline env; what was in flight is left to `collect_async`,
+    and `reset` drops it. If it comes while a call moves data, the call ends first, and Ctrl-C is
+    raised a moment after that (docs/faults.md). Any thread may use the group, one at a time: a call
+    while another thread is in one raises RLightningError.
     """
 
     _driver: SyncDriver
@@ -128,7 +128,7 @@ class EnvGroup(GroupInterface):
 
     def close(self) -> None:
         try:
-            self._driver.run_last(self._core.close(time.monotonic()))
+            self._driver.run(self._core.close(time.monotonic()))
         finally:
             self._after_close()
 
@@ -143,14 +143,10 @@ class EnvHandle(EnvHandleInterface):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
         seeds = None if seed is None else [seed]
-        return self._only(partial(self._group.reset, seeds, options, [self.env_id]))
+        return only_result(self._group.reset(seeds, options, [self.env_id]))
 
     def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        return self._only(partial(self._group.step, steps_of(self.env_id, response)))
-
-    def _only(self, ask: Callable[[], Any]) -> EnvRet | MultiAgentEnvRet:
-        """Return the only result of `ask`; a Ctrl-C after the reply doesn't take it."""
-        return self._driver.call(lambda: only_result(ask()))
+        return only_result(self._group.step(steps_of(self.env_id, response)))
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         slot = self._core.envs.find_one(self._env_id)
@@ -169,11 +165,7 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[EnvRet | MultiAgentEnvRet]:
         procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
-
-        def results() -> list[EnvRet | MultiAgentEnvRet]:
-            return self._driver.run(procedure)[0].values()
-
-        return self._driver.call(results)
+        return self._driver.run(procedure)[0].values()
 
 
 def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:

@@ -99,9 +99,6 @@ class AioDriver:
         """Call a function that runs an env; asyncio handles Ctrl-C."""
         return execute()
 
-    def check_interrupt(self) -> None:
-        """Do nothing: asyncio handles Ctrl-C."""
-
     def move(self) -> None:
         """Bind the driver to the running loop, if its own loop is not running.
 

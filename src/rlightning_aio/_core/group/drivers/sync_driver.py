@@ -1,9 +1,7 @@
 """`SyncDriver`: waits for a synchronous group, and holds Ctrl-C back.
 
-Rule: Ctrl-C never stops a call between two changes of the group's state, nor takes its result. It
-is raised where the call waits or runs an env in this process, or once the call has done what it can
-without waiting, before it hands out results. If it comes after that, the call returns, and the next
-one raises it. A second one is raised at once.
+Rule: Ctrl-C is raised where a call waits, and in the code of an env of this process. Where it comes
+while a call moves data, the call ends first, and the signal comes again a moment after that.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import threading
 import time
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
+from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
 from rlightning_aio._core.group.drivers.wait import TURN, forked_from, this_process
 from rlightning_aio._core.hosts.descriptors import READABLE, WRITABLE, new_descriptor_set
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.hosts.base import Source
 
-__all__ = ["SyncDriver"]
+__all__ = ["SyncDriver", "press_again"]
 
 T = TypeVar("T")
 A = TypeVarTuple("A")
@@ -36,7 +34,16 @@ A = TypeVarTuple("A")
 # The functions of `signal` take ten times as long, because they make enums.
 _signal: Any = import_module("_signal")
 _SIGINT: Final = int(signal.SIGINT)
-_MAIN_THREAD: Final = threading.main_thread().ident
+_MAIN_THREAD: Final = cast("int", threading.main_thread().ident)
+_MOMENT: Final = 0.01
+"""Seconds after which a Ctrl-C that was held back comes again."""
+
+
+def press_again() -> None:
+    """Send Ctrl-C once more, a moment after the call that held it back has returned."""
+    timer = threading.Timer(_MOMENT, signal.pthread_kill, (_MAIN_THREAD, _SIGINT))
+    timer.daemon = True
+    timer.start()
 
 
 class SyncDriver:
@@ -54,8 +61,8 @@ class SyncDriver:
         self._pid = os.getpid()
         # The thread that is in a call now; 0 if none is.
         self._thread = 0
-        # Ctrl-C may be raised; there was one when it could not be; the next call raises it.
-        self._is_interruptible = self._is_interrupted = self._was_interrupted = False
+        # Ctrl-C may be raised; there was one when it could not be.
+        self._is_interruptible = self._is_interrupted = False
 
     def check_caller(self) -> None:
         """Check the thread as `GroupDriver` says; signal handlers of the waiting thread pass."""
@@ -115,13 +122,6 @@ class SyncDriver:
         """
         return self.call(self._run, procedure)
 
-    def run_last(self, procedure: Procedure[None]) -> None:
-        """Run the procedure that closes the group; raise an earlier interrupt after that."""
-        was_interrupted, self._was_interrupted = self._was_interrupted, False
-        self.run(procedure)
-        if was_interrupted:
-            raise KeyboardInterrupt
-
     def _run(self, procedure: Procedure[T]) -> T:
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
@@ -131,7 +131,7 @@ class SyncDriver:
                         self._block(wait.until)
                         if self.completions:
                             self.apply_completions()
-                    self.check_interrupt()
+                    self._check_interrupt()
                 except BaseException as error:
                     if isinstance(error, KeyboardInterrupt):
                         error.add_note(self.awaited(time.monotonic()))
@@ -142,90 +142,60 @@ class SyncDriver:
         except StopIteration as stop:
             return stop.value
 
+    # -- one thread at a time, and Ctrl-C ---------------------------------------------
+
     def call(self, function: Callable[[*A], T], *args: *A) -> T:
         """Call a function of the group; errors are those of `run`.
 
-        Of an interrupt that it has not raised, the next call hears: it must not take a result or an
-        error. Where there is none of these, it is raised at once.
-        """
-        state = self._enter(hears=True)
-        try:
-            result = function(*args)
-        finally:
-            self._leave(*state)
-        if result is None and self._was_interrupted:
-            self._was_interrupted = False
-            raise KeyboardInterrupt
-        return result
-
-    def look(self, function: Callable[[*A], T], *args: *A) -> T:
-        """Call a function that only looks at the group; an interrupt is for the next `call`."""
-        state = self._enter(hears=False)
-        try:
-            return function(*args)
-        finally:
-            self._leave(*state)
-
-    # -- one thread at a time, and Ctrl-C ---------------------------------------------
-
-    def _enter(self, *, hears: bool) -> tuple[bool, bool, bool]:
-        """Begin a call, which raises an interrupt that the last one has not raised if it `hears`.
-
-        Returns True if it is no call within another; True if it holds back Ctrl-C, as a program
-        that handles SIGINT in its own way continues doing so; and True if it was allowed before.
+        A program that handles SIGINT in its own way continues doing so.
         """
         me = threading.get_ident()
         # No function call before the assignment, so no other thread can run in between.
         if this_process[0] != self._pid or self._thread not in (0, me):
             raise self._refusal()
         outermost, was_interruptible = not self._thread, self._is_interruptible
+        holds_back = False
         try:
-            self._thread = me
-            holds_back = (
+            self._thread, self._is_interruptible = me, False
+            if (
                 outermost
                 and me == _MAIN_THREAD
                 and _signal.getsignal(_SIGINT) is signal.default_int_handler
-            )
-            if holds_back:
-                if hears and self._was_interrupted:
-                    self._was_interrupted = False
-                    raise KeyboardInterrupt
-                self._is_interrupted = False
+            ):
                 _signal.signal(_SIGINT, self._on_interrupt)
-            self._is_interruptible = False
-        except BaseException:  # Ctrl-C, just before it is held back.
+                holds_back = True
+            return function(*args)
+        finally:
+            self._is_interruptible = was_interruptible
             if outermost:
                 self._thread = 0
-            raise
-        return outermost, holds_back, was_interruptible
+            if holds_back:
+                self._stop_holding_back()
 
-    def _leave(self, outermost: bool, holds_back: bool, was_interruptible: bool) -> None:
-        self._is_interruptible = was_interruptible
-        if outermost:
-            self._thread = 0
-        if holds_back:
-            try:
-                self._stop_holding_back()
-            except KeyboardInterrupt:  # It came before the call could return.
-                self._is_interrupted = True
-                self._stop_holding_back()
-            # Nothing is called from here on, so Python handles no signal before the call returns.
-            self._was_interrupted |= self._is_interrupted
-            self._is_interrupted = False
+    def look(self, function: Callable[..., T], *args: Any) -> T:
+        return self.call(function, *args)
 
     def _stop_holding_back(self) -> None:
-        if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.
-            _signal.signal(_SIGINT, signal.default_int_handler)
+        try:
+            if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.
+                _signal.signal(_SIGINT, signal.default_int_handler)
+        except KeyboardInterrupt:  # It came before the call could return.
+            self._is_interrupted = True
+        # If it is not set, nothing is called from here on, so Python handles no signal before the
+        # call returns.
+        if self._is_interrupted:
+            self._is_interrupted = False
+            press_again()
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         """Handle Ctrl-C during a call."""
         del number, frame
-        if self._is_interruptible or self._is_interrupted:
-            self._is_interrupted = False
+        if self._is_interruptible:
             raise KeyboardInterrupt
         self._is_interrupted = True
 
-    def check_interrupt(self) -> None:
+    def _check_interrupt(self) -> None:
+        """Raise a Ctrl-C that came while it could not be raised."""
         if self._is_interrupted:
             self._is_interrupted = False
             raise KeyboardInterrupt
@@ -233,7 +203,7 @@ class SyncDriver:
     def interruptible(self, execute: Callable[[], T]) -> T:
         before, self._is_interruptible = self._is_interruptible, True
         try:
-            self.check_interrupt()  # Of a moment ago.
+            self._check_interrupt()
             return execute()
         finally:
             self._is_interruptible = before

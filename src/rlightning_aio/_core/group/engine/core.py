@@ -8,6 +8,7 @@ Rule: no I/O beyond passing bytes to hosts, no waiting, no event loop.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.engine.waiting import Waiting
 from rlightning_aio._core.group.state.request_states import NOBODY, State
 from rlightning_aio.batch.data import BatchedData
+from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -115,8 +117,14 @@ class Core:
         options: dict[str, Any] | None,
         env_ids: Sequence[str] | None,
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        """Reset envs and wait for all of them."""
+        """Reset envs and wait for all of them; without `env_ids`, drop what is in flight first."""
         with self.observed.call("reset", now):
+            # Other calls that wait have the envs that they use; a reset is refused then.
+            others = self.steps.collecting or self.requests.tickets.waiting
+            if env_ids is None and not (others or self.supervisor.members.possible):
+                with suppress(EnvFault):
+                    yield from self._drain(now, None)
+                now = self.tables.clock()
             return self.steps.settled(*(yield from self._resets.reset(now, seed, options, env_ids)))
 
     def reset_members(

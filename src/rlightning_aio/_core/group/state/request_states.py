@@ -48,8 +48,6 @@ class Event(Enum):
     ABORTED = auto()
     """Its caller wants no reply."""
     ASKED_AGAIN = auto()
-    KEPT = auto()
-    """Its error could not be raised at once: it waits for the collector."""
     FREED = auto()
     """The error that it ended in is raised, or its caller doesn't wait for that."""
     HANDED_OUT = auto()
@@ -69,7 +67,6 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_IDLE, _C, Event.SENT): (_BUSY, _C),
     (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
     (_IDLE, _C, Event.JOINED): (_READY, _C),
-    (_IDLE, _C, Event.KEPT): (_SPENT, _C),
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),
     (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),

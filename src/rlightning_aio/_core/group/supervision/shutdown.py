@@ -43,17 +43,23 @@ class Shutdown:
             return
         self._tables.lifetime.end()
         alive = [r for r in self._tables.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
+        interrupt: KeyboardInterrupt | None = None
         for record in alive:
             record.held, record.restart_at = [], None
             if record.stage in (Stage.GIVEN_UP, Stage.DOWN):
                 record.stage = Stage.CLOSED
             else:
-                record.host.close()
+                try:
+                    record.host.close()
+                except KeyboardInterrupt as error:  # In an env of this process; others close, too.
+                    interrupt = error
         try:
             yield from self._until_closed(alive, now)
         finally:
             stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._tables.records)
             self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
+        if interrupt is not None:
+            raise interrupt
 
     def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
         """Wait for hosts that close; kill each when its time is up."""

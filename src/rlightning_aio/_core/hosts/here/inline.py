@@ -116,9 +116,11 @@ class InlineHost(Host):
 
     def close(self) -> None:
         """Close the envs immediately."""
-        errors = close_all(self._runners)
+        errors = self._driver.interruptible(partial(close_all, self._runners))
         self.release()
         self._post(Closed(self.host_id, errors))
+        if any(error.type_name == "KeyboardInterrupt" for _, error in errors):
+            raise KeyboardInterrupt  # It is meant for the program.
 
     def release(self) -> None:
         """Drop the envs and their requests."""
