@@ -64,6 +64,8 @@ class Play(Session):
         self.snapshots: list[tuple[bytes, list[tuple[Env, Any]]]] = []
         self.tasks: list[asyncio.Task[None]] = []
         self.context: Any = None
+        # Envs whose results were dropped: they may have ended episodes.
+        self.unseen: set[str] = set()
         self.trace: Any = None
         self.collecting = False
         self.kept: list[tuple[Any, Any]] = []
@@ -355,7 +357,7 @@ class Play(Session):
     def check_stats(self) -> None:
         """Compare the figures of the group with the episodes that were seen."""
         for env_id, found in self.group.get_env_stats().items():
-            if env_id in self.nested:
+            if env_id in self.nested or env_id in self.unseen:
                 continue
             episodes = self.model.envs[env_id].episodes
             require(found["episodes"] == len(episodes), "episodes", env_id, found, episodes)
@@ -587,6 +589,7 @@ class Play(Session):
             if env.limbo or env.request is not None:
                 self.model.abort(env)
                 env.kept.clear()
+                self.unseen.add(env.env_id)
         self.counts["dropped by a reset"] += 1
         await self.reset(envs, rng, drops=True)
 

@@ -24,7 +24,7 @@ from rlightning_aio._core.group.engine.results import Results
 from rlightning_aio._core.group.engine.snapshots import Snapshots
 from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.engine.waiting import Waiting
-from rlightning_aio._core.group.state.request_states import NOBODY, State
+from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.batch.data import BatchedData
 from rlightning_aio.errors import EnvFault
 
@@ -119,8 +119,8 @@ class Core:
     ) -> Procedure[tuple[BatchedData, Flags]]:
         """Reset envs and wait for all of them; without `env_ids`, drop what is in flight first."""
         with self.observed.call("reset", now):
-            # Other calls that wait have the envs that they use; a reset is refused then.
-            others = self.steps.collecting or self.requests.tickets.waiting
+            # What another call waits for is not dropped; the reset is refused then.
+            others = self.steps.collecting or np.count_nonzero(self.requests.owner > COLLECTOR)
             if env_ids is None and not (others or self.supervisor.members.possible):
                 with suppress(EnvFault):
                     yield from self._drain(now, None)
