@@ -217,7 +217,7 @@ async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
     group.step_async(responses(["probe-1"], 1))
     for request in (
         group.step(responses(IDS, 1, 2, 3, 4)),
-        group.reset(),
+        group.reset(env_ids=IDS),
         group["probe-1"].step([0, 1]),
         group["probe-1"].call("double", 1),
     ):
@@ -282,7 +282,7 @@ async def test_an_env_whose_error_was_not_collected_is_busy(start: Any, is_read:
                 send()
         for request in (
             group.step(responses(IDS, 1, 2, 3, 4)),
-            group.reset(),
+            group.reset(env_ids=IDS),
             group.snapshot(["probe-1"]),
             group["probe-1"].call("double", 1),
         ):
