@@ -38,7 +38,7 @@ def gate(tmp_path: Any) -> Any:
 def watch(group: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a group whose envs have been reset wait no more than a moment."""
     monkeypatch.setattr(overdue, "OWED_SECONDS", 0.3)
-    group._core.supervisor.overdue.begin(time.monotonic())
+    group._core.supervisor.watch(time.monotonic())
     if isinstance(group, rl.EnvGroup):
         group._driver._end_nudge()  # It has a timer for a minute, if a reset has waited.
 
@@ -130,7 +130,8 @@ def test_nothing_is_said_of_envs_with_a_limit_or_that_reply(
         batch, _ = group.step(batch.respond([0, 1, 0]))
     with sync.build_env_group(entry(gate)) as group:
         batch, _ = group.reset()
-        group._core.supervisor.overdue.due = 0.0  # It looks at each wait.
+        supervisor = group._core.supervisor
+        supervisor.overdue.due = supervisor.due = 0.0  # It looks at each wait.
         for _ in range(10):
             batch, _ = group.step(batch.respond([0, 0, 0]))
     assert said(caplog) == []

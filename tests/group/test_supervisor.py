@@ -77,6 +77,14 @@ class Fleet(FakeGroup):
         self.supervisor.check(self.now)
         self.drain()
 
+    def let(self, seconds: float) -> None:
+        """Let time pass, and look at the hosts whenever that is due, as a call that waits."""
+        end = self.now + seconds
+        while (due := self.supervisor.next_check()) is not None and due <= end:
+            self.now = max(self.now, due)
+            self.check()
+        self.now = end
+
     def wait(self) -> float:
         """Let time pass until the supervisor has something to do; return how long that took."""
         due = self.supervisor.next_check()
@@ -215,13 +223,9 @@ def test_a_host_that_survives_a_kill_is_destroyed_with_its_fork_server(
     ours.check()
     for destroyed in range(1, 3):
         ours.check()
-        due = ours.supervisor.next_check()
-        assert due == pytest.approx(ours.now + hang_detector._OBEY_SECONDS)
-        ours.now = due - 0.1
-        ours.check()
+        ours.let(hang_detector._OBEY_SECONDS - 0.1)
         assert len(ours.log) == destroyed
-        ours.now = due
-        ours.check()
+        ours.let(0.1)
         assert ours.log == ["dump and kill 0"] + destroyed * ["destroy 0"]
         ours.check()
     loss = ours.die(0)
@@ -244,13 +248,15 @@ def test_a_killed_host_has_its_time_if_the_trainer_was_stopped(fleet: Callable[.
     ours.check()
     ours.check()
     assert ours.log == ["dump and kill 0"]
-    assert ours.supervisor.next_check() == ours.now + hang_detector._OBEY_SECONDS
+    ours.let(hang_detector._OBEY_SECONDS - 0.1)
+    assert ours.log == ["dump and kill 0"]
+    ours.let(0.1)
+    assert ours.log == ["dump and kill 0", "destroy 0"]
 
 
 def ended_as_hung(ours: Fleet) -> HostLoss:
-    """Return the outcome for host 0, whose time is almost over."""
-    ours.now += 0.2
-    ours.check()
+    """Return the outcome for host 0, whose time is almost over, or is by the next look."""
+    ours.let(0.1 + 5.0 / 4)
     assert ours.log[0] == "dump and kill 0"
     (loss,) = ours.losses
     assert is_replaced(loss)
@@ -282,10 +288,7 @@ def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
     ours.hosts[0].current = (entries[1], 0)
     for part in range(3):
         ours.hosts[0].traffic = part
-        ours.check()
-        assert ours.supervisor.next_check() == pytest.approx(ours.now + 5)
-        ours.now += 4.9
-        ours.check()
+        ours.let(4.9)
     assert ours.log == []
     loss = ended_as_hung(ours)
     assert loss.error(loss.owed).env_id == "fake-1"
@@ -311,9 +314,7 @@ def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -
     ours.ask(0, 2)
     for _ in range(3):
         ours.hosts[0].current = (0, int(ours.now * 1e9))
-        ours.check()
-        ours.now += 4.9
-        ours.check()
+        ours.let(4.9)
     assert ours.log == []
     loss = ended_as_hung(ours)
     assert loss.why[2:] == ("infrastructure", None)
@@ -369,6 +370,64 @@ def test_an_unread_death_does_not_cost_the_fork_server(
     ours.now += 60
     ours.check()
     assert ours.log == ["dump and kill 0", "start 0", "attach 0"]
+
+
+def test_hosts_are_looked_at_a_few_times_within_the_shortest_limit(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """However often a call waits meanwhile: so limits cost a step nothing."""
+    ours = fleet((1,) * 8, step_timeout=8.0, reset_timeout=100.0)
+    looks = 0
+
+    def looked(current: Callable[[], tuple[int, int]]) -> Callable[[], tuple[int, int]]:
+        def look() -> tuple[int, int]:
+            nonlocal looks
+            looks += 1
+            return current()
+
+        return look
+
+    for host in ours.hosts:
+        host.current_request = looked(host.current_request)  # type: ignore[method-assign]
+    entries = ours.ask(*range(8))
+    for _ in range(800):
+        for host, entry in zip(ours.hosts, entries, strict=True):
+            host.current = (entry, int(ours.now * 1e9))
+        ours.check()
+        ours.now += 0.01
+    assert 0 < looks <= 8 * 5
+
+
+@pytest.mark.parametrize("begun", [0.0, 0.1, 1.9, 2.0, 3.3])
+@pytest.mark.parametrize("idle", [False, True])
+def test_a_hang_is_ended_in_time(fleet: Callable[..., Fleet], begun: float, idle: bool) -> None:
+    """When its time is over; of a worker that executes nothing, at most a quarter later."""
+    ours = fleet((1, 1), step_timeout=8.0)
+    ours.ask(1)
+    ours.hosts[1].traffic = 1
+    ours.let(begun)
+    (entry,) = ours.ask(0)
+    if not idle:
+        ours.hosts[0].current = (entry, int(ours.now * 1e9))
+    ours.let(7.9 - begun)  # The other one is not found before that.
+    assert ours.log == []
+    ours.reply(1)
+    ours.let(begun)
+    assert ours.log == []
+    ours.let(2.1 if idle else 0.11)
+    assert ours.log[0] == "dump and kill 0"
+
+
+def test_a_limit_of_milliseconds_is_not_looked_at_all_the_time(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """A hang may take some of them longer then."""
+    ours = fleet((1,), step_timeout=0.001)
+    (entry,) = ours.ask(0)
+    ours.hosts[0].current = (entry, int(ours.now * 1e9) + 1)
+    ours.check()
+    ours.let(0.02)
+    assert ours.log[0] == "dump and kill 0"
 
 
 def test_an_aborted_request_that_exceeds_its_limit_is_no_hang(
@@ -506,22 +565,24 @@ def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     ours.die(0, entry)
     (later,) = ours.ask(1)
     asked = [*ours.entries(0), later]
-    ours.wait()
+    ours.let(0.15)
     ours.hosts[0].refusals, ours.hosts[0].builds = 0, False
-    ours.wait()
+    ours.let(0.2)
     assert ours.log == ["start 0", "attach 0"]
     ours.now += 5
     ours.check()
     ours.die(0)
     ours.hosts[0].builds = True
-    ours.wait()
+    ours.let(0.45)
     assert ours.hosts[0].asked == [entry, *asked]
     assert ours.requests.in_flight == [2, 0]
     assert [type(loss) for loss in ours.losses] == [HostLoss, *[type(None)] * 3]
     # The time begins when the replacement is up: until then it had nothing to execute.
-    ours.check()
     assert ours.log[-2:] == ["start 0", "attach 0"]
-    assert ours.supervisor.next_check() == ours.now + 1
+    ours.let(0.9)
+    assert ours.log[-2:] == ["start 0", "attach 0"]
+    ours.let(0.1 + 1.0 / 4)
+    assert "dump and kill 0" in ours.log
 
 
 def test_a_replacement_gets_no_requests_that_were_aborted(fleet: Callable[..., Fleet]) -> None:

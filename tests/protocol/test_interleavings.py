@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from protocol.memory_model import Access, Program, fence, load, outcomes, store
+from protocol.memory_of_rings import both_sides
 
-from rlightning_aio.protocol import exchange
+from rlightning_aio.protocol import exchange, rings
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.exchange import Ring, WorkerSide
 
@@ -105,6 +106,14 @@ def nobody_wakes(goal: int, turns: int) -> Callable[[Mapping[str, int]], bool]:
     return is_wrong
 
 
+def publish(number: int) -> Program:
+    """Publish which request is executed, and since when, as `serve` does before each entry."""
+    return store("since", number), store("current", number, release=True)
+
+
+CLEAR: Program = (store("current", 0),)
+WATCH: Program = (load("current", "saw current", acquire=True), load("since", "saw since"))
+
 COMPLETE: Program = (
     load("counter 0", "saw counter", acquire=True),
     load("report 0 1", "saw report"),
@@ -115,6 +124,13 @@ AGAIN: Program = (load("row", "result"), store("sent", 1, release=True))
 OVERWRITE: Program = (load("sent", "saw sent", acquire=True), store("row", 9, given="saw sent"))
 
 SCENARIOS = {
+    "the trainer looks at the request in execution while the next one begins": Scenario(
+        ((*publish(1), *CLEAR, *publish(2)), WATCH), lambda v: v["saw since"] < v["saw current"]
+    ),
+    "a reply is read while its request seems to be executed": Scenario(
+        ((*publish(1), *CLEAR, store("counter 0", 1, release=True)), (COMPLETE[0], WATCH[0])),
+        lambda v: v["saw counter"] == v["saw current"] == 1,
+    ),
     "a worker falls asleep while a request is published": Scenario(
         (SUBMIT, FALL_ASLEEP), lambda v: not v["saw asleep"] and not v["saw sent"]
     ),
@@ -274,15 +290,33 @@ def test_submit_and_take_make_these_accesses(trace: list[Access]) -> None:
     assert trace == bare(TAKE[:2])
 
 
+def test_the_trainer_and_a_worker_agree_on_the_request_in_execution(
+    trace: list[Access], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The worker's time is there before its request, and is read after it."""
+    monkeypatch.setattr(rings, "IN_ORDER", False)
+    _, trainer, worker = both_sides(1)
+    names = {exchange.CURRENT: "current", exchange.CURRENT_SINCE_NS: "since"}
+    for side in (trainer, worker):
+        vars(side)["_words"] = Recorded(trace, names, 40)
+        vars(side)["_fence"] = lambda: trace.append(fence())
+    worker.begin(STEP, 1)
+    assert trace == bare(publish(1))
+    trace.clear()
+    assert trainer.current() == (0, 0)
+    assert trace == bare(WATCH)
+
+
 def test_the_bell_makes_these_accesses(trace: list[Access]) -> None:
-    """When the trainer arms it, and when a worker reports."""
+    """When the trainer arms it, and when a worker executes a request and reports."""
     names = {0: "armed", 8: "counter 0", 16: "counter 1"}
     bell: Any = Recorded(trace, names, 24)
     exchange.arm(bell, 1 << exchange.GOAL_SHIFT | 1, lambda: trace.append(fence()))
     assert trace[1:] == bare(arm(1))  # It looks first whether the word stands there.
     trace.clear()
     counts = memoryview(bytearray(8 * exchange.NUM_COUNTS)).cast("q")
-    words: Any = memoryview(bytearray(8 * 40)).cast("q")
+    in_execution = {exchange.CURRENT: "current", exchange.CURRENT_SINCE_NS: "since"}
+    words: Any = Recorded(trace, in_execution, 40)
     reports: Any = Recorded(trace, {0: "report 0 1"}, 2)
     requests: Any = memoryview(bytearray(16)).cast("q")
     requests[0], words[exchange.REQUESTS_SENT] = STEP, 1
@@ -293,4 +327,5 @@ def test_the_bell_makes_these_accesses(trace: list[Access]) -> None:
     )  # fmt: skip
     taken = [fence()]
     once_more = bare(look(0, 1)[:2])  # When it has run out of work; it has rung before.
-    assert trace == [*taken, *bare(report(0, 1)[1:]), *once_more]
+    executed = bare((*publish(1), *CLEAR, *report(0, 1)[1:]))
+    assert trace == [*taken, *executed, *once_more]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -234,6 +235,7 @@ def test_serve_survives_any_contents_of_the_rings(
 
     def scenario(implementation: ModuleType) -> Any:
         events: list[Any] = []
+        began = time.monotonic_ns()
         own = words(NUM_COUNTS)
         own[CAREFUL] = careful
         bell = words(3 * LINE)
@@ -244,33 +246,79 @@ def test_serve_survives_any_contents_of_the_rings(
             side.requests[position] = one
 
         def step(name: int, outcome: Any) -> Any:
-            events.append(("step", name))
+            events.append(("step", name, executed()))
             if len(events) == child_after:
                 own[CAREFUL] = 1
             if isinstance(outcome, Exception):
                 raise outcome
             return outcome
 
+        def executed() -> int:
+            if current := side.words[exchange.CURRENT]:
+                assert began <= side.words[exchange.CURRENT_SINCE_NS] <= time.monotonic_ns()
+            return current
+
         def receive() -> None:
-            events.append("receive")
+            events.append(("receive", executed()))
             own[exchange.FRAMES_SEEN] += 1
 
         outcomes = (None, {"info": 1}, KeyError("no"), None)
         found = outcome_of(
             lambda: implementation.serve(
                 side,
-                lambda request: events.append(("execute", request)) or request % 2 == 0,
-                lambda request, outcome: events.append(("finish", request, str(outcome))),
-                lambda: events.append("ring"),
+                lambda request: events.append(("execute", request, executed())) or request % 2 == 0,
+                lambda request, outcome: events.append(
+                    ("finish", request, str(outcome), executed())
+                ),
+                lambda: events.append(("ring", executed())),
                 receive,
                 [lambda k=k, one=one: step(k, one) for k, one in enumerate(outcomes)],
                 1,
                 exchange.new_fence(),
             )
         )
-        return found, events, own.tolist(), bell.tolist(), side.reports.tolist()
+        return found, events, own.tolist(), bell.tolist(), side.reports.tolist(), executed()
 
     same(scenario)
+
+
+def test_the_request_in_execution_is_known_with_its_start() -> None:
+    """To whoever looks at the shared words, until its reply is published."""
+
+    def scenario(implementation: ModuleType) -> Any:
+        side = WorkerSide(words(5 * LINE), words(8), words(8), words(5), words(2 * LINE), LINE)
+        side.words[REQUESTS_SENT] = 3
+        requests = [entry(1, 0, Operation.STEP), entry(2, 1, Operation.STEP), entry(3, 0, 2)]
+        for position, request in enumerate(requests):
+            side.requests[position] = request
+        side.bell[ARMED] = 1 << exchange.GOAL_SHIFT | 1
+        seen: list[Any] = []
+
+        def look(*what: Any) -> bool:
+            began = side.words[exchange.CURRENT_SINCE_NS]
+            seen.append(
+                (side.words[exchange.CURRENT], before <= began <= time.monotonic_ns(), *what)
+            )
+            return True
+
+        before = time.monotonic_ns()
+        implementation.serve(
+            side, look, lambda *_: look("finish"), lambda: look("ring"), look,
+            [lambda: (look(), None)[1], lambda: {"more": look()}], 0, exchange.new_fence(),
+        )  # fmt: skip
+        look("end")
+        return seen, requests
+
+    seen, requests = same(scenario)
+    first, second, third = requests
+    assert seen == [
+        (first, True),
+        (0, True, "ring"),
+        (second, True),
+        (second, True, "finish"),
+        (third, True, third),
+        (0, True, "end"),
+    ]
 
 
 def test_what_a_worker_cannot_send_ends_its_loop() -> None:

@@ -172,6 +172,8 @@ class World:
         kernel.select(self._implementation)
         for name in kernel._FUNCTIONS:
             setattr(kernel, name, self._with_points(getattr(kernel, name)))
+        if self._implementation == "c":
+            kernel.serve = self._with_clock(kernel.serve)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -236,6 +238,22 @@ class World:
             found = function(*arguments)
             self.point()
             return found
+
+        return called
+
+    def _with_clock(self, serve: Callable[..., bool]) -> Callable[..., bool]:
+        """Have the compiled `serve`, which asks the machine for the time, publish the world's."""
+
+        def called(side: Any, execute: Any, finish: Any, ring: Any, *arguments: Any) -> bool:
+            receive, steps, *rest = arguments
+
+            def timed(function: Callable[..., Any], *entry: int) -> Any:
+                side.words[exchange.CURRENT_SINCE_NS] = self.clock_ns()
+                return function(*entry)
+
+            # Looked up when it is called, because a rebuilt env has another.
+            own = [lambda k=k: timed(steps[k]) for k in range(len(steps))]
+            return serve(side, partial(timed, execute), finish, ring, receive, own, *rest)
 
         return called
 

@@ -29,6 +29,8 @@ enum {
     WORKER_ASLEEP = 1 * LINE,
     FRAMES_TO_WORKER = 2 * LINE,
     FRAMES_TO_TRAINER = 3 * LINE,
+    CURRENT = 4 * LINE,
+    CURRENT_SINCE_NS = 4 * LINE + 1,
     /* The trainer's own counts, and the worker's. */
     SENT = 0,
     SEEN = 1,
@@ -766,14 +768,17 @@ static int
 run_loop(Loop *loop, const int64_t *requests, Py_ssize_t count)
 {
     int64_t *own = words_of(&loop->views[LOOP_OWN]);
-    const int64_t *words = words_of(&loop->views[LOOP_WORDS]);
+    int64_t *words = words_of(&loop->views[LOOP_WORDS]);
     int64_t *reports = words_of(&loop->views[LOOP_REPORTS]);
     int64_t *bell = words_of(&loop->views[LOOP_BELL]);
     uint64_t mask = (uint64_t)length(&loop->views[LOOP_REPORTS]) - 1;
     for (Py_ssize_t k = 0; k < count; k++) {
         if (load(words + FRAMES_TO_WORKER) > own[FRAMES_SEEN] && called(loop->receive) < 0)
             return -1;
+        put(words + CURRENT_SINCE_NS, now_ns());
+        publish(words + CURRENT, requests[k]);
         int report = execute_entry(loop, requests[k]);
+        put(words + CURRENT, 0);
         if (report < 0)
             return -1;
         if (!report)
@@ -794,7 +799,7 @@ serve_views(Loop *loop)
 {
     Py_buffer *views = loop->views;
     uint64_t capacity = (uint64_t)length(&views[LOOP_REQUESTS]);
-    if (length(&views[LOOP_WORDS]) <= FRAMES_TO_TRAINER || length(&views[LOOP_OWN]) <= CAREFUL ||
+    if (length(&views[LOOP_WORDS]) <= CURRENT_SINCE_NS || length(&views[LOOP_OWN]) <= CAREFUL ||
         loop->counter < LINE || loop->counter >= length(&views[LOOP_BELL]) || capacity < 1 ||
         (capacity & (capacity - 1)) != 0 || (uint64_t)length(&views[LOOP_REPORTS]) != capacity) {
         PyErr_SetString(PyExc_ValueError, "rings or bell of unexpected lengths");

@@ -43,6 +43,8 @@ __all__ = [
     "AT_LAST",
     "BUSY",
     "CAREFUL",
+    "CURRENT",
+    "CURRENT_SINCE_NS",
     "FEW_NUMBERS",
     "FRAMES_SEEN",
     "FRAMES_TO_TRAINER",
@@ -86,6 +88,11 @@ REQUESTS_SENT: Final = 0 * LINE
 WORKER_ASLEEP: Final = 1 * LINE
 FRAMES_TO_WORKER: Final = 2 * LINE
 FRAMES_TO_TRAINER: Final = 3 * LINE
+# The request that the worker executes, 0 if none, and since when. The time is written first, so who
+# reads it after the request never takes that for older than it is. The request is cleared before it
+# is reported, so one whose reply was read is not executed.
+CURRENT: Final = 4 * LINE
+CURRENT_SINCE_NS: Final = 4 * LINE + 1
 # The trainer's own counts: requests sent, and frames of the worker that were read.
 SENT: Final = 0
 SEEN: Final = 1
@@ -429,28 +436,32 @@ def serve(  # noqa: C901  # Calls would slow down every step.
         first_slot: of `steps`.
         fence: see `new_fence`.
     """
-    requests = take(side, fence)
-    if not requests:
+    if not (requests := take(side, fence)):
         return False
-    from_trainer, _, reports, own, bell, counter = side
-    mask = len(reports) - 1
+    words, _, reports, own, bell, counter = side
+    mask, clock = len(reports) - 1, time.monotonic_ns
     for request in requests:
-        if from_trainer[FRAMES_TO_WORKER] > own[FRAMES_SEEN]:
+        if words[FRAMES_TO_WORKER] > own[FRAMES_SEEN]:
             receive()
+        words[CURRENT_SINCE_NS] = clock()
+        if not IN_ORDER:
+            fence()
+        words[CURRENT] = request
         index = (request >> OP_BITS & SLOT_MASK) - first_slot
         if not own[CAREFUL] and request & OP_MASK == _STEP and 0 <= index < len(steps):
             try:
                 outcome = steps[index]()
             except BaseException as error:  # noqa: BLE001  # It is the env's, and is sent.
                 outcome = error
-            if outcome is not None or own[CAREFUL]:
+            if not (is_in_row := outcome is None and not own[CAREFUL]):
                 finish(request, outcome)
-                continue
-        elif not execute(request):
+        else:
+            is_in_row = execute(request)
+        words[CURRENT] = 0
+        if not is_in_row:
             continue
-        sent = own[REPORTED]
-        reports[sent & mask] = request
-        own[REPORTED] = sent = sent + 1
+        own[REPORTED] = sent = own[REPORTED] + 1
+        reports[(sent - 1) & mask] = request
         if not IN_ORDER:
             fence()
         bell[counter] = sent

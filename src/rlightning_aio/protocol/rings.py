@@ -25,6 +25,8 @@ from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.exchange import (
     ARMED,
     AT_LAST,
+    CURRENT,
+    CURRENT_SINCE_NS,
     FRAMES_SEEN,
     FRAMES_TO_TRAINER,
     FRAMES_TO_WORKER,
@@ -54,9 +56,6 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainerBell", "TrainerRings", "WorkerBell", "WorkerRings", "bell_size", "rings_size"]
 
-# Words that `exchange` doesn't use.
-_CURRENT: Final = 4 * LINE
-_CURRENT_SINCE_NS: Final = 4 * LINE + 1
 _WORDS: Final = 5 * LINE
 _COUNTERS: Final = LINE
 _EPOCH_SHIFT: Final = 55
@@ -180,7 +179,10 @@ class TrainerRings:
         The time is in ns of the monotonic clock, which all processes share; 0 while the worker
         waits for the trainer to read earlier output of the entry.
         """
-        return self._words[_CURRENT], self._words[_CURRENT_SINCE_NS]
+        current = self._words[CURRENT]
+        if not IN_ORDER:
+            self._fence()
+        return current, self._words[CURRENT_SINCE_NS]
 
 
 class WorkerRings:
@@ -213,23 +215,25 @@ class WorkerRings:
         self.own[FRAMES_SEEN] += 1
 
     def begin(self, current: int, now_ns: int) -> None:
-        """Publish the entry whose execution begins."""
-        self._words[_CURRENT_SINCE_NS] = now_ns
-        self._words[_CURRENT] = current
+        """Publish that an entry is being executed which `serve` does not execute."""
+        self._words[CURRENT_SINCE_NS] = now_ns
+        if not IN_ORDER:
+            self._fence()
+        self._words[CURRENT] = current
 
     def pause(self) -> int:
         """Publish that execution waits for the trainer. Return the argument of `resume`."""
-        since_ns = self._words[_CURRENT_SINCE_NS]
-        self._words[_CURRENT_SINCE_NS] = 0
+        since_ns = self._words[CURRENT_SINCE_NS]
+        self._words[CURRENT_SINCE_NS] = 0
         return since_ns
 
     def resume(self, since_ns: int) -> None:
         """Publish that execution continues, with a start time that excludes the wait."""
-        self._words[_CURRENT_SINCE_NS] = since_ns
+        self._words[CURRENT_SINCE_NS] = since_ns
 
     def idle(self) -> None:
         """Publish that nothing is being executed."""
-        self._words[_CURRENT] = 0
+        self._words[CURRENT] = 0
 
     def serve(
         self,

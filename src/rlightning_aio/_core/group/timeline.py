@@ -193,8 +193,7 @@ class Trace(Scope):
             sent = requests.sent_ns.item(slot)
             if self._last_times(slot)[0] < sent:
                 owed[requests.numbering.entry.item(slot)] = sent
-        idle_since = max(self._last_times(slot)[0] for slot in record.slots) if owed else 0
-        for entry, began in _executed(record, owed, idle_since):
+        for entry, began in _executed(record, owed):
             self._unfinished.append((entry, began, max(now, began)))
 
     def _last_times(self, slot: int) -> tuple[int, int]:
@@ -257,23 +256,20 @@ class Trace(Scope):
         return found | {"args": {"request": entry >> NUMBER_SHIFT}}
 
 
-def _executed(record: HostRecord, owed: dict[int, int], idle_since: int) -> list[tuple[int, int]]:
+def _executed(record: HostRecord, owed: dict[int, int]) -> list[tuple[int, int]]:
     """Return those of the requests that a host owes which it executes now, and since when.
 
     Args:
         record: of the host.
         owed: times of sending by entry, the oldest first.
-        idle_since: when the last result of its envs was ready.
     """
-    sent = list(owed.items())
     if isinstance(record.host, Executing) or record.is_starting or record.is_down:
         return []  # In this process nothing is executed now.
     if record.membership is not None or record.awaits_several or record.host.needs_loop:
-        return sent[: record.config.max_concurrency]  # At the same time.
-    if record.timed and record.killable is not None:
-        entry, began = record.killable.current_request()
-        return [(entry, began)] if entry in owed and began else []
-    return [(entry, max(at, idle_since)) for entry, at in sent[:1]]  # It can't tell.
+        return list(owed.items())[: record.config.max_concurrency]  # At the same time.
+    assert record.killable is not None
+    entry, began = record.killable.current_request()
+    return [(entry, began)] if entry in owed and began else []
 
 
 def _title(record: HostRecord) -> str:

@@ -90,7 +90,7 @@ class Core:
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
         self.steps.begin()
-        self.supervisor.overdue.begin(self.tables.clock())
+        self.supervisor.watch(self.tables.clock())
         return metas
 
     def close(self, now: float) -> Procedure[None]:

@@ -116,7 +116,7 @@ class Waiting:
     def check(self, now: float) -> None:
         """Check all hosts for deaths and hangs, and apply the outcome."""
         self.intake.now = now
-        if self._supervisor.detector.timed or now >= self._supervisor.overdue.due:
+        if now >= self._supervisor.due:
             self.poll()  # An env that has replied is not hung, and owes nothing.
         self._supervisor.check(now)
         self.poll()
@@ -143,11 +143,10 @@ class Waiting:
                     if is_due:
                         now = yield Wait(0.0)
                 else:
-                    detector = supervisor.detector
-                    is_due = until is not None or detector.timed or detector.any_ending
+                    is_due = until is not None or supervisor.detector.any_ending
                     is_due = is_due or self._conditions.unusual & OF_HOSTS != 0
                     is_due = is_due or supervisor.members.possible
-                    patient = supervisor.overdue.wait
+                    patient = supervisor.patient
                     now = yield Wait(supervisor.next_check(until)) if is_due else patient
                     if may_spin:
                         poller.slept()
@@ -159,7 +158,7 @@ class Waiting:
                 self.wanted[wanted] = calls - 1
             elif not self.wanted:
                 self._bell.disarm()
-        if is_due or now >= supervisor.overdue.due:
+        if is_due or now >= supervisor.due:
             self.check(now)
         return now
 

@@ -4,10 +4,16 @@ Rule: read pending output before killing a host. The worker measures how long it
 stops its clock while it waits for the trainer to read. A worker that executes nothing gets its
 limit again whenever data passes between the two. Before a kill, the host is asked for completions
 that the trainer, late itself, has not read yet. An aborted request has a short limit.
+
+Time limits cost an ordinary step nothing: a few looks within the shortest limit are enough. A
+request that is seen in one of them is ended when its time is over, because the next look is then.
+The time of a worker that executes nothing begins with the look that finds it so. So it is at most a
+quarter of the limit, the time between two looks, until a hang is found.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,6 +32,10 @@ __all__ = ["HangDetector", "read_news"]
 
 _ABORT_SECONDS: Final = 0.2
 """Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
+_LOOKS: Final = 4
+"""Looks within the shortest limit."""
+_PAUSE_SECONDS: Final = 0.02
+"""The shortest time between two looks."""
 _OBEY_SECONDS: Final = 5.0
 """Limit for the exit of a killed worker to be reported. After that, the process that should have
 killed it hangs, too. Only an overloaded machine needs a tenth of it.
@@ -36,7 +46,7 @@ class HangDetector:
     """See the module.
 
     Attributes:
-        timed: some requests have a time limit.
+        due: when to look next for requests that exceed a limit; infinite if none has one.
         any_ending: a killed host has not reported its exit, or requests to a host that can be
             killed were aborted. If neither holds, nothing needs to be checked.
     """
@@ -47,7 +57,14 @@ class HangDetector:
         self._requests = tables.requests
         self.any_ending = False
         self._now = 0.0
-        self.timed = False
+        self.due = math.inf
+        self._pause = math.inf
+
+    def add(self, record: HostRecord) -> None:
+        """Watch a host whose requests have limits; of another it does nothing."""
+        if record.timed:
+            pause = max(_PAUSE_SECONDS, min(record.limits.values()) / _LOOKS)
+            self.due, self._pause = 0.0, min(self._pause, pause)
 
     def abort(self, slots: NDArray[np.intp], now: float) -> list[tuple[int, int]]:
         """Have hosts end the outstanding requests of `slots`, which are aborted.
@@ -71,22 +88,18 @@ class HangDetector:
         return no_longer_held
 
     def expiries(self) -> list[float | None]:
-        """Return the times when `check` must be called."""
-        times: list[float | None] = []
-        if self.timed:
-            times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
-        if self.any_ending:
-            times += [r.die_by or self._now for r in self._records if r.dying]
-            times += [by for r in self._records for by in r.abort_by.values()]
-        return times
+        """Return the times, besides `due`, when `check` must be called."""
+        times: list[float | None] = [r.die_by or self._now for r in self._records if r.dying]
+        return times + [by for r in self._records for by in r.abort_by.values()]
 
     def check(self, now: float) -> None:
         """Kill workers that have exceeded a limit, and destroy those that survive a kill."""
         self._now = now
-        if self.timed:
+        if now >= self.due:
+            self.due = now + self._pause
             for record in self._records:
                 if record.timed and self._in_flight(record):
-                    self._check_hung(record)
+                    self.due = min(self.due, self._check_hung(record))
         if self.any_ending:
             for record in self._records:
                 if record.abort_by:
@@ -115,50 +128,45 @@ class HangDetector:
     def _in_flight(self, record: HostRecord) -> int:
         return self._requests.in_flight[record.host.host_id]
 
-    def _expiry(self, record: HostRecord) -> float | None:
-        """Return the time when the worker's current request exceeds its limit."""
+    def _check_hung(self, record: HostRecord) -> float:
+        """Kill a worker that has exceeded a limit, or return the time when it will have."""
         if record.stage is not Stage.UP or record.is_hung or record.aborted_slot is not None:
-            return None  # It is being killed.
+            return math.inf  # It is starting, or being killed.
         assert record.killable is not None
-        entry, since_ns = record.killable.current_request()
-        shortest = min(record.limits.values())
-        if not (entry and since_ns):
-            # A stopped process executes none of its requests.
-            idle = record.idle == self._progress(record)
-            return (record.idle_since if idle else self._now) + shortest
-        limit = record.limits.get(self._requests.numbering.op(slot_of(entry)))
-        # A request without a limit is checked again, because the next one may have a limit.
-        return self._now + shortest if limit is None else since_ns / 1e9 + limit
-
-    def _progress(self, record: HostRecord) -> tuple[int, ...]:
-        """Return numbers that change with every request, reply, part of a reply, sign of life."""
-        assert record.killable is not None
-        slots = slice(record.slots.start, record.slots.stop)
-        entries = int(self._requests.numbering.entry[slots].sum())
-        # Where all envs wait, the worker says now and then that its event loop goes on.
-        current = record.killable.current_request()
-        return self._in_flight(record), entries, record.killable.traffic, *current
-
-    def _check_hung(self, record: HostRecord) -> None:
-        assert record.killable is not None
-        entry, since_ns = record.killable.current_request()
-        if not (entry and since_ns):
-            progress = self._progress(record)
-            if progress != record.idle:
-                record.idle, record.idle_since = progress, self._now
-                return
-        expiry = self._expiry(record)
-        if expiry is None or self._now < expiry or read_news(record):
-            return
+        entry, _ = current = record.killable.current_request()
+        expiry = self._expiry(record, current)
+        if self._now < expiry or read_news(record):
+            return max(expiry, self._now)
         if entry and slot_of(entry) in record.abort_by:  # It counts as aborted.
             self._kill_aborted(record, slot_of(entry))
-            return
+            return math.inf
         record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
         record.culprit = culprit_of(record, (entry,), self._requests, busy)
         if record.culprit is not None:
             self._tables.observed.note_fate("hung", record.host.host_id, record.culprit, "")
         self.kill(record, dump=True)
+        return math.inf
+
+    def _expiry(self, record: HostRecord, current: tuple[int, int]) -> float:
+        """Return the time when the worker exceeds its limit, if it goes on like this."""
+        entry, since_ns = current
+        if entry and since_ns:
+            limit = record.limits.get(self._requests.numbering.op(slot_of(entry)))
+            return math.inf if limit is None else since_ns / 1e9 + limit
+        # A stopped process executes none of its requests.
+        progress = self._progress(record, current)
+        if progress != record.idle:
+            record.idle, record.idle_since = progress, self._now
+        return record.idle_since + min(record.limits.values())
+
+    def _progress(self, record: HostRecord, current: tuple[int, int]) -> tuple[int, ...]:
+        """Return numbers that change with every request, reply, part of a reply, sign of life."""
+        assert record.killable is not None
+        slots = slice(record.slots.start, record.slots.stop)
+        entries = int(self._requests.numbering.entry[slots].sum())
+        # Where all envs wait, the worker says now and then that its event loop goes on.
+        return self._in_flight(record), entries, record.killable.traffic, *current
 
     def _check_dying(self) -> None:
         """Destroy hosts that a kill has not ended, together with their fork server."""

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import Patient
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -32,22 +31,15 @@ class Overdue:
 
     Attributes:
         due: the time to `look` next, in monotonic seconds; infinite if that is never.
-        wait: what a call waits for that has no other time to keep.
     """
 
     def __init__(self, tables: Tables) -> None:
         self._tables = tables
         self.due = math.inf
-        self.wait = Patient()
 
     def begin(self, now: float) -> None:
         """Watch the envs, which have started."""
-        self._look_at(now + OWED_SECONDS)
-
-    def _look_at(self, due: float) -> None:
-        """Look at that time."""
-        self.due = due
-        self.wait.until = None if due == math.inf else due
+        self.due = now + OWED_SECONDS
 
     def look(self, now: float) -> None:
         """Log which env owes a result for too long, if there is one."""
@@ -73,4 +65,4 @@ class Overdue:
             )
             due = math.inf
             break
-        self._look_at(due)
+        self.due = due

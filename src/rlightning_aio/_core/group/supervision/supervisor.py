@@ -10,13 +10,14 @@ until then. `HangDetector` decides which workers are killed.
 from __future__ import annotations
 
 import logging
+import math
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import Procedure, Wait, earliest
+from rlightning_aio._core.group.drivers.wait import Patient, Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import DEATH
 from rlightning_aio._core.group.state.host_record import HostRecord, Stage
 from rlightning_aio._core.group.state.slab_layout import check_actions
@@ -88,6 +89,9 @@ class Supervisor:
             step yet.
         close_errors: env id and error of each env whose `close` raised.
         look_by: time by which a trainer that never waits must call `check`.
+        due: time by which a call that waits must call it, though nothing has happened. It moves
+            only once it has passed.
+        patient: what a call waits for that has no other time to keep: until `due`.
     """
 
     def __init__(self, tables: Tables) -> None:
@@ -97,6 +101,8 @@ class Supervisor:
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.look_by = 0.0
+        self.due = math.inf
+        self.patient = Patient()
         self._tables = tables
         self._envs = tables.envs
         self._requests = tables.requests
@@ -119,7 +125,7 @@ class Supervisor:
         self.hosts.append(host)
         record = HostRecord(host, config)
         self.records.append(record)
-        self.detector.timed = self.detector.timed or record.timed
+        self.detector.add(record)
         if record.membership is not None:
             self.members.add(record.membership)
 
@@ -305,14 +311,24 @@ class Supervisor:
 
     def next_check(self, until: float | None = None) -> float | None:
         """Return the time by which `check` must be called, or `until` if that is earlier."""
-        times = [until, self.overdue.wait.until]
-        if self.detector.timed or self.detector.any_ending:
+        times = [until, self.patient.until]
+        if self.detector.any_ending:
             times += self.detector.expiries()
         if self.any_deaths:
             times += [due for r in self.records for due in (r.start_by, r.restart_at)]
         if self.members.possible:
             times.append(self.members.next_deadline())
         return min((time for time in times if time is not None), default=None)
+
+    def watch(self, now: float) -> None:
+        """Begin to look for envs that exceed a limit, or that owe a result for too long."""
+        self.overdue.begin(now)
+        self._plan()
+
+    def _plan(self) -> None:
+        """Set the time of the next look."""
+        self.due = min(self.detector.due, self.overdue.due)
+        self.patient.until = None if self.due == math.inf else self.due
 
     def check(self, now: float) -> None:
         """Restart hosts that are due, and find silent members and workers that hang."""
@@ -326,10 +342,12 @@ class Supervisor:
                 self._restart(record, now)
         if self.members.possible:
             self.members.tick(now)
-        if self.detector.timed or self.detector.any_ending:
+        if now >= self.detector.due or self.detector.any_ending:
             self.detector.check(now)
         if now >= self.overdue.due:
             self.overdue.look(now)
+        if now >= self.due:
+            self._plan()
 
     # -- deaths -------------------------------------------------------------------
 

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
-from rlightning_aio._core.hosts.limits import limits_of
 from rlightning_aio._core.hosts.messages import Built, Closed
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
@@ -80,7 +79,6 @@ class Worker:
         self._rings = rings
         self._runners: list[EnvRunner] = []
         self._steps: list[Execute] = []
-        self._timed = False
         self._spinner = Spinner(enabled=False)
         self._attached = False
         self._closing = False
@@ -158,7 +156,6 @@ class Worker:
                 self._first_slot,
             ):
                 break
-        rings.idle()
 
     def _run(self, request: int) -> bool:
         """Execute one request of the ring; return True if its row holds the whole reply.
@@ -167,8 +164,6 @@ class Worker:
         """
         if self._closing:
             return False
-        if self._timed:
-            self._rings.begin(request, time.monotonic_ns())
         index = slot_of(request) - self._first_slot
         op, runner = op_of(request), self._runners[index]
         try:  # As `exchange.serve` does; `execute` would take a microsecond more.
@@ -269,8 +264,6 @@ class Worker:
             order = pickle.loads(frame.payload)
             assert order is not None
             self._spinner = Spinner(enabled=order.spins)
-            self._timed = bool(limits_of(order.config))
-            self._rings.own[CAREFUL] = self._timed
             self._order = order
             for runner in built_envs(order):
                 self._runners.append(runner)
