@@ -42,6 +42,7 @@ CARTPOLE = {
     "num_workers": NUM_ENVS,
     "envs_per_process": NUM_ENVS // 2,
 }
+LIMITS = {"step_timeout": None}
 
 
 @dataclass
@@ -198,7 +199,7 @@ def step_and_collect_async() -> Calls:
 def vector_step() -> Calls:
     """Count `VectorEnv.step`."""
     makers = [lambda: gym.make("CartPole-v1")] * NUM_ENVS
-    env = VectorEnv(makers, envs_per_process=NUM_ENVS // 2)
+    env = VectorEnv(makers, envs_per_process=NUM_ENVS // 2, **LIMITS)
     env.reset(seed=0)
     actions = np.zeros(NUM_ENVS, np.int64)
     try:
@@ -233,7 +234,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--list", action="store_true", help="also list each function")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--step-timeout", type=float, help="of the envs, in seconds")
     given = parser.parse_args()
+    LIMITS["step_timeout"] = CARTPOLE["step_timeout"] = given.step_timeout
     found = {name: measure() for name, measure in MEASURED.items()}
     if given.json:
         print(json.dumps({name: calls.figures() for name, calls in found.items()}))
