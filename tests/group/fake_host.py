@@ -30,7 +30,6 @@ from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
-    NO_ACTION,
     Attached,
     AttachOrder,
     Built,
@@ -173,7 +172,7 @@ class FakeHost(Host):
                         ),
                         LAYOUT,
                         reads_extras=self.reads_extras,
-                        transforms_actions=False,
+                        actions_beside_row=False,
                         is_awaitable=self.awaits,
                     )
                     for env in self.envs
@@ -218,7 +217,7 @@ class FakeHost(Host):
         action = self.slab.action[at]
         if given is not None:
             self.extras[slot_of(entry)] = given[1]
-            if given[0] is not NO_ACTION:
+            if given[0] is not None:
                 action = given[0]
         action = int(action)
         if action == RAISES:

@@ -26,12 +26,12 @@ IDS = ["e-0", "e-1", "e-2"]
 
 
 class Rows:
-    """Rows for the actions of three envs, which take any action if they are `free`."""
+    """Rows for the actions of three envs; if they are `free`, two of them take any action."""
 
     def __init__(self, space: Any, *, free: bool = False) -> None:
         config = EnvConfig(name="e", backend="gymnasium", task="x", num_workers=3)
         self.envs: Any = EnvTable([config] * 3, IDS)
-        self.envs.out_of_band_actions[:] = self.envs.any_out_of_band = free
+        self.envs.actions_beside_rows[[2, 0]] = self.envs.any_beside_rows = free
         layout = RowLayout(spaces.Discrete(2), space, (), ())
         self.slab = Slab(layout, memoryview(bytearray(layout.size(3))), 3)
         self.layout: Any = SimpleNamespace(
@@ -148,17 +148,16 @@ def test_a_cast_that_keeps_the_value_is_allowed(form: str) -> None:
     assert (rows.written == np.float32(0.1)).all()
 
 
-@pytest.mark.parametrize("free", [False, True])
-def test_a_list_holds_one_action_for_each_env(free: bool) -> None:
+def test_a_list_holds_one_action_for_each_env() -> None:
     """Even if a Tuple has as many parts as there are envs, its parts are not taken for envs."""
     threes = spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9), spaces.Discrete(9)])
-    rows = Rows(spaces.Dict(arm=threes, hand=SMALL), free=free)
+    rows = Rows(spaces.Dict(arm=threes, hand=SMALL))
     drawn = [{"arm": (k, k + 1, k + 2), "hand": np.array([k, -k])} for k in (0, 3, 6)]
     assert rows.write(drawn) is None
     arm, hand = (rows.slab.action[part] for part in ("arm", "hand"))
     assert [part[[2, 0, 1]].tolist() for part in arm] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
     assert hand[[2, 0, 1]].tolist() == [[0, 0], [3, -3], [6, -6]]
-    rows = Rows(threes, free=free)
+    rows = Rows(threes)
     rows.write([action["arm"] for action in drawn])
     assert rows.slab.action[1][[2, 0, 1]].tolist() == [1, 4, 7]
 
@@ -185,17 +184,22 @@ def test_nan_and_values_beyond_a_bound_are_found_in_arrays_of_any_size(
         assert (rows.written == actions).all()
 
 
-def test_free_actions_may_be_anything() -> None:
-    """An action that doesn't fit in its row is sent to the env out of band."""
+@pytest.mark.parametrize("form", ["columns", "values"])
+def test_free_actions_travel_beside_their_rows_and_may_be_anything(form: str) -> None:
+    """Whether they would fit or not; those of other envs are checked and written."""
     for space, actions in (
         (SMALL, np.array([[1, 2], [1, 300], [3, 4]])),
         (HALF_BOUNDED, np.array([[0, 0], [NAN, INF], [0, 0]], np.float32)),
     ):
         rows = Rows(space, free=True)
-        sent = rows.write(actions)
-        assert sent.positions.tolist() == [1]
-        assert np.array_equal(sent.contents[0][0], actions[1], equal_nan=True)
-        assert rows.written[[0, 2]].tolist() == actions[[0, 2]].tolist()
+        sent = rows.write(actions, form)
+        assert sent.positions.tolist() == [0, 1]
+        for k, (action, extras) in enumerate(sent.contents):
+            assert np.array_equal(action, actions[k], equal_nan=True)
+            assert extras == {}
+        assert rows.written.tolist() == [[0, 0], [0, 0], actions[2].tolist()]
+    with pytest.raises(BadAction, match=r"env 'e-1' .* holds 300"):
+        Rows(SMALL, free=True).write(np.array([[1, 300], [1, 2], [300, 4]]), form)
 
 
 class Tensor:

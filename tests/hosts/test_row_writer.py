@@ -13,7 +13,6 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio._core.hosts.messages import NO_ACTION
 from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_of_band
 from rlightning_aio._core.hosts.running.runner import EnvRunner
 from rlightning_aio.config import EnvConfig
@@ -188,7 +187,7 @@ def test_requests_out_of_band_have_the_same_effect_as_those_in_the_row(
             in_row = partial(other.execute, op, None)
         else:
             found = runner.step()
-            op, arguments = Operation.STEP, (NO_ACTION, {})
+            op, arguments = Operation.STEP, (None, {})
             in_row = other.step
         expected = other.execute(op, arguments) if number in apart else in_row()
         assert row.contents(found) == other_row.contents(expected)

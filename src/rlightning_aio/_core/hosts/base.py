@@ -134,8 +134,9 @@ class Host(Protocol):
 
         Args:
             entries: env, number and operation of each request (see `protocol.entries`).
-            arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
-                reset, (name, args, kwargs) of a call. None: they are in the rows.
+            arguments: packed, one for each: (action, extras) of a step, with None for an action
+                that is in the row; (seed, options) of a reset, (name, args, kwargs) of a call.
+                None: they are in the rows.
 
         One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Lost` or
         `Withdrawn`, with the same entry; or the host's `Died` for all.
@@ -248,7 +249,7 @@ class Membership(Host, Protocol):
         ...
 
     def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
-        """Raise `BadAction` if an env can't get these; `NO_ACTION` means the action in the row."""
+        """Raise `BadAction` if an env can't get these; the action may be in the row."""
         ...
 
     def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:

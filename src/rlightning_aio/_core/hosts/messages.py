@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from collections import deque
 from dataclasses import dataclass, field
-from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from rlightning_aio.protocol.error_text import ErrorText
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio.types import ClientTraits, EnvMeta
 
 __all__ = [
-    "NO_ACTION",
     "STEP_IN_ROW",
     "AttachOrder",
     "Attached",
@@ -59,19 +57,11 @@ __all__ = [
 ]
 
 
-class _Marker(Enum):
-    """What no user can send by chance; each copy is the same object, also one from a pickle."""
-
-    NO_ACTION = auto()
-
-
-NO_ACTION: Final = _Marker.NO_ACTION
-"""Sent in place of an action if only its extras travel out of band."""
-STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
+STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (None, {})
 """The action and the extras of a step that has no arguments out of band."""
 OutOfBand: TypeAlias = dict[str, Any]
 """The part of a result that has no place in its row. Keys: ``observation``, ``info``, ``extra``
-(the result's ``_extra``), ``ret`` (the whole result)."""
+(the result's ``_extra``)."""
 
 
 # -- orders -----------------------------------------------------------------------
@@ -152,13 +142,15 @@ class EnvStarted:
     """The description of an env that was built.
 
     Attributes:
+        reads_extras: extras of responses are sent to it.
+        actions_beside_row: its actions travel in the channel and not in its row.
         is_awaitable: its host executes its requests together with those of others.
     """
 
     meta: EnvMeta
     layout: RowLayout
     reads_extras: bool
-    transforms_actions: bool
+    actions_beside_row: bool
     is_awaitable: bool = False
 
 

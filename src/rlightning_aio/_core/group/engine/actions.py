@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio._core.group.state.slab_layout import rows_in
-from rlightning_aio._core.hosts.messages import NO_ACTION
 from rlightning_aio.batch.contents import columns_of_responses
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.batch.stacking import plain_numbers
@@ -38,7 +37,10 @@ __all__ = ["OutOfBandSteps", "number_limits", "write_actions", "write_column"]
 
 @dataclass(frozen=True, slots=True)
 class OutOfBandSteps:
-    """Steps with arguments that the channel carries: (action, extras) by position in the batch."""
+    """Steps with arguments that the channel carries, by their positions in the batch.
+
+    Each content is an action and extras; None is in the place of an action that is in its row.
+    """
 
     positions: NDArray[np.intp]
     contents: list[tuple[Any, dict[str, Any]]]
@@ -47,26 +49,23 @@ class OutOfBandSteps:
 def write_actions(
     batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
 ) -> OutOfBandSteps | None:
-    """Check the actions of `batch` and write those that fit into their rows.
+    """Check the actions of `batch` and write those that travel in rows.
 
-    Returns the steps to send out of band, or None if the rows hold all actions.
+    Returns the steps to send out of band, or None if the rows hold all that is to be sent.
 
     Raises:
         BadAction: an action doesn't match its env in shape, dtype or count, or holds a number
             outside its space. Nothing was sent; rows of idle envs may have been written.
     """
-    out_of_band = None
-    if envs.any_out_of_band:
-        out_of_band = _chosen_out_of_band(batch, slots, envs, layout)
-        if out_of_band is not None and len(out_of_band.positions) == len(slots):
-            return out_of_band
+    beside = envs.actions_beside_rows[slots] if envs.any_beside_rows else None
     columns = columns_of_responses(batch)
-    if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
+    in_rows = beside is None or not np.count_nonzero(beside)
+    if columns is not None and len(layout.slabs) == 1 and in_rows:
         rows = rows_in(layout, slots, envs.all)
         write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
-        return None
-    _write_one_by_one(batch, slots, envs, layout, out_of_band)
-    return out_of_band
+    else:
+        _write_one_by_one(batch, slots, envs, layout, beside)
+    return None if beside is None else _steps_beside_rows(batch, slots, envs, beside)
 
 
 def write_column(
@@ -98,14 +97,16 @@ def _write_one_by_one(
     slots: NDArray[np.intp],
     envs: EnvTable,
     layout: SlabLayout,
-    out_of_band: OutOfBandSteps | None,
+    beside: NDArray[np.bool_] | None,
 ) -> None:
-    """Write actions given as separate values, or for envs with different layouts."""
-    elsewhere = set(out_of_band.positions.tolist()) if out_of_band is not None else set[int]()
+    """Write actions given as separate values, or for envs with different layouts.
+
+    Not those of envs whose actions travel `beside` their rows.
+    """
     actions = actions_of(batch)
     by_slab: dict[int, list[int]] = {}
     for position, slab_index in enumerate(layout.slab[slots].tolist()):
-        if position not in elsewhere:
+        if beside is None or not beside[position]:
             by_slab.setdefault(slab_index, []).append(position)
     for slab_index, positions in by_slab.items():
         slab = layout.slabs[slab_index]
@@ -190,41 +191,25 @@ def actions_of(batch: BatchedData) -> list[Any]:
     return actions
 
 
-def _chosen_out_of_band(
-    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
+def _steps_beside_rows(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, beside: NDArray[np.bool_]
 ) -> OutOfBandSteps | None:
-    """The steps that the channel carries: actions that fit no row, and extras that envs read."""
+    """The steps of envs whose actions travel `beside` their rows, or that read extras."""
     columns = columns_of_responses(batch)
+    reads = envs.reads_extras[slots]
     any_extras = columns is None or len(columns) > 1
-    chosen = envs.out_of_band_actions[slots]
-    if any_extras:
-        chosen = chosen | envs.reads_extras[slots]
-    positions = np.flatnonzero(chosen)
-    if not len(positions):
-        return None
-    if columns is not None and len(layout.slabs) == 1:
-        action = columns.get("action")
-        if _fits(action, layout.slabs[0], len(slots)):
-            if not any_extras:
-                return None
-            _write(action, layout.slabs[0], rows_in(layout, slots, envs.all))
-            return _extras_alone(batch, slots, envs)
-    actions = actions_of(batch)
-    contents: list[tuple[Any, dict[str, Any]]] = []
-    kept: list[int] = []
-    for k in positions.tolist():
-        slot = int(slots[k])
-        extras = _extras(batch, k) if envs.reads_extras[slot] else {}
-        slab, row = layout.of(slot)
-        if not _fits(actions[k], slab):
-            if envs.out_of_band_actions[slot]:
-                kept.append(k)
-                contents.append((_plain(actions[k]), extras))
+    positions: list[int] = np.flatnonzero(beside | reads if any_extras else beside).tolist()
+    actions = actions_of(batch) if positions else []
+    contents: dict[int, tuple[Any, dict[str, Any]]] = {}
+    for k in positions:
+        extras = _extras(batch, k) if reads[k] else {}
+        if beside[k]:
+            contents[k] = _plain(actions[k]), extras
         elif extras:
-            _write(actions[k], slab, row)
-            kept.append(k)
-            contents.append((NO_ACTION, extras))
-    return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
+            contents[k] = None, extras
+    if not contents:
+        return None
+    return OutOfBandSteps(np.array([*contents], np.intp), [*contents.values()])
 
 
 def response_columns(
@@ -239,41 +224,11 @@ def response_columns(
     return columns_of_values(batch.values(), actions_as_list=actions_as_list)
 
 
-def _extras_alone(
-    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable
-) -> OutOfBandSteps | None:
-    """The extras that envs read, of steps whose actions are in their rows."""
-    readers = np.flatnonzero(envs.reads_extras[slots])
-    contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
-    return OutOfBandSteps(readers, contents) if contents else None
-
-
 def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
     columns = columns_of_responses(batch)
     if columns is not None:
         return {name: index(c, position) for name, c in columns.items() if name != "action"}
     return batch.values()[position].extras
-
-
-def _fits(action: Any, slab: Slab, *count: int) -> bool:
-    """True if a row can hold `action`, or `count` rows the actions of a whole batch."""
-    at = _column_at if count else _at
-    try:
-        return slab.action is not None and all(
-            (array := _as_array(at(action, leaf))).shape == (*count, *leaf.shape)
-            and _castable(array, leaf)
-            and _unfit(array, leaf, slab) is None
-            for leaf, _ in slab.action_columns
-        )
-    except (BadAction, ValueError):
-        return False
-
-
-def _write(action: Any, slab: Slab, rows: Any) -> None:
-    """Write one action into its row, or a whole batch into `rows`."""
-    at = _at if isinstance(rows, int) else _column_at
-    for leaf, target in slab.action_columns:
-        target[rows] = _as_array(at(action, leaf))
 
 
 def _plain(action: Any) -> Any:

@@ -116,7 +116,7 @@ class Steps:
         ordinary = (
             in_one_slab
             and (is_inline or self._requests.in_rings)
-            and not envs.any_out_of_band
+            and not envs.any_beside_rows
             and bool(slabs[0].action_columns)
         )
         self._conditions.note(UNLIKE_ENVS, not ordinary)

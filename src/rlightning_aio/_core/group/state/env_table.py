@@ -41,8 +41,9 @@ class EnvTable:
         local_ids, server_ids: ids of the local envs, and of the hosts that envs join.
         all: slots of the local envs.
         step_limits: steps per episode, configured or from the simulator; 0 for no limit.
-        out_of_band_actions: True where actions may not fit the row; reads_extras: True where
-            extras of responses are read; any_out_of_band: either holds for any slot.
+        actions_beside_rows: True where actions travel in the channel and not in the row;
+            reads_extras: True where extras of responses are read, which do; any_beside_rows:
+            either holds for any slot.
         num_sub_envs: sub-environments of each slot; seed_offset: the number of seeds before its
             own; num_seeds: the number for all local envs.
         resets_itself: True where envs need no reset after an end; any_resets_itself: for any slot.
@@ -81,9 +82,9 @@ class EnvTable:
         self.step_limits = np.array(
             [config.max_episode_steps or 0 for config in self.configs], np.int64
         )
-        self.out_of_band_actions = np.zeros(size, np.bool_)
+        self.actions_beside_rows = np.zeros(size, np.bool_)
         self.reads_extras = np.zeros(size, np.bool_)
-        self.any_out_of_band = False
+        self.any_beside_rows = False
         self.num_sub_envs = np.ones(size, np.int64)
         self.seed_offset = np.zeros(size, np.int64)
         self.num_seeds = self._next_index = 0
@@ -105,8 +106,7 @@ class EnvTable:
         """Record the properties of the local envs, in the order of their slots."""
         self.observation_spaces = [env.meta.observation_space for env in started]
         for slot, env in enumerate(started):
-            fits_row = env.layout.action_leaves is not None
-            self.out_of_band_actions[slot] = env.transforms_actions or not fits_row
+            self.actions_beside_rows[slot] = env.actions_beside_row
             self.reads_extras[slot] = env.reads_extras
             self._note_meta(slot, env.meta)
             self.num_sub_envs[slot] = env.meta.num_envs
@@ -130,7 +130,7 @@ class EnvTable:
         """
         self._slot_of.pop(self.env_ids[slot], None)
         self._slot_of[meta.env_id] = slot
-        self.out_of_band_actions[slot] = traits.free_actions or not has_row
+        self.actions_beside_rows[slot] = traits.free_actions or not has_row
         self.reads_extras[slot] = traits.reads_extras
         self._note_meta(slot, meta)
         self.num_sub_envs[slot] = meta.num_envs
@@ -147,7 +147,7 @@ class EnvTable:
         self.step_limits[slot] = self.configs[slot].max_episode_steps or meta.max_episode_steps or 0
 
     def _note_any(self) -> None:
-        self.any_out_of_band = bool(self.out_of_band_actions.any() or self.reads_extras.any())
+        self.any_beside_rows = bool(self.actions_beside_rows.any() or self.reads_extras.any())
         self.any_resets_itself = bool(self.resets_itself.any())
 
     # -- names ------------------------------------------------------------------------

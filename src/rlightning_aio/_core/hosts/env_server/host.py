@@ -19,7 +19,6 @@ from rlightning_aio._core.hosts.base import Membership
 from rlightning_aio._core.hosts.env_server.listener import Listener
 from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio._core.hosts.messages import (
-    NO_ACTION,
     STEP_IN_ROW,
     Attached,
     Built,
@@ -44,7 +43,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder
     from rlightning_aio.protocol.net.server_session import RemoteResult
-    from rlightning_aio.types import EnvMeta
+    from rlightning_aio.types import ClientTraits, EnvMeta
 
 __all__ = ["EnvServerHost"]
 
@@ -69,9 +68,10 @@ class _ClientRow:
         self._row = row
         self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)
 
-    def assign(self, name: str, meta: EnvMeta) -> None:
+    def assign(self, name: str, meta: EnvMeta, traits: ClientTraits) -> None:
         """Give the row to a new session of the client `name`."""
         self.name = name
+        self._is_free = traits.free_actions
         self._writer = RowWriter(
             self._slab,
             self._row,
@@ -81,10 +81,8 @@ class _ClientRow:
         )
 
     def action(self, given: Any) -> Any:
-        """Return the action of a step: `given`, or the row's action in place of `NO_ACTION`."""
-        if given is NO_ACTION and self._read_action is not None:
-            return self._read_action()
-        return given
+        """Return the action of a step: `given`, or that of the row if it travels there."""
+        return given if self._read_action is None or self._is_free else self._read_action()
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Write a result into the row; return the parts that have no place there."""
@@ -201,7 +199,7 @@ class EnvServerHost(Membership):
                 return None
             self._index_of.pop(self._rows[index].name, None)
             self._index_of[name] = index
-        self._rows[index].assign(name, meta)
+        self._rows[index].assign(name, meta, self._sessions.traits(name))
         return index
 
     def _free_index(self, slab: Slab) -> int | None:

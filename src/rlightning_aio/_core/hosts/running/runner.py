@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 import numpy as np
 
 from rlightning_aio._core.hosts.messages import (
-    NO_ACTION,
     STEP_IN_ROW,
     Attached,
     EnvStarted,
@@ -136,12 +135,17 @@ class EnvRunner:
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
         self._input = input_of(env)
+        free = env.transforms_actions or has_preprocess_fn(env)
+        self._actions_beside_row = free or self.layout.action_leaves is None
 
     def started(self) -> EnvStarted:
         """Return the description of the env that the trainer gets."""
-        any_action = self.env.transforms_actions or has_preprocess_fn(self.env)
         return EnvStarted(
-            self.meta, self.layout, reads_extras(self.env), any_action, self.is_awaitable
+            self.meta,
+            self.layout,
+            reads_extras(self.env),
+            self._actions_beside_row,
+            self.is_awaitable,
         )
 
     @property
@@ -300,7 +304,7 @@ class EnvRunner:
 
     def _step_with(self, action: Any, extras: dict[str, Any]) -> Any:
         """Step with an action that didn't come through the row, or with extras."""
-        if action is NO_ACTION:
+        if not self._actions_beside_row:
             action = self._read_action()
         return self._step_env(self._input(action, extras))
 
