@@ -408,11 +408,11 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
 
 @on_one_driver
 @pytest.mark.parametrize("whose", ["the trainer's", "the fork server's"])
-def test_one_restart_outlasts_a_shortage_of_descriptors(
+def test_restarts_outlast_a_shortage_of_descriptors(
     start: Start, caplog: pytest.LogCaptureFixture, whose: str
 ) -> None:
-    """Attempts become rarer; the other envs step meanwhile."""
-    group, tokens = start(two_workers(max_restarts=1)), Tokens()
+    """Each attempt counts, and they become rarer; the other envs step meanwhile."""
+    group, tokens = start(two_workers(max_restarts=99)), Tokens()
     pid = fork_server_pid(group.group) if whose == "the fork server's" else os.getpid()
     kept = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     listed = list(Path(f"/proc/{pid}/fd").iterdir())
@@ -422,11 +422,10 @@ def test_one_restart_outlasts_a_shortage_of_descriptors(
     resource.prlimit(pid, resource.RLIMIT_NOFILE, (lowest_free, kept[1]))
     try:
         with caplog.at_level(logging.WARNING, "rlightning_aio"):
-            while "in 0.4 s" not in caplog.text:
+            while "in 0.2 s" not in caplog.text:
                 tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
     finally:
         resource.prlimit(pid, resource.RLIMIT_NOFILE, kept)
-    assert "can't start a worker for entry 'faulty'" in caplog.text
     assert re.search("Too many open files|too many are open", caplog.text)
     batch, _ = group.collect_async()
     assert marked(batch["faulty-0"])

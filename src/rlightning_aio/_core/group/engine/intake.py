@@ -192,6 +192,9 @@ class Intake:
         if not wanted:
             if self._episodes.why_lost(slot) is None:  # Else that is known, as after an abort.
                 self._episodes.lose([slot], why)
+                is_stepped = self._requests.numbering.op(slot) == Operation.STEP
+                if self._requests.is_idle(slot) or not is_stepped:  # Else its step is lost, too.
+                    self._supervisor.losses.count_env(slot, why, completion.message)
             return
         self._episodes.lose([slot], why)
         replaced, fault = self._supervisor.losses.count_env(slot, why, completion.message)

@@ -69,6 +69,7 @@ class _EnvRecord:
         entry: of the request that is being executed; 0 while there is none.
         arguments: of that request.
         is_ending: the env before has left by itself, and has not closed yet.
+        lost: why the env before is gone, and the same as a message; None if there was none.
         leaving: the task that puts the env before away.
         rebuilding: the task that makes another env.
     """
@@ -81,6 +82,7 @@ class _EnvRecord:
         self.entry = 0
         self.arguments: Any = None
         self.is_ending = False
+        self.lost: tuple[Loss, str] | None = None
         self.leaving: asyncio.Task[None] | None = None
         self.rebuilding: asyncio.Task[None] | None = None
 
@@ -267,7 +269,12 @@ class AwaitedEnvs:
             record.entry, record.arguments = entry, arguments
             if record.env is not None:
                 self._give(record, record.env)
-            elif not record.is_ending:  # Else its end takes the request along.
+            elif record.is_ending:
+                continue  # Its end takes the request along.
+            elif op_of(entry) == Operation.STEP and record.lost is not None:
+                # It was sent before the trainer knew, and another env has no episode for it.
+                self._report_loss(record, *record.lost)
+            else:
                 record.rebuilding = self._spawn(self._rebuild(record))
 
     def _give(self, record: _EnvRecord, env: AwaitedEnv) -> None:
@@ -358,6 +365,7 @@ class AwaitedEnvs:
 
     def _report_loss(self, record: _EnvRecord, why: Loss, message: str) -> None:
         """Report that an env is gone, and the request with it that it was executing."""
+        record.lost = why, message
         entry, record.entry, record.arguments = record.entry, 0, None
         if self._ending:
             return
