@@ -91,6 +91,7 @@ class Play(Session):
         self.check_pending()
 
     was_interrupted = False
+    is_stopped = False
 
     def note_interrupt(self) -> None:
         self.was_interrupted = True
@@ -579,7 +580,7 @@ class Play(Session):
         """A reset of all envs drops what is in flight, and nothing stops it on the way."""
         envs = self.model.envs.values()
         gone = any(env.gone for env in envs)
-        known = not ("interrupts" in self.features or self.clients or gone)
+        known = not ("interrupts" in self.features or self.clients or gone or self.is_stopped)
         return known and self.may_abort() and all(map(self.is_abortable, self.model.pending()))
 
     async def drop(self, rng: Random) -> None:
@@ -1009,6 +1010,7 @@ class Play(Session):
     async def op_cancel(self, rng: Random) -> None:
         if not self.is_async:
             return
+        self.is_stopped = True
         task = asyncio.create_task(self.waiting(rng))
         seconds = rng.choice([0, 0, 1e-6, 1e-5, 1e-4, 1e-2])
         for _ in range(rng.randint(1, 6)):
@@ -1016,14 +1018,17 @@ class Play(Session):
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+        self.is_stopped = False
 
     async def op_expire(self, rng: Random) -> None:
         if not self.is_async:
             return
         seconds = 10 ** rng.uniform(-6, -0.5)
+        self.is_stopped = True
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self.waiting(rng)
+        self.is_stopped = False
 
     async def op_abort(self, rng: Random) -> None:
         """End what some envs are doing, unless that may stay with them."""
@@ -1084,6 +1089,10 @@ class Play(Session):
         for env in envs:
             if env.env_id not in pending:
                 self.model.abort(env)
+            elif env.client is not None and env.request is not None and env.client.may_be_back:
+                # It has come back while the abort waited for others.
+                self.model.abort(env)
+                env.client.note_pending(is_pending=True)
 
     async def op_task(self, rng: Random) -> None:
         if not self.is_async or len(self.tasks) > 3:
