@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def closing_table(name: str, *words: str) -> dict[str, list[str]]:
-    """Cells of each line, by entry, of ``rollout configs/NAME.yaml`` with `words`."""
+    """Cells of each line, by name, of ``rollout configs/NAME.yaml`` with `words`."""
     done = subprocess.run(
         [*COMMAND, "rollout", f"configs/{name}.yaml", *words],
         cwd=ROOT,
@@ -28,5 +28,5 @@ def closing_table(name: str, *words: str) -> dict[str, list[str]]:
 
 
 def steps(cells: list[str]) -> int:
-    """The entry's steps."""
-    return int(cells[2].replace(",", ""))
+    """The number of steps."""
+    return int(cells[1].replace(",", ""))

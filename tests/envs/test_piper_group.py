@@ -167,4 +167,4 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
 
 def test_the_dry_run_ends_with_its_table() -> None:
     """The example config runs unchanged, without an arm."""
-    assert steps(closing_table("piper", "--steps", "30")["piper"]) == 30
+    assert steps(closing_table("piper", "--steps", "30")["steps"]) == 30
