@@ -230,7 +230,7 @@ def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: list[Any]) -> None:
     """A thousand steps of both, and of a plain loop."""
-    together = hasattr(ours, "envs")  # A batch.
+    together = not isinstance(ours.envs, VectorEnv)  # A batch.
     actions = actions_for(theirs.action_space, 1000, len(makers))
     for env in (ours, theirs):
         env.seed(SEED)
