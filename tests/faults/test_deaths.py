@@ -407,9 +407,15 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
 
 
 @on_one_driver
-@pytest.mark.parametrize("whose", ["the trainer's", "the fork server's"])
+@pytest.mark.parametrize(
+    ("whose", "words"),
+    [
+        ("the trainer's", "can't start a worker for entry 'faulty'"),
+        ("the fork server's", "could not be forked"),
+    ],
+)
 def test_restarts_outlast_a_shortage_of_descriptors(
-    start: Start, caplog: pytest.LogCaptureFixture, whose: str
+    start: Start, caplog: pytest.LogCaptureFixture, whose: str, words: str
 ) -> None:
     """Each attempt counts, and they become rarer; the other envs step meanwhile."""
     group, tokens = start(two_workers(max_restarts=99)), Tokens()
@@ -426,6 +432,7 @@ def test_restarts_outlast_a_shortage_of_descriptors(
                 tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
     finally:
         resource.prlimit(pid, resource.RLIMIT_NOFILE, kept)
+    assert words in caplog.text
     assert re.search("Too many open files|too many are open", caplog.text)
     batch, _ = group.collect_async()
     assert marked(batch["faulty-0"])

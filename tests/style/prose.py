@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[2]
 SRC = ROOT / "src"
 
 PROSE = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", -1)}
-MAX_IDIOMS = 24
+MAX_IDIOMS = 20
 """Per 10,000 words."""
 MAX_REFERRALS = 10
 """Docstrings that only point to another."""
