@@ -296,7 +296,8 @@ async def test_an_env_that_raised_is_taken_back(
     async with numbered(place) as group:
         with group.auto_reset(math.inf):
             collector = collector_of(group, style, failing(*numbers))
-            while len(found) < 8:
+            # Which envs are served first is a matter of their processes.
+            while len(found) < 8 or min(map(len, steps_of(found).values())) <= 4:
                 try:
                     found += parts_of(await done(collector.collect()))
                 except EnvRaised as fault:
