@@ -87,7 +87,7 @@ async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
         assert batch.observation.tolist() == [1, 1]
 
 
-async def call_for_ever(episode: rl.EnvEpisode) -> None:
+async def call_for_ever(episode: Any) -> None:
     """Call a method again and again: the env may answer until its background has ended."""
     while True:
         await episode.call("get_attr", "env_id")
