@@ -158,9 +158,10 @@ def learn(
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
     run = Run(args.total_steps, args.folder, args.resume)
-    # MuJoCo's envs are one batch in this process; a timeline needs a group, of separate envs.
-    fields: dict[str, Any] = {"placement": "process"} if args.trace else {}
-    envs = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **fields)
+    # MuJoCo's envs are one batch, with a state; a timeline, and the state of others, need a group.
+    grouped = args.trace or args.backend != "mujoco"
+    fields: dict[str, Any] = {"placement": "process"} if grouped else {}
+    envs: Any = make_vec(args.task, args.num_envs, autoreset_mode="SameStep", **fields)
     with closing(envs):
         group = envs.group if args.trace else None
         observations, actions = envs.single_observation_space, envs.single_action_space

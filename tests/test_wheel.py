@@ -28,7 +28,7 @@ from rlightning_aio.vector import VectorEnv, make_vec
 
 assert rlightning_aio.__file__.startswith(sys.prefix), rlightning_aio.__file__
 pendulums = [lambda: gym.make("Pendulum-v1")] * 2
-for envs in (VectorEnv(pendulums), make_vec("Pendulum-v1", 2)):
+for envs in (VectorEnv(pendulums), make_vec("Pendulum-v1", 2, "async")):
     observations, _ = envs.reset(seed=1)
     assert envs.step(np.zeros((2, 1), np.float32))[0].shape == observations.shape == (2, 3)
     envs.close()

@@ -23,7 +23,7 @@ from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.vector.env import VectorEnv
 from rlightning_aio.vector.lazy_infos import LazyColumns, LazyInfos
-from rlightning_aio.vector.making import batch_of, steps_together
+from rlightning_aio.vector.making import batch_of, is_brief, steps_together
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -55,43 +55,52 @@ def make_vec_env(
     """Make monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
 
     Envs of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped together, in
-    threads of this process, inside a `VecMonitor`. Envs of any other task, and envs that need a
-    wrapper, a file or a worker each, are separate, each in a `Monitor`.
+    threads of this process, inside a `VecMonitor`, unless they need a wrapper or a file each.
+    Classic control, toy text and a single env are what Stable-Baselines3 makes, a `DummyVecEnv`.
+    All else is a `VecEnv` of separate envs in workers, each in a `Monitor`.
 
     Args:
         env_id: a registered name, or a callable that makes an env.
         n_envs: the number of envs.
         seed: env k gets ``seed + k`` at the next reset.
         env_kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads``.
-        vec_env_kwargs: of `VecEnv`: fields of a config entry. Envs with one are separate.
-        vec_env_cls: ignored if it is `SubprocVecEnv` or `DummyVecEnv`.
+        vec_env_kwargs: of `VecEnv`: fields of a config entry. Envs with one are in a `VecEnv`.
+        vec_env_cls: None makes what is fastest. `VecEnv` or `SubprocVecEnv`: always workers.
+            `DummyVecEnv`: always that.
         more: further arguments of Stable-Baselines3's function.
 
     Raises:
         ValueError: `vec_env_cls` is another class.
         TypeError: an argument is unknown.
-        ConfigError: ``num_threads`` is wrong, or another argument keeps the envs of the task
-            separate.
+        ConfigError: ``num_threads`` is wrong, another argument keeps the envs of the task
+            separate, or there are fields for a `DummyVecEnv`.
     """
     vec_envs = import_module("stable_baselines3.common.vec_env")
-    if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, vec_envs.DummyVecEnv):
+    dummy = vec_envs.DummyVecEnv
+    if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, dummy):
         raise ValueError(
             f"vec_env_cls is {vec_env_cls.__name__}, and these envs are in a {VecEnv.__name__}: "
             "leave it out, or call Stable-Baselines3's make_vec_env"
         )
     make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
-    given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
-    inspect.signature(make).bind(env_id, n_envs, seed, **given)
-    fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
-    separate = any(more.get(name) for name in _OF_SINGLE_ENVS) or not fields.keys() <= _IGNORED
-    if isinstance(env_id, str) and steps_together(
-        spec := spec_of(env_id), kwargs, separate=separate
-    ):
+    given = {"env_kwargs": env_kwargs, **more}
+    inspect.signature(make).bind(env_id, n_envs, seed, vec_env_kwargs=vec_env_kwargs, **given)
+    fields = {k: v for k, v in (vec_env_kwargs or {}).items() if k not in _IGNORED}
+    if vec_env_cls is dummy and fields:
+        raise ConfigError(f"{', '.join(fields)}: leave out vec_env_cls to have workers")
+    decides = vec_env_cls is None and not fields
+    spec = spec_of(env_id) if isinstance(env_id, str) else None
+    kwargs = {"render_mode": "rgb_array", **(env_kwargs or {})}
+    separate = not decides or any(more.get(name) for name in _OF_SINGLE_ENVS)
+    if spec is not None and steps_together(spec, kwargs, separate=separate):
         kwargs = {"disable_env_checker": True, **kwargs}
         made = VecEnv(batch_of(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
         made.seed(seed)
         return vec_envs.VecMonitor(made)
-    return make(env_id, n_envs, seed, vec_env_cls=VecEnv, **given)
+    if decides and (n_envs == 1 or (spec is not None and is_brief(spec))):
+        vec_env_cls = dummy
+    kind = dummy if vec_env_cls is dummy else VecEnv
+    return make(env_id, n_envs, seed, vec_env_cls=kind, vec_env_kwargs=fields, **given)
 
 
 class VecEnv(_Base):

@@ -242,7 +242,7 @@ def worker_processes() -> None:
     for build in (
         lambda: rl.build_env_group("CartPole-v1"),
         lambda: sync.build_env_group("HalfCheetah-v5", num_workers=2),
-        lambda: make_vec("CartPole-v1", 2),
+        lambda: make_vec("CartPole-v1", 2, "async"),
     ):
         try:
             build()

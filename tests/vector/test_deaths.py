@@ -27,7 +27,9 @@ LOST = [True, True, False, False]
 def made(**arguments: Any) -> VectorEnv:
     """Two workers, each with two envs."""
     entry = {"placement": "process", "envs_per_process": 2, **arguments}
-    return make_vec(TASK, 4, vector_kwargs=entry)
+    envs = make_vec(TASK, 4, vector_kwargs=entry)
+    assert isinstance(envs, VectorEnv)
+    return envs
 
 
 def killed(group: Any, send: Callable[[], None]) -> None:

@@ -301,7 +301,7 @@ def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
 def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:
     """Wrappers, arguments of the task and of the vector env; the spec has those of the task."""
     kwargs = {"max_episode_steps": 9, "wrappers": [gym.wrappers.RecordEpisodeStatistics]}
-    ours = make_vec("Pendulum-v1", 2, vector_kwargs={"placement": "inline"}, g=3.0, **kwargs)
+    ours: Any = make_vec("Pendulum-v1", 2, vector_kwargs={"placement": "inline"}, g=3.0, **kwargs)
     theirs = gym.make_vec("Pendulum-v1", 2, vectorization_mode="sync", g=3.0, **kwargs)
     assert ours.spec is not None
     assert ours.spec.id == "Pendulum-v1"
@@ -326,7 +326,7 @@ def test_make_vec_passes_on_what_the_runtime_needs(task: str, mode: Any) -> None
     fields: dict[str, Any] = {"envs_per_process": 1, "step_timeout": HANG, "max_restarts": 0}
     rendered = {"render_mode": "rgb_array"}
     fields["autoreset_mode"] = AutoresetMode.SAME_STEP
-    env = make_vec(task, 2, mode, vector_kwargs={"max_restarts": 7}, **fields, **rendered)
+    env: Any = make_vec(task, 2, mode, vector_kwargs={"max_restarts": 7}, **fields, **rendered)
     with contextlib.closing(env):
         config = env.group._core.envs.configs[0]
         assert (config.envs_per_process, config.step_timeout) == (1, HANG)
@@ -340,7 +340,7 @@ def test_make_vec_passes_on_what_the_runtime_needs(task: str, mode: Any) -> None
 def test_errors_name_what_the_user_has_given() -> None:
     """The task, the class or the function, and not what this package puts around it."""
     with pytest.raises(StartFailed, match=r"task CartPole-v1\).*'unknown'"):
-        make_vec("CartPole-v1", 2, unknown=3)
+        make_vec("CartPole-v1", 2, "async", unknown=3)
     with pytest.raises(StartFailed, match=r"task Sized\)"):
         VectorEnv([partial(Sized, high=3)] * 2)
 
@@ -443,7 +443,7 @@ def test_after_ctrl_c_a_state_can_be_restored(placement: str) -> None:
 
 def test_a_tuple_of_actions_is_one_for_each_env() -> None:
     """Like a list; only actions of Tuple and Dict spaces are trees."""
-    with contextlib.closing(make_vec("CartPole-v1", 3)) as env:
+    with contextlib.closing(make_vec("CartPole-v1", 3, "async")) as env:
         env.reset(seed=0)
         listed = env.step([0, 1, 0])
         env.reset(seed=0)
@@ -468,16 +468,6 @@ def test_arguments_of_methods_may_have_any_name() -> None:
     with contextlib.closing(VectorEnv([toy] * 2)) as env:
         env.call("set_wrapper_attr", name="note", value=3)
         assert env.get_attr("note") == (3, 3)
-
-
-def test_make_vec_takes_gymnasiums_modes() -> None:
-    """By name or by enum; the error for unsupported modes names the alternative."""
-    inline = {"placement": "inline"}
-    for mode in (gym.VectorizeMode.ASYNC, "async", None):
-        make_vec("Pendulum-v1", 1, mode, inline).close()
-    for mode in (gym.VectorizeMode.SYNC, "sync"):
-        with pytest.raises(ValueError, match="not 'sync': placement='inline'"):
-            make_vec("Pendulum-v1", 1, mode)  # pyright: ignore[reportArgumentType]
 
 
 def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:

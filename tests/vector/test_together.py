@@ -226,14 +226,6 @@ def test_the_state_of_another_kind_of_vector_env_is_refused() -> None:
     separate.close()
 
 
-def test_unsupported_modes_raise() -> None:
-    for mode in ("sync", gym.VectorizeMode.VECTOR_ENTRY_POINT):
-        with pytest.raises(ValueError, match=r"None or 'async', not .*gymnasium\.make_vec makes"):
-            make_vec(PENDULUM, 2, mode)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="max_concurrency"):
-        make_vec(PENDULUM, 2, vector_kwargs={"max_concurrency": 0})
-
-
 def test_attributes_that_would_make_them_differ_raise() -> None:
     """Attributes of some envs, and attributes of each env; the error says what to do."""
     env = make_vec(PENDULUM, 3)

@@ -1,10 +1,17 @@
-"""Vector envs of registered tasks, and the choice of tasks whose envs are stepped together."""
+"""Vector envs of registered tasks: which task comes as what.
+
+Rule: nothing is slower than what the peer makes by default. docs/gymnasium.md has the table.
+"""
 
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+import inspect
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import gymnasium as gym
+from gymnasium import VectorizeMode
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.config import EnvConfig
@@ -20,17 +27,26 @@ from rlightning_aio.vector.reset_arguments import checked_mode
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    import gymnasium as gym
-    from gymnasium import VectorizeMode
     from gymnasium.envs.registration import EnvSpec
 
     from rlightning_aio.vector.mujoco import MujocoVectorEnv
 
-__all__ = ["batch_of", "imports_of", "make_vec", "steps_together", "vector_entry_point"]
+__all__ = [
+    "batch_of",
+    "imports_of",
+    "is_brief",
+    "make_vec",
+    "steps_together",
+    "vector_entry_point",
+]
 
 Made = TypeVar("Made", bound="gym.vector.VectorEnv[Any, Any, Any]")
 _OF_EVERY_VECTOR_ENV: Final = {"autoreset_mode", "shared_memory", "copy", "context", "daemon"}
 """Arguments of `VectorEnv` without a meaning for a group."""
+_WORKERS_OWN: Final = {"shared_memory", "context", "daemon"}
+"""Arguments of `AsyncVectorEnv` that a `SyncVectorEnv` doesn't take."""
+_BRIEF: Final = ("classic_control", "toy_text", "phys2d", "tabular")
+"""Packages of Gymnasium's tasks whose step takes microseconds; the last two are those in JAX."""
 _WHICH_ENVS: Final = {
     "name", "backend", "task", "num_workers", "num_envs", "max_episode_steps",
     "env_kwargs",
@@ -42,49 +58,99 @@ RUNTIME_FIELDS: Final = EnvConfig.model_fields.keys() - _WHICH_ENVS | {"autorese
 def make_vec(
     id: str | EnvSpec,  # noqa: A002  # As Gymnasium calls it.
     num_envs: int = 1,
-    vectorization_mode: VectorizeMode | Literal["async"] | None = None,
+    vectorization_mode: VectorizeMode | str | None = None,
     vector_kwargs: Mapping[str, Any] | None = None,
     wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     **kwargs: Any,
-) -> VectorEnv | MujocoVectorEnv:
+) -> VectorEnv | MujocoVectorEnv | gym.vector.VectorEnv[Any, Any, Any]:
     """Make a vector env of `num_envs` envs of one task; see `gymnasium.make_vec`.
 
     Args:
         id: a registered name, ``module:name``, or a spec.
         num_envs: the number of envs.
-        vectorization_mode: None steps the envs of a task that `envs.mujoco` supports together,
-            with the same results, in threads of this process, unless a wrapper or a field of a
-            config entry needs a group; envs of any other task are separate. ``async``: always
-            separate envs.
+        vectorization_mode: None makes what is fastest. A task that `envs.mujoco` supports is one
+            batch in threads of this process. Classic control, toy text and a single env are what
+            Gymnasium makes by default: the task's own vector env, or a `SyncVectorEnv` where that
+            can't do what was asked. All else is a `VectorEnv`, in workers. Wrappers and
+            Gymnasium's checker need separate envs, and a field of a config entry a `VectorEnv`.
+            ``async``: always a `VectorEnv`. ``sync`` and ``vector_entry_point``: what
+            `gymnasium.make_vec` makes of these arguments.
         vector_kwargs: further arguments of `VectorEnv`. Fields of a config entry that say how envs
             run (``step_timeout``, ``envs_per_process``, …) and ``autoreset_mode`` may also be given
             without it.
-        wrappers: applied to each env, the first innermost; envs with wrappers are separate.
+        wrappers: applied to each env, the first innermost.
         kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads``.
             ``disable_env_checker`` is True by default, because Gymnasium's checker slows every
-            step; envs with the checker are separate.
+            step.
 
     Raises:
         ConfigError: ``num_threads`` is wrong, or given for a task that `envs.mujoco` supports with
-            an argument that keeps its envs separate.
+            an argument that keeps its envs separate; or a field of a config entry is given with
+            one of Gymnasium's modes.
         ValueError: the mode is unknown.
     """
-    mode = getattr(vectorization_mode, "value", vectorization_mode)
-    if mode not in (None, "async"):
-        raise ValueError(
-            f"vectorization_mode must be None or 'async', not {mode!r}: placement='inline' keeps "
-            "envs in this process, and gymnasium.make_vec makes a task's own vector environment"
-        )
+    mode = None if vectorization_mode is None else VectorizeMode(vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
+    around: list[Any] = [*wrappers]
+    if mode == VectorizeMode.VECTOR_ENTRY_POINT:
+        return gym.make_vec(spec, num_envs, mode, {**(vector_kwargs or {})}, around, **kwargs)
     own = {name: kwargs.pop(name) for name in RUNTIME_FIELDS & kwargs.keys()}
     given = {**(vector_kwargs or {}), **own}
+    if mode == VectorizeMode.SYNC:
+        if fields := sorted(given.keys() & RUNTIME_FIELDS - {"autoreset_mode"}):
+            raise ConfigError(f"{', '.join(fields)}: leave out vectorization_mode to have workers")
+        return gym.make_vec(spec, num_envs, mode, given, around, **kwargs)
+    in_workers = mode is not None or not given.keys() <= {*_OF_EVERY_VECTOR_ENV, "observation_mode"}
     of_one = {"disable_env_checker": True, **kwargs}
-    separate = mode == "async" or bool(wrappers) or not given.keys() <= _OF_EVERY_VECTOR_ENV
+    separate = in_workers or bool(around) or "observation_mode" in given
     if steps_together(spec, kwargs, separate=separate):
         autoreset = checked_mode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         return _with_spec(batch_of(spec, of_one, num_envs, autoreset), spec, kwargs)
-    makers = [OneOf(spec, of_one, tuple(wrappers))] * num_envs
+    if not in_workers and (num_envs == 1 or is_brief(spec)):
+        return _of_gymnasium(spec, num_envs, given, around, of_one)
+    makers = [OneOf(spec, of_one, tuple(around))] * num_envs
     return _with_spec(VectorEnv(makers, **{**imports_of(spec), **given}), spec, kwargs)
+
+
+def is_brief(spec: EnvSpec) -> bool:
+    """Return True for one of Gymnasium's tasks whose step costs less than the way to a worker."""
+    package, _, rest = str(spec.entry_point).partition(".envs.")
+    return package == "gymnasium" and rest.partition(".")[0] in _BRIEF
+
+
+def _of_gymnasium(
+    spec: EnvSpec,
+    num_envs: int,
+    given: Mapping[str, Any],
+    wrappers: Sequence[Any],
+    kwargs: dict[str, Any],
+) -> gym.vector.VectorEnv[Any, Any, Any]:
+    """Make the task's own vector env if it can do all that was asked, else a `SyncVectorEnv`."""
+    autoreset = checked_mode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+    entry_point, plain = spec.vector_entry_point, dict(kwargs)
+    unchecked = plain.pop("disable_env_checker")
+    as_asked = (
+        unchecked
+        and autoreset == AutoresetMode.NEXT_STEP
+        and given.get("observation_mode", "same") == "same"
+        and not (wrappers or spec.additional_wrappers)
+    )
+    if is_brief(spec) and entry_point is not None and as_asked:
+        make = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+        if _takes(make, {**spec.kwargs, **plain}):
+            return gym.make_vec(spec, num_envs, VectorizeMode.VECTOR_ENTRY_POINT, **plain)
+    of_loop = {name: value for name, value in given.items() if name not in _WORKERS_OWN}
+    of_loop["autoreset_mode"] = autoreset
+    return gym.make_vec(spec, num_envs, VectorizeMode.SYNC, of_loop, wrappers, **kwargs)
+
+
+def _takes(make: Callable[..., Any], kwargs: dict[str, Any]) -> bool:
+    """Return True if a task's own vector env has these arguments; none of them draws windows."""
+    try:
+        inspect.signature(make).bind(num_envs=1, **kwargs)
+    except TypeError:
+        return False
+    return kwargs.get("render_mode") != "human"
 
 
 def _with_spec(env: Made, spec: EnvSpec, kwargs: Mapping[str, Any]) -> Made:
@@ -116,14 +182,14 @@ def batch_of(
 def vector_entry_point(
     id: str | EnvSpec,  # noqa: A002
     **vector_kwargs: Any,
-) -> Callable[..., VectorEnv | MujocoVectorEnv]:
+) -> Callable[..., gym.vector.VectorEnv[Any, Any, Any]]:
     """Make a ``vector_entry_point`` for `gymnasium.register`: it makes a vector env of task `id`.
 
     `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")` then returns what `make_vec`
     does with `vector_kwargs`, also to libraries that call it, such as RLlib.
     """
 
-    def make(num_envs: int, **kwargs: Any) -> VectorEnv | MujocoVectorEnv:
+    def make(num_envs: int, **kwargs: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
         return make_vec(id, num_envs, vector_kwargs=vector_kwargs, **kwargs)
 
     return make
