@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from kit.scripted import DIE, GO, HANG, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.attempts.records import attempt_of
 from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, ResultsFile, evaluate
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
@@ -382,6 +384,48 @@ def test_it_is_printed_as_a_table() -> None:
     assert line.split()[1] == "8"
 
 
+@pytest.mark.parametrize(
+    ("told", "success", "words"),
+    [
+        (np.nan, None, ""),
+        ([0.7, 0.2, 1.0, 0.0], 0.5, "a value above 0.5; the mean of the values is 0.475"),
+        ([1, None, None, 1], 1.0, "out 2 with no success in the last info of 4 episodes: 50"),
+    ],
+)  # fmt: skip
+def test_what_counts_as_a_success_is_said(told: Any, success: float | None, words: str) -> None:
+    """NaN is no verdict, a share counts above one half, and what is left out is named."""
+    values = np.broadcast_to(np.array(told, object), 4).tolist()
+
+    def judged(k: int) -> Callable[[], Succeeding]:
+        env = scripted(lambda _: True)()
+        env.told = lambda: {} if values[k] is None else {"success": values[k]}
+        return lambda: env
+
+    found = evaluated(group_of(*map(judged, range(4))), 1)
+    assert (found.success and found.success.mean) == success
+    assert words in str(found)
+    assert bool(words) == bool(found.remarks)
+    again = Evaluation(
+        [attempt_of(json.loads(json.dumps(one.to_json()))) for one in found.attempts]
+    )
+    assert (again.success, again.success_value) == (found.success, found.success_value)
+
+
+def test_a_success_rate_says_that_failed_episodes_are_left_out() -> None:
+    """Those that end soon succeed; longer ones have failed more often."""
+
+    def late(seed: int) -> bool:
+        if seed == 3:
+            raise ConnectionError("the simulator is gone")
+        return True
+
+    group = group_of(scripted(late), on_env_error="restart")
+    found = evaluated(group, [EpisodeSpec("", seed) for seed in range(4)], retries=0)
+    assert found.success is not None
+    assert (found.success.mean, len(found.failed)) == (1.0, 1)
+    assert str(found).endswith("leaves out 1 failed of 4 episodes: 75.0% if they count as failures")
+
+
 # -- errors -----------------------------------------------------------------------------
 
 
@@ -434,7 +478,7 @@ def test_a_step_that_takes_too_long_for_an_evaluation_that_has_ended_is_aborted(
 
     with group_of(*HALF_SUCCEED[:2], placement="process") as group:
         with pytest.raises(RuntimeError, match="no memory"):
-            evaluate(group, fails, 1, seed=0, min_results=1)
+            evaluate(group, fails, 1000, seed=0, min_results=1)  # So one env plays on meanwhile.
         assert group.pending == []
         found = evaluate(group, nothing, 2, seed=0)
     assert len(found.played) == 4

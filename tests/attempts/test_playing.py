@@ -652,4 +652,4 @@ def test_a_last_info_without_a_verdict_has_none() -> None:
     assert success_of(both) is None
     masks = {"_final_info": np.array([True, False]), "_success": np.array([True, True])}
     assert success_of({**both, **masks, "success": np.array([False, True])}, 0) is None
-    assert success_of({**both, **masks, "success": np.array([False, True])}, 1) is True
+    assert success_of({**both, **masks, "success": np.array([False, True])}, 1) == 1.0

@@ -1,6 +1,6 @@
 """`Attempt` and `AttemptGroup`: what became of an episode, and of all attempts at a task.
 
-`success_of` reads from an info whether an episode has succeeded.
+`success_of` reads from an info how far an episode has succeeded.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Attempt:
         outcome: how it ended.
         reward: the undiscounted return, summed over agents; None if it has failed.
         length: number of steps.
-        success: ``success`` or ``is_success`` of the last info; None if it has neither, or if the
-            attempt has failed.
+        success_value: ``success`` or ``is_success`` of the last info as a number; None if it has
+            neither or NaN, or if the attempt has failed.
         sub_env: index of the sub-environment that played it; 0 if the env has only one.
         rewards: of each step, in order; empty if a policy played several envs at once.
         columns: what the agent gave to `step` with each action, and ``action`` itself: lists with
@@ -56,7 +56,7 @@ class Attempt:
     outcome: Outcome
     reward: float | None = None
     length: int = 0
-    success: bool | None = None
+    success_value: float | None = None
     sub_env: int = 0
     rewards: list[float] = field(default_factory=list[float])
     columns: dict[str, list[Any]] = field(default_factory=dict[str, list[Any]])
@@ -70,6 +70,11 @@ class Attempt:
         """Id of the env that played it last; empty if none did."""
         return self.outcome.env_id
 
+    @property
+    def success(self) -> bool | None:
+        """`success_value` is above 0.5; None if it is unknown."""
+        return None if self.success_value is None else self.success_value > 0.5
+
     def to_json(self) -> dict[str, Any]:
         """Return the attempt as a row of JSON, without observations.
 
@@ -80,7 +85,8 @@ class Attempt:
             "index": self.index,
             "reward": self.reward,
             "length": self.length,
-            "success": self.success,
+            # A verdict as such, a share as a number.
+            "success": self.success if self.success_value in (0, 1) else self.success_value,
             "sub_env": self.sub_env,
             "rewards": self.rewards,
             "outcome": self.outcome.to_json(),
@@ -102,12 +108,12 @@ def attempt_of(row: Mapping[str, Any]) -> Attempt:
     outcome = Outcome.from_json(fields.pop("outcome"))
     failures = tuple(map(Outcome.from_json, fields.pop("failures")))
     rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
-    reward = fields.pop("reward")
+    reward, success = fields.pop("reward"), fields.pop("success")
     if reward is None and not outcome.is_failure:  # It was not finite.
         reward = math.nan
-    return Attempt(
-        spec, outcome=outcome, failures=failures, rewards=rewards, reward=reward, **fields
-    )
+    value = None if success is None else float(success)
+    known = {"outcome": outcome, "failures": failures, "rewards": rewards, "reward": reward}
+    return Attempt(spec, **known, success_value=value, **fields)
 
 
 def _json_or_none(value: Any) -> Any:
@@ -154,10 +160,10 @@ class AttemptGroup(Sequence[Attempt]):
         return iter(self.attempts)
 
 
-def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
+def success_of(info: dict[str, Any], sub_env: int = 0) -> float | None:
     """Read the success of an episode from its last info, or from the ``final_info`` in it.
 
-    None if it says nothing, or something that is neither a bool nor a number.
+    None if it says nothing, or something that is neither a bool nor a number, such as NaN.
     """
     final: Any = info.get("final_info")
     marked: Any = info.get("_final_info")
@@ -169,5 +175,6 @@ def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
             # It may be a tensor on another device.
             array = np.asarray(given.tolist() if hasattr(given, "tolist") else given).reshape(-1)
             if array.size and array.dtype.kind in "biuf":
-                return bool(array[sub_env if array.size > 1 else 0])
+                value = float(array[sub_env if array.size > 1 else 0])
+                return None if math.isnan(value) else value
     return None

@@ -206,7 +206,7 @@ class Try:
             replace(ended, seconds=spent),
             reward=None if ended.is_failure else sum(view.rewards),
             length=len(view.rewards),
-            success=None if ended.is_failure else success_of(view.last.info),
+            success_value=None if ended.is_failure else success_of(view.last.info),
             rewards=view.rewards,
             columns=view.columns,
             first=view.first,

@@ -150,9 +150,10 @@ def evaluation(
     times. If any has failed then, the exit code is 1.
 
     Means and success rates have 95 % intervals. The episodes that end first would not be a fair
-    sample, because envs with short episodes would have more of them. Success is the value of
-    success or is_success in the last info of an episode. Ctrl-C ends early and prints the results
-    so far, which are not a fair sample either. With --resume the same command continues from there.
+    sample, because envs with short episodes would have more of them. Success is success or
+    is_success in the last info of an episode, True or above 0.5. Ctrl-C ends early and prints the
+    results so far, which are not a fair sample either. With --resume the same command continues
+    from there.
 
     For example:
 
@@ -356,7 +357,7 @@ def _figures(found: Evaluation) -> dict[str, Any]:
 
 
 def _notes(found: Evaluation) -> list[str]:
-    notes: list[str] = []
+    notes = found.remarks
     if failures := found.failures:
         kinds = ", ".join(f"{count(failures[kind])} {kind}" for kind in sorted(failures))
         notes.append(f"tries that failed, by the kind of their outcome: {kinds}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from statistics import fmean
 from typing import Literal
 
 from rlightning_aio.attempts.records import Attempt
@@ -61,16 +62,52 @@ class Evaluation:
 
     @property
     def success(self) -> Estimate | None:
-        """Success rate of episodes whose `success` is known, with Wilson's interval, or None."""
-        judged = [attempt.success for attempt in self.played if attempt.success is not None]
-        return wilson_estimate(sum(judged), len(judged))
+        """Success rate of episodes whose `success` is known, with Wilson's interval, or None.
+
+        Values above 0.5 are successes. `remarks` say what is left out.
+        """
+        values = self._success_values
+        return wilson_estimate(sum(value > 0.5 for value in values), len(values))
+
+    @property
+    def success_value(self) -> Estimate | None:
+        """Mean of the values from which `success` is counted, with Student's t interval."""
+        return mean_estimate(self._success_values)
+
+    @property
+    def _success_values(self) -> list[float]:
+        return [one.success_value for one in self.played if one.success_value is not None]
+
+    @property
+    def remarks(self) -> list[str]:
+        """Notes on the figures, in words: values that are no verdicts, and what is
+        left out of the success rate.
+        """
+        found, values = list[str](), self._success_values
+        if not values:
+            return found
+        if any(value not in (0, 1) for value in values):
+            found.append(
+                f"a success is a value above 0.5; the mean of the values is {fmean(values):.4g}"
+            )
+        left_out = len(self.attempts) - len(values)
+        if left_out:
+            failed, silent = len(self.failed), left_out - len(self.failed)
+            parts = [f"{failed} failed"] * bool(failed)
+            parts += [f"{silent} with no success in the last info"] * bool(silent)
+            least = sum(value > 0.5 for value in values) / len(self.attempts)
+            found.append(
+                f"the success rate leaves out {' and '.join(parts)} of {len(self.attempts)} "
+                f"episodes: {least:.1%} if they count as failures"
+            )
+        return found
 
     def by_task(self) -> dict[str, Evaluation]:
         """Split by task, in alphabetical order."""
         return parts_of(self, "task")
 
     def __str__(self) -> str:
-        """A table with a line for each task."""
+        """A table with a line for each task, and the `remarks`."""
         by_task = self.by_task()
         parts = [*by_task.items()] if len(by_task) == 1 else [*by_task.items(), ("all", self)]
         head = ("task", "episodes", "success", "return", "length", "failed")
@@ -80,7 +117,7 @@ class Evaluation:
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
             for row in rows
         )
-        return "\n".join(line.rstrip() for line in lines)
+        return "\n".join([*(line.rstrip() for line in lines), *self.remarks])
 
 
 def parts_of(found: Evaluation, name: Literal["entry", "task"]) -> dict[str, Evaluation]:

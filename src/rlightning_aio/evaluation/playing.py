@@ -285,7 +285,7 @@ class PolicyPlay:
             self._release(env_id)
 
     def _end(
-        self, env_id: str, sub_env: int, outcome: Outcome, success: bool | None = None
+        self, env_id: str, sub_env: int, outcome: Outcome, success: float | None = None
     ) -> None:
         """Note that the episode of a sub-environment has ended, if it was one of the queue."""
         place = self._places[env_id][sub_env]
@@ -294,7 +294,7 @@ class PolicyPlay:
             return
         attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
         if not outcome.is_failure:
-            attempt.reward, attempt.success = float(self._reward[place]), success
+            attempt.reward, attempt.success_value = float(self._reward[place]), success
             attempt.length = int(self._length[place])
         self._counts[place] = False
         self._ended.append((job, attempt))
