@@ -63,6 +63,15 @@ class PlainStub(Stub):
     """An env without faults."""
 
 
+@rl.ENVS.register("nan")
+class NotANumber(Stub):
+    """Has rewards that are none."""
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        found = super().step(policy_resp)
+        return found.model_copy(update={"last_reward": found.last_reward * math.nan})
+
+
 @rl.ENVS.register("raising")
 class Raising(Stub):
     """Raises in its third step."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
 from cli.stub_envs import Careless, Stub
+from group.sample_envs import Crowd
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,6 +72,32 @@ def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
     assert any("more open descriptors after" in leak for leak in leaks)
     assert "problem: none found" in text
     assert "placement" not in text
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_it_says_of_how_many_rewards_some_are_nan(tmp_path: Path, num_envs: int) -> None:
+    """Resets have none, and each sub-environment has its own."""
+    entry = {"name": "nan", "backend": "nan", "task": "any", "num_envs": num_envs}
+    entry |= {"placement": "inline", "env_kwargs": {"episode_length": 1}}
+    (found,) = failed(write_config(tmp_path, entry), "--steps", "9")
+    assert found["problems"][0].startswith(f"{5 * num_envs} of {5 * num_envs} rewards are NaN")
+    assert found["step_us"] is not None
+
+
+def test_problems_are_printed_where_no_step_was_timed(tmp_path: Path) -> None:
+    """Each result of one of the sub-environments is a reset."""
+    entry = {"name": "nan", "backend": "nan", "task": "any", "placement": "inline"}
+    done = invoke("check", write_config(tmp_path, {**entry, "num_envs": 2}), "--steps", "1")
+    assert done.exit_code == 1
+    assert "  problem: 2 of 2 rewards are NaN or infinite" in done.stdout
+
+
+def test_envs_of_several_agents_are_played(tmp_path: Path) -> None:
+    """An episode is over when it is for all of them."""
+    assert Crowd.agents == ("tall", "small")
+    entry = {"name": "two", "backend": "crowd", "task": "any", "placement": "inline"}
+    (found,) = invoke_json("check", write_config(tmp_path, entry), "--steps", "12")["entries"]
+    assert (found["episodes"], found["problems"]) == (3, [])
 
 
 def test_a_sound_env_is_code_0(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import signal
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from cli import stub_policies
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
 
@@ -103,6 +104,20 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     assert len(file.read_text().splitlines()) == 2
     (film,) = films.iterdir()
     assert film.name.endswith("-seed-0-slow-0-episode-0.mp4")
+
+
+def test_an_error_of_the_policy_is_no_interrupt(tmp_path: Path) -> None:
+    """What was played before is shown, how much that is, and why there is no more."""
+    config = write_config(tmp_path, {**POLE, "num_workers": 1, "max_episode_steps": 2})
+    words = ("eval", config, "--episodes", 20, "--policy", "cli.stub_policies:breaks_soon")
+    stub_policies.calls_left = 13
+    done = invoke(*words, "--json")
+    document = json.loads(done.stdout)
+    assert (done.exit_code, document["interrupted"], document["episodes"]) == (1, False, 6)
+    stub_policies.calls_left = 13
+    table = " ".join(invoke(*words).stdout.split())
+    assert table.startswith("Ended by an error after 6 episodes, so short ones are favoured: ")
+    assert "20 episodes of each env were to be played" in table
 
 
 def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:

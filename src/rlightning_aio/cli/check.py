@@ -21,6 +21,7 @@ import typer
 
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.cli.options import AsJson, Config, Overrides
 from rlightning_aio.cli.policies import Responder, respond_to_all
 from rlightning_aio.cli.terminal import (
@@ -70,8 +71,8 @@ class _Finding:
         skipped: the reason why it was not started.
         steps: how many steps it made; none if only a policy can choose its actions.
         offers: what the envs' own server says of them.
-        episodes: number that have ended, with ``--steps``; step_us: median time of a step in its
-            env.
+        is_played: with ``--steps``; episodes: number that have ended then; step_us: median time of
+            a step in its env.
         problems: in words, each with what to do.
     """
 
@@ -86,6 +87,7 @@ class _Finding:
     skipped: str | None = None
     steps: int = 0
     offers: dict[str, Any] | None = None
+    is_played: bool = False
     episodes: int = 0
     step_us: float | None = None
     problems: list[str] = field(default_factory=list[str])
@@ -179,19 +181,22 @@ def _has_no_samples(space: Any) -> bool:
 async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
     """Play so many steps, and look at rewards, at times, and at what episodes leave behind."""
     (worker,) = group.get_workers()
-    pid, samples, bad, times = worker["pid"] or "self", list[dict[str, float]](), 0, list[int]()
+    pid, samples, times = worker["pid"] or "self", list[dict[str, float]](), list[int]()
+    rewards = bad = 0
     respond = Responder(group, None, 0)
     batch, _ = await group.reset(seed=0)
     for _ in range(steps):
         await respond_to_all(group, respond, batch)
         batch, _ = await group.collect_async()
-        bad += int(np.count_nonzero(~np.isfinite(batch.reward)))
-        times += [] if batch.is_reset.any() else batch.busy_ns.tolist()
-        samples += [_held(pid)] * int(np.count_nonzero(batch.done & ~batch.is_reset))
-    found.episodes = len(samples)
+        stepped = ~batch.is_reset
+        of_steps = summed_rewards(batch.reward)[stepped]
+        rewards, bad = rewards + of_steps.size, bad + np.count_nonzero(~np.isfinite(of_steps))
+        times += batch.busy_ns.tolist() if stepped.all() else []
+        samples += [_held(pid)] * int(np.count_nonzero(all_agents(batch.done) & stepped))
+    found.is_played, found.episodes = True, len(samples)
     found.step_us = float(np.median(times)) / 1e3 if times else None
     if bad:
-        found.problems.append(f"{bad} of {steps} rewards are NaN or infinite")
+        found.problems.append(f"{bad} of {rewards} rewards are NaN or infinite")
     found.problems += _leaks(samples)
 
 
@@ -328,6 +333,7 @@ def _lines(found: _Finding) -> Iterator[str]:
         yield "  reset; not stepped: only a policy can choose its actions"
         return
     yield f"  reset and stepped {found.steps} times"
-    if found.step_us is not None:
-        yield f"  {counted(found.episodes, 'episode')}; a step takes {duration(found.step_us)}"
+    if found.is_played:
+        took = f"; a step takes {duration(found.step_us)}" if found.step_us is not None else ""
+        yield f"  {counted(found.episodes, 'episode')}{took}"
         yield from (f"  problem: {problem}" for problem in found.problems or ["none found"])

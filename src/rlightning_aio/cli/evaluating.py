@@ -66,6 +66,7 @@ _IN_SUBJECT: Final = (
 )  # fmt: skip
 """Fields of an entry that affect what comes of an episode; others only where and how it runs."""
 _By: TypeAlias = Literal["entry", "task"]
+_End: TypeAlias = Literal["Interrupted", "Ended by an error"]
 
 _Episodes: TypeAlias = Annotated[
     int | None, typer.Option(min=1, help="Episodes for each env.", show_default="10")
@@ -224,18 +225,18 @@ def _play(
     """Play the episodes, and report them."""
     configs = [*order.configs] if order.video is None else [*map(_rendering, order.configs)]
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
-    interrupted, stopped = True, False
+    ended: _End | None = "Ended by an error"
     try:
         with Progress() as progress:
             run_interruptible(_evaluate(group, order, policy, results, progress))
-        interrupted = False
+        ended = None
     except KeyboardInterrupt:
-        stopped = True
+        ended = "Interrupted"
         raise
     finally:
         # After an error, too: the episodes until then may be useful.
-        if stopped or order.found.attempts:
-            _report(order, plot, interrupted=interrupted, as_json=as_json)
+        if ended == "Interrupted" or order.found.attempts:
+            _report(order, plot, ended, as_json=as_json)
     if order.found.failed:
         raise typer.Exit(1)
 
@@ -302,18 +303,26 @@ def _with_progress(
 # -- output ------------------------------------------------------------------------------
 
 
-def _report(order: _Order, plot: Path | None, *, interrupted: bool, as_json: bool) -> None:
-    """Print and draw the results."""
+def _report(order: _Order, plot: Path | None, ended: _End | None, *, as_json: bool) -> None:
+    """Print and draw the results; `ended` says why there are fewer than were asked for."""
     found = order.found
     parts, notes = parts_of(found, order.by), _notes(found)
     if as_json:
         each = [{"name": name, **_figures(own)} for name, own in parts.items()]
-        about = {**order.facts, "interrupted": interrupted, "notes": notes, **_figures(found)}
+        about = {
+            **order.facts,
+            "interrupted": ended == "Interrupted",
+            "notes": notes,
+            **_figures(found),
+        }
         attempts = [attempt.to_json() for attempt in found.attempts]
         print_json({**about, "by": order.by, "parts": each, "attempts": attempts})
     else:
-        unfair = "Interrupted, so short episodes are favoured: " if interrupted else ""
-        print_table(_table(f"{unfair}{order.title}", order.by, parts, found))
+        title = order.title
+        if ended is not None:
+            known = counted(len(found.attempts), "episode")
+            title = f"{ended} after {known}, so short ones are favoured: {title} were to be played"
+        print_table(_table(title, order.by, parts, found))
         print_lines(notes)
     if plot is not None and found.played:
         figures = [(name, own, own.returns) for name, own in parts.items() if own.played]
