@@ -96,7 +96,7 @@ def drive(placement: str, channels: list[str]) -> None:
 def serve() -> None:
     """Run a trainer whose arms are clients."""
     server = {"name": "arms", "backend": "env_server"}
-    server["env_kwargs"] = {"min_clients": len(STOPS), "connect_timeout": PATIENCE, "heartbeat": 30}
+    server["env_kwargs"] = {"clients": len(STOPS), "connect_timeout": PATIENCE, "heartbeat": 30}
     with sync.build_env_group(server) as group:
         say(group["arms-0"].address)
         batch, _ = group.reset()

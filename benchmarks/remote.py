@@ -185,7 +185,7 @@ class Ours(_Clients):
         return ("rlightning_aio",)
 
     def listen(self) -> None:
-        kwargs = {"min_clients": self.num_clients, "keys": self.keys("server")}
+        kwargs = {"clients": self.num_clients, "keys": self.keys("server")}
         self._group = sync.build_env_group(
             {"name": "remote", "backend": "env_server", "step_timeout": 60, "env_kwargs": kwargs}
         )

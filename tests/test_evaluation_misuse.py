@@ -77,10 +77,10 @@ def test_a_seed_for_a_queue_is_refused() -> None:
         evaluated(group_of(), seed=3)
 
 
-def test_clients_are_not_evaluated() -> None:
-    """They come and go."""
+def test_clients_that_have_not_dialled_in_are_not_evaluated() -> None:
+    """Their spaces are not known."""
     server = {"name": "robots", "backend": "env_server"}
-    refused = pytest.raises(ValueError, match="robots-0 is an env_server")
+    refused = pytest.raises(ValueError, match="no client has dialled in for robots-0/0")
     with sync.build_env_group(server) as group, refused:
         evaluate(group, None, 1)
 

@@ -265,13 +265,15 @@ class EnvHung(WorkerDied):
 
 
 class EnvAway(EnvFault):
-    """The client of a remote env is not connected; it may come back.
+    """No client lends a remote env, or not any more; another may dial in.
 
     An awaitable env whose step raises it has lost what it talks to, and so its episode: the env is
     made anew, as a worker that has died is.
     """
 
     _outcome = "env_away", "infrastructure"
+    env_ids: tuple[str, ...] = ()
+    """All envs of which that is so, where it ends the requests of several."""
 
 
 class EpisodeLost(EnvFault):

@@ -187,8 +187,8 @@ class Placement:
         local: its workers use this machine's cores and see this process's modules.
         awaits: if awaitable envs (`async def` reset and step) can live there, or only such.
         extra: the extra of this package that it needs; empty for none.
-        max_members: the most envs of an entry that join and leave while the group runs; 0 where
-            the envs are built with the group.
+        places: ``module:function`` that returns the names of an entry's places, where workers
+            start themselves; empty where the trainer starts them.
         check: ``module:function`` that raises `ConfigError` for an entry that can't be there.
     """
 
@@ -198,7 +198,7 @@ class Placement:
     local: bool = True
     awaits: Literal["never", "also", "only"] = "never"
     extra: str = ""
-    max_members: int = 0
+    places: str = ""
     check: str = ""
 
 
@@ -262,13 +262,11 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
     "env_server": Placement(
         BACKENDS["env_server"].target,
         spreads=False,
-        max_members=1024,  # Twice the limit on clients that are connected at a time.
+        places="rlightning_aio._core.hosts.env_server.settings:place_names",
+        local=False,
         check="rlightning_aio._core.hosts.env_server.settings:server_settings",
         refuses={
-            "num_workers": "an env_server is one env with as many clients as connect; "
-            "env_kwargs.min_clients is the number for which a reset waits",
-            "num_envs": "each client announces how many its env has; "
-            "env_kwargs.min_clients is the number of clients for which a reset waits",
+            "num_workers": "env_kwargs.clients is the number of places for clients",
             "placement": _CLIENTS_OWN,
             "envs_per_process": _CLIENTS_OWN,
             "interpreter": _CLIENTS_OWN,
@@ -276,11 +274,8 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "ray_options": _CLIENTS_OWN,
             "max_concurrency": _CLIENTS_OWN,
             "start_timeout": "clients connect at any time; env_kwargs.connect_timeout limits how "
-            "long a reset waits for them",
+            "long a call waits for them",
             "close_timeout": _CLIENTS_OWN,
-            "on_worker_death": "it has no workers; a request to a client that is lost gives a "
-            "truncated result, and the client may come back",
-            "max_restarts": "it has no workers; a client that is lost may come back",
         },
     ),
 }

@@ -168,7 +168,9 @@ class ClientTraits(NamedTuple):
     Attributes:
         free_actions: its actions may be outside its action space.
         reads_extras: the client reads fields of responses other than the action.
+        hardware: its env moves something real.
     """
 
     free_actions: bool
     reads_extras: bool
+    hardware: bool = True

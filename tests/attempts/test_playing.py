@@ -23,7 +23,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.records import success_of
-from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
+from rlightning_aio.errors import EpisodeLost, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -421,6 +421,11 @@ async def test_a_call_is_not_answered_by_another_episode() -> None:
     assert (attempt.outcome.kind, attempt.reward, attempt.result) == ("env_died", None, None)
 
 
+def served(*names: str) -> dict[str, Any]:
+    kwargs = {"clients": list(names), "connect_timeout": HANG}
+    return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+
+
 async def test_clients_of_an_env_server_play() -> None:
     """Also one that comes while others play."""
 
@@ -431,7 +436,11 @@ async def test_clients_of_an_env_server_play() -> None:
         return episode.env_id
 
     playing = set[str]()
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    server = {
+        "name": "robots",
+        "backend": "env_server",
+        "env_kwargs": {"clients": ["c0", "c1", "c2"], "connect_timeout": HANG},
+    }
     async with rl.build_env_group(server) as group:
         handle: Any = group["robots-0"]
         address: str = handle.address
@@ -450,28 +459,6 @@ async def test_clients_of_an_env_server_play() -> None:
         await asyncio.to_thread(client.join)
 
 
-async def test_a_client_plays_that_came_before() -> None:
-    """Its first result, which nobody has asked for, keeps no one from playing."""
-
-    async def agent(episode: AttemptEpisode) -> str:
-        await episode.step([0.0, 0.0])
-        return episode.env_id
-
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
-    async with rl.build_env_group(server) as group:
-        handle: Any = group["robots-0"]
-        client = ClientThread(handle.address, "c0", CountingEnv(0))
-        while group.pending != ["robots-0/c0"]:  # noqa: ASYNC110  # Nothing tells that it has come.
-            await asyncio.sleep(0.01)
-        ((attempt,),) = await played(group, tasks(1), agent)
-        assert attempt.result == "robots-0/c0"
-        await group.reset()
-        group.reset_async()
-        with pytest.raises(EnvBusy, match="c0"):
-            await played(group, tasks(1), agent)
-    client.join()
-
-
 async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
     """It is read while an env of another entry is there."""
 
@@ -479,7 +466,11 @@ async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
         await episode.step([0.0, 0.0])
         return episode.env_id
 
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    server = {
+        "name": "robots",
+        "backend": "env_server",
+        "env_kwargs": {"clients": ["c0"], "connect_timeout": HANG},
+    }
     local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
     specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(["here", "robots"])]
     found: list[str] = []
@@ -500,7 +491,11 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
         await episode.step([0.0, 0.0])
         return episode.env_id
 
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    server = {
+        "name": "robots",
+        "backend": "env_server",
+        "env_kwargs": {"clients": ["c0"], "connect_timeout": HANG},
+    }
     local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
     order = [*["robots"] * 4, *["here"] * 3]
     specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(order)]

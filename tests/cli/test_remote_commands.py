@@ -132,7 +132,7 @@ def test_each_change_of_a_connection_is_one_line_on_both_sides(tmp_path: Path) -
             )
             withheld.rename(allowed)
             assert line_with(client, "left: ") == "left: serving\n"
-            line_with(server, "robots-0: the client 'left' has joined")
+            line_with(server, "robots-0: the client 'left' has taken robots-0/0")
             client.communicate(timeout=HANG)
             server.communicate(timeout=HANG)
     assert client.returncode == server.returncode == 0

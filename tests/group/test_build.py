@@ -98,7 +98,7 @@ def test_the_repr_of_a_group_lists_its_envs_and_their_placement() -> None:
         "EnvGroup(pole: 4 envs, placement process, 2 worker processes; "
         "many: 1 env of 16 sub-environments, placement inline, 0 worker processes; "
         "one: 1 env, placement process, 1 worker process; "
-        "arms: env_server)"
+        "arms: 1 place for clients)"
     )
     group.close()
     assert repr(group) == said

@@ -11,11 +11,10 @@ from group.fake_host import PLAIN, RAISES, TERMINATES, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.hosts.messages import Lost, Result, Withdrawn
+from rlightning_aio._core.hosts.messages import Lost, Result
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     EnvBusy,
-    EnvFault,
     EnvHung,
     EnvRaised,
     NothingPending,
@@ -311,25 +310,6 @@ def test_a_restore_is_one_request(new_group: NewGroup) -> None:
     group.finish(1)
     restoring.result()
     assert len(group.hosts[0].asked) == num_asked + 2
-
-
-def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
-    new_group: NewGroup,
-) -> None:
-    """The request that was to report its loss ended without a result."""
-    group = new_group(1, 1)
-    run(group, group.core.reset(group.now, None, None, None))
-    die(group, 0)
-    stepping = group.begin(group.steps.step(steps(0), group.now))
-    host, entry = group.hosts[0], group.core.requests.numbering.entry.item(0)
-    host.waiting.clear()
-    host.answer(Withdrawn(0, entry))
-    group.turn()
-    with pytest.raises(EnvFault):
-        stepping.result()
-    batch, _ = run(group, group.core.reset(group.now, None, None, None))
-    assert batch.ids() == ["fake-0", "fake-1"]
-    assert not batch.restarted.any()
 
 
 def test_one_env_of_a_host_can_be_lost(new_group: NewGroup) -> None:

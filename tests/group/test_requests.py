@@ -60,17 +60,15 @@ class Driven:
         self.events: dict[Event, Callable[[], None]] = {
             Event.SENT: lambda: self._ask([SLOT], Operation.STEP, COLLECTOR),
             Event.SENT_FOR_CALL: self._call,
-            Event.JOINED: lambda: self.table.join(SLOT, 1.0),
             Event.RESULT: self._result,
             Event.VALUE: lambda: self.table.set_value(self._end(), "value"),
             Event.FAULT: self._fail,
-            Event.WITHDRAWN: lambda: self.table.withdraw(self._end()),
+            Event.TAKEN_BACK: self._take_back,
             Event.ASKED_AGAIN: self._restart,
             Event.HANDED_OUT: lambda: self.table.hand_out(self.table.collector.pop_ready(1)),
             Event.SETTLED: self._settle,
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
-            Event.CLAIMED: self._claim,
             Event.DROPPED: self._drop,
             Event.FREED: self._free,
             Event.ABORTED: self._abort,
@@ -94,10 +92,11 @@ class Driven:
         op = Operation.CALL if self.method else Operation.RESET
         self._ask(slots, op, self.ticket.owner)
 
-    def _claim(self) -> None:
-        self.ticket = self.table.tickets.open(np.array([SLOT, COMPANION]))
-        self.table.claim(self.table.alone(SLOT), self.ticket)
-        self._ask([COMPANION], Operation.RESET, self.ticket.owner)
+    def _take_back(self) -> None:
+        slot = self._end()  # What is held is not in flight.
+        if self.ticket is not None:
+            self.table.tickets.forget(self.ticket.owner, self.table.alone(slot))
+        self.table.take_back(self.table.alone(slot))
 
     def _free(self) -> None:
         fault = self.table.collector.errors[SLOT]
@@ -186,11 +185,10 @@ UNCOLLECTED: Situation = (State.READY, Owner.COLLECTOR)
 ALL: list[Combination] = list(itertools.product(State, Owner, Event))
 NOT_EXPRESSIBLE: dict[Combination, str] = {
     (State.BUSY, Owner.COLLECTOR, Event.VALUE): "only methods have values; each has a ticket",
-    (State.BUSY, Owner.TICKET, Event.WITHDRAWN): "a call learns by an error that its env is away",
     (State.BUSY, Owner.NOBODY, Event.RESULT): "whatever ends it, its reply is dropped",
     (State.BUSY, Owner.NOBODY, Event.VALUE): "likewise",
     (State.BUSY, Owner.NOBODY, Event.FAULT): "likewise",
-    (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "likewise",
+    (State.BUSY, Owner.NOBODY, Event.TAKEN_BACK): "likewise",
     (State.BUSY, Owner.NOBODY, Event.ABORTED): "it is aborted once",
     (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN): "what nobody waits for ends with its worker",
     (State.READY, Owner.TICKET, Event.METHOD_GIVEN_UP): "methods have values, not results",
@@ -209,8 +207,6 @@ def brought_to(state: State, owner: Owner, event: Event | None = None) -> Driven
     method = owner is Owner.NOBODY or of_methods
     driven = Driven(method=method)
     way = (METHODS if method else STEPS)[state, owner]
-    if event in (Event.CLAIMED, Event.DROPPED) and (state, owner) == UNCOLLECTED:
-        way = [Event.JOINED]
     for past in way:
         driven.events[past]()
     assert driven.situation() == (state, owner)
@@ -240,18 +236,18 @@ def test_any_other_event_is_refused_or_has_no_effect(
     table = driven.table
     slots = table.alone(SLOT)
     needs_idle = (
-        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED,
+        Event.SENT, Event.SENT_FOR_CALL,
     )  # fmt: skip
     if event in needs_idle:
         assert table.first_not_idle(slots) == SLOT
         assert not table.is_idle(SLOT)
-    elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.WITHDRAWN):
+    elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.TAKEN_BACK):
         # A reply without a request, like a late one.
         assert table.end(1, driven.entry()) is None
     elif event in (Event.ASKED_AGAIN, Event.ABORTED):
         assert table.owed(slots).size == 0
-    elif event in (Event.CLAIMED, Event.DROPPED):
-        assert not table.joined(slots).any()
+    elif event is Event.DROPPED:
+        assert not (table.ready(slots).size and table.owner[SLOT] == COLLECTOR)
     elif event is Event.FREED:
         assert SLOT not in table.collector.errors
     elif event is Event.HANDED_OUT:
@@ -311,16 +307,6 @@ def test_the_reply_to_an_aborted_request_is_dropped(owner: Owner) -> None:
     assert table.in_flight == [0, 0]
 
 
-def test_a_first_result_is_handed_out_once() -> None:
-    """To any other call the env is busy, whatever it would do with a first result."""
-    table = CheckedRequests(HOST_OF, 2)
-    ticket = table.tickets.open(np.array([SLOT, COMPANION]))
-    table.join(SLOT, 1.0)
-    assert table.joined(table.alone(SLOT)).all()
-    table.claim(table.alone(SLOT), ticket)
-    assert not table.joined(table.alone(SLOT)).any()
-
-
 # -- the debug mode
 
 
@@ -353,7 +339,7 @@ def test_results_that_came_first_are_taken_first() -> None:
     [
         (State.IDLE, Owner.COLLECTOR, Event.HANDED_OUT),
         (State.BUSY, Owner.COLLECTOR, Event.SENT),
-        (State.READY, Owner.COLLECTOR, Event.JOINED),
+        (State.READY, Owner.COLLECTOR, Event.RESULT),
         (State.SPENT, Owner.TICKET, Event.RESULT),
         (State.BUSY, Owner.NOBODY, Event.ASKED_AGAIN),
     ],
@@ -368,7 +354,6 @@ def test_the_checked_table_refuses_an_illegal_event(
     bring_about: dict[Event, Callable[[], object]] = {
         Event.HANDED_OUT: lambda: table.hand_out(slots),
         Event.SENT: lambda: table.issue(slots, Operation.STEP, COLLECTOR, 1.0),
-        Event.JOINED: lambda: table.join(SLOT, 1.0),
         Event.RESULT: lambda: table.deliver(slots),
         Event.ASKED_AGAIN: lambda: table.ask_again(1, slots),
     }
@@ -383,4 +368,4 @@ def test_the_checked_table_refuses_a_change_without_an_event() -> None:
     table = brought_to(State.BUSY, Owner.COLLECTOR).table
     table.state[SLOT] = State.IDLE
     with pytest.raises(RuntimeError, match=f"slot {SLOT} became IDLE for COLLECTOR without"):
-        table.withdraw(SLOT)
+        table.take_back(table.alone(SLOT))

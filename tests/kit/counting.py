@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -68,6 +69,13 @@ class CountingEnv(BaseEnv):
         self.closed = True
 
 
+def look(group: Any, seconds: float = 0.02, server: str = "robots-0") -> None:
+    """Let the sockets of an env_server work, while nothing is asked of anybody."""
+    time.sleep(seconds)
+    group[server]._server.on_readable()  # noqa: SLF001
+    group._core.intake.apply_completions()  # noqa: SLF001
+
+
 class ClientThread:
     """A client in a thread of the test's process; it ends with its server."""
 
@@ -76,7 +84,7 @@ class ClientThread:
     ) -> None:
         self.env = env or CountingEnv()
         self.error: BaseException | None = None
-        self.client = RemoteEnvClient(self.env, address, name=name, **{"heartbeat": 5.0, **options})
+        self.client = RemoteEnvClient(self.env, address, name=name, **options)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import threading
 import warnings
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -128,3 +132,50 @@ def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:
         robot.steps = STEPS  # It is finished.
         group.close()
         thread.join()
+
+
+def test_a_loop_over_robots_that_come_and_go(tmp_path: Path) -> None:
+    """Each of four serves twice, in a process of its own; a fifth one that comes late plays."""
+    group = build_env_group(
+        EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
+    )
+    started: list[subprocess.Popen[bytes]] = []
+    folders = [str(Path(__file__).parents[1]), *sys.path]
+
+    def start() -> None:
+        host, port = group.env_servers[0].get_address_port()
+        script = str(Path(__file__).parent / "dialling_robot.py")
+        started.append(
+            subprocess.Popen(
+                [sys.executable, script, host, str(port), str(tmp_path)],
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
+            )
+        )
+
+    try:
+        for _ in range(4):
+            start()
+        batch, _ = group.reset()
+        results = len(batch.ids())
+        most = 0
+        while results < 4 * 2 * 11:
+            group.step_async(answers(batch))
+            batch, _ = group.collect_async()
+            results += len(batch.ids())
+            most = max(most, len(group._group["robots-0"].clients))
+        assert results == 88
+        assert most == 4
+        group.step_async(answers(batch))
+        with pytest.raises(TimeoutError):
+            group._group.collect_async(deadline=2.0)
+        start()
+        batch, _ = group.collect_async()
+        assert len(batch.ids()) == 1
+        for _ in range(21):
+            group.step_async(answers(batch))
+            batch, _ = group.collect_async()
+    finally:
+        for one in started:
+            one.kill()
+            one.wait()
+        group.close()

@@ -17,7 +17,7 @@ from rlightning_aio.remote import RemoteEnvClient
 
 def serve(address: str, name: str, task: str, keys: str | None) -> None:
     env = GymnasiumEnv(EnvConfig(name="env", backend="gymnasium", task=task))
-    with RemoteEnvClient(env, address, name=name, heartbeat=5.0, keys=keys) as client:
+    with RemoteEnvClient(env, address, name=name, keys=keys) as client:
         client.run()
 
 

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from kit.counting import ClientThread, CountingEnv
 from patience import HANG
 from remote.random_spaces import any_space
+from remote.unreliable import Recorder
 
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvRaised
-from rlightning_aio.protocol.net.server_session import ServerSessions
+from rlightning_aio.protocol.error_text import ErrorText
+from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.wire import (
     VERSION,
     Bye,
     ClientHello,
-    ClientResult,
     Failure,
     Writer,
 )
@@ -82,7 +83,7 @@ HOSTILE: list[Any] = [
 @pytest.mark.parametrize("place", ["observation_space", "action_space"])
 def test_every_hello_is_answered(place: str) -> None:
     """Also if arithmetic errors and warnings raise in the trainer."""
-    server = ServerSessions("srv")
+    server = ServerSessions("srv", [ClientPlace("srv/0", Recorder())])
     with np.errstate(all="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
         for k, description in enumerate(HOSTILE):
@@ -105,7 +106,7 @@ def test_a_description_with_any_field_changed_is_answered(space: Any, data: st.D
         inner = data.draw(st.sampled_from(fields["spaces"]))
         fields = inner[1] if isinstance(inner, list) else inner
     fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(_ANYTHING)
-    server = ServerSessions("srv")
+    server = ServerSessions("srv", [ClientPlace("srv/0", Recorder())])
     with np.errstate(all="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
         server.receive(b"r", hello(observation_space=description))
@@ -114,7 +115,7 @@ def test_a_description_with_any_field_changed_is_answered(space: Any, data: st.D
 
 def test_a_hello_of_any_length_costs_little() -> None:
     """It is refused before its spaces are read."""
-    server = ServerSessions("srv")
+    server = ServerSessions("srv", [ClientPlace("srv/0", Recorder())])
     long = {"type": "multi_discrete", "nvec": [1] * 300_000}
     server.receive(b"r", hello(observation_space=long))
     (answer,) = answers(server)
@@ -126,28 +127,28 @@ def test_texts_of_clients_are_shown_without_control_characters(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Reasons and errors in logs, infos and exceptions."""
-    server = ServerSessions("srv")
+    seen = Recorder()
+    place = ClientPlace("srv/0", seen)
+    server = ServerSessions("srv", [place])
     long = ESCAPES * 10_000
     with caplog.at_level(logging.INFO, "rlightning_aio"):
         server.receive(b"r", hello("raises"))
-        failure = Failure(number=0, exception_type=long, text=long,
-                          traceback=long)  # fmt: skip
+        server.reset(place, None, None)
+        failure = Failure(number=1, exception_type=long, text=long, traceback=long)
         server.receive(b"r", Writer().write(failure))
-        server.receive(b"r", hello("leaves"))
-        first = ClientResult(number=0, reward=0.0, terminated=False,
-                       truncated=False)  # fmt: skip
-        server.receive(b"r", Writer().write(first, [bytes(8)]))
-        server.step("leaves", 1, 0, {}, 0.0)
         server.receive(b"r", Writer().write(Bye(reason=long)))
         server.receive(b"r", hello(ESCAPES))
         server.receive(b"r", hello(observation_space={"type": ESCAPES}))
         server.receive(b"r", [msgspec.msgpack.encode({"type": ESCAPES})])
     messages = [record.getMessage() for record in caplog.records]
-    assert len(messages) == 6
+    assert len(messages) == 5
     assert all(message.isprintable() and len(message) < 2500 for message in messages)
-    (_, lost) = server.take()
-    assert lost.info["client_lost"].isprintable()
-    assert "fake: " in lost.info["client_lost"]
+    ((cause, _),) = seen.lost
+    (error,) = seen.answers
+    assert isinstance(error, ErrorText)
+    for text in (cause, error.text, error.summary):
+        assert text.isprintable()
+        assert "fake: " in text
 
 
 class _Hostile(CountingEnv):

@@ -38,6 +38,8 @@ POSITION = spaces.Box(-1.0, 1.0, (2,), np.float32)
 class _Sampling(BaseEnv):
     """Observations are samples of its space, by seed and step; every third step ends."""
 
+    sub_envs = 1
+
     observations: spaces.Space[Any] = POSITION
     actions: spaces.Space[Any] = spaces.Discrete(3)
     finished = False
@@ -104,6 +106,7 @@ class Chunked(_Sampling):
 
 
 class Vectorised(_Sampling):
+    sub_envs = 2
     observations = batch_space(POSITION, 2)
     actions = batch_space(spaces.Discrete(3), 2)
     autoreset = "next_step"
@@ -162,7 +165,8 @@ def trajectory(group: Any, kind: type[_Sampling]) -> Iterator[Any]:
 def described(ret: Any) -> dict[str, Any]:
     fields = ("observation", "last_reward", "last_terminated", "last_truncated")
     # Tuples arrive as lists in both cases.
-    return {name: getattr(ret, name) for name in fields} | {"info": ret.info, "extra": ret._extra}
+    info = {name: value for name, value in ret.info.items() if name != "client"}
+    return {name: getattr(ret, name) for name in fields} | {"info": info, "extra": ret._extra}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -174,11 +178,13 @@ def test_a_client_gives_the_results_of_a_local_env(kind: type[_Sampling]) -> Non
     with sync.build_env_group(local) as group:
         expected = [described(ret) for ret in trajectory(group, kind)]
         stats = group.get_env_stats()["here-0"]
-    with sync.build_env_group({"name": "there", "backend": "env_server"}) as group:
+    with sync.build_env_group(
+        {"name": "there", "backend": "env_server", "num_envs": kind.sub_envs}
+    ) as group:
         env = kind(EnvConfig(name="there", backend=name, task="any"))
         thread = ClientThread(group["there-0"].address, "client", env)
         found = [described(ret) for ret in trajectory(group, kind)]
-        stats_of_client = group.get_env_stats()["there-0/client"]
+        stats_of_client = group.get_env_stats()["there-0/0"]
         group.close()
         thread.join()
     assert without_times(stats_of_client) == without_times(stats)

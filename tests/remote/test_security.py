@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import zmq
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread, CountingEnv, look
 from patience import HANG
 from remote.random_spaces import mutation
 from zmq.utils.monitor import recv_monitor_message
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 def entry(**env_kwargs: Any) -> dict[str, Any]:
-    kwargs = {"heartbeat": 5.0, "connect_timeout": HANG, **env_kwargs}
+    kwargs = {"clients": ["arm"], "connect_timeout": HANG, **env_kwargs}
     return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
 
 
@@ -152,7 +152,7 @@ def test_a_client_without_the_right_key_is_not_admitted(kind: str, tmp_path: Pat
             group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
             batch, _ = group.collect_async(deadline=HANG)
         thread.join()
-        assert group["robots-0"].clients == ["robots-0/arm"]
+        assert group["robots-0"].clients == {"robots-0/arm": "arm"}
         group.close()
         friend.join()
     (error,) = errors
@@ -169,9 +169,7 @@ def test_a_client_learns_that_its_key_is_not_allowed(tmp_path: Path) -> None:
     with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
         friend = ClientThread(group["robots-0"].address, "arm", keys=arm)
         while "the server does not know this client's key" not in friend.client.state:
-            with pytest.raises(TimeoutError):
-                # No client joins; the group only listens.
-                group.collect_async(deadline=0.1)
+            look(group)
         hidden.rename(listed)
         batch, _ = group.reset()
         assert batch.values()[0].env_id == "robots-0/arm"
@@ -214,9 +212,9 @@ def test_a_client_with_other_keys_is_logged_once_on_both_sides(
             CountingEnv(), "127.0.0.1", port, keys=client_keys, name="arm"
         ) as remote:
             while events.count(zmq.EVENT_CONNECTED) < 5 or "robots-0: " not in caplog.text:
-                for wait in (remote.connect, lambda t: group.collect_async(deadline=t)):
-                    with pytest.raises(TimeoutError):
-                        wait(0.05)
+                with pytest.raises(TimeoutError):
+                    remote.connect(0.05)
+                look(group)
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == len(set(lines)) <= 3
     (line,) = [line for line in lines if line.startswith("robots-0: ")]
@@ -232,10 +230,11 @@ def test_a_key_that_is_overwritten_in_place_is_no_longer_admitted(
     listed = tmp_path / "server" / "clients"
     Path(os.fsdecode(os.fsencode(listed) + b"/\xff\x1b.key")).write_text("x")
     errors: list[str] = []
-    with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
+    kwargs = {"clients": ["arm", "leg"], "keys": str(tmp_path / "server")}
+    with sync.build_env_group(entry(**kwargs)) as group:
         address = group["robots-0"].address
         friend = ClientThread(address, "arm", keys=arm)
-        batch, _ = group.reset()
+        batch, _ = group.reset(env_ids=["robots-0/arm"])
         with (listed / "arm.key").open("r+") as file:
             file.write((listed / "leg.key").read_text())
         thread = threading.Thread(target=lambda: errors.append(refused(address, arm)))
@@ -286,7 +285,7 @@ def test_loopback_needs_neither(host: str) -> None:
         ({"prot": 1}, "env_kwargs.prot: unknown field; did you mean 'port'"),
         ({"port": 70000}, "env_kwargs.port: .*65535.*got 70000"),
         ({"heartbeat": 0}, "env_kwargs.heartbeat"),
-        ({"min_clients": 0}, "env_kwargs.min_clients"),
+        ({"clients": 0}, "env_kwargs.clients"),
         ({"connect_timeout": "soon"}, "env_kwargs.connect_timeout"),
     ],
 )
@@ -348,7 +347,7 @@ def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path
                 if k % 10 == 0:
                     group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                     batch, _ = group.collect_async(deadline=HANG)
-        assert group["robots-0"].clients == ["robots-0/arm"]
+        assert group["robots-0"].clients == {"robots-0/arm": "arm"}
         group.close()
         friend.join()
     assert not (tmp_path / "exploded").exists()

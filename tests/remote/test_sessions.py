@@ -8,15 +8,15 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from remote.unreliable import OBSERVATION, Client, World
+from remote.unreliable import OBSERVATION, Client, Recorder, World
 
-from rlightning_aio.errors import BadAction, EnvBusy, UnknownEnv
+from rlightning_aio.errors import BadAction
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import ClientSession, Phase, Refused
 from rlightning_aio.protocol.net.payload import ResultFields
-from rlightning_aio.protocol.net.server_session import ServerSessions
-from rlightning_aio.protocol.net.wire import ClientHello, Refusal, Welcome, Writer
-from rlightning_aio.types import EnvMeta, EnvRet
+from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
+from rlightning_aio.protocol.net.wire import ClientHello, Refusal, Reset, Step, Welcome, Writer
+from rlightning_aio.types import EnvMeta
 
 
 @pytest.fixture
@@ -31,79 +31,65 @@ def only(results: list[Any]) -> Any:
     return result
 
 
-def test_a_client_that_joins_sends_its_first_result_without_a_request(world: World) -> None:
-    """Joining is a reset, and its result answers no request."""
-    first = {result.client: result for result in world.take()}
-    assert set(first) == set(world.server.clients) == {"a", "b"}
-    assert first["a"].number is None
-    assert first["a"].observation.tolist() == [1, 1, 0]
-    assert world.server.clients["b"].env_id == "srv/b"
+def test_a_client_is_asked_nothing_until_somebody_asks(world: World) -> None:
+    """The welcome names its env; nothing moves."""
+    assert world.server.clients() == {"srv/0": "a", "srv/1": "b"}
+    assert [one.taken for one in world.seen] == [["a"], ["b"]]
+    assert not world.take()
+    assert not world.clients["a"].executed
 
 
-def test_a_step_and_a_reset_come_back_under_their_numbers(world: World) -> None:
-    """Numbers are the caller's own, whatever travels."""
-    world.take()
-    assert world.submit("a", 70)
+def test_a_reset_and_a_step_are_answered(world: World) -> None:
+    world.reset("a", seed=3)
     world.settle()
-    assert only(world.take()).number == 70
-    assert world.submit_reset("a", 5)
+    assert only(world.take()).observation.tolist() == [1, 1, 0]
+    world.step("a")
     world.settle()
-    result = only(world.take())
-    assert (result.number, result.observation[2]) == (5, 0)
+    assert only(world.take()).observation.tolist() == [1, 1, 1]
 
 
-def test_a_client_with_a_pending_request_is_busy(world: World) -> None:
-    """A second request is refused before anything is sent."""
-    world.submit("a", 1)
-    with pytest.raises(EnvBusy, match="srv/a has not answered its last step"):
-        world.submit("a", 2)
-
-
-def test_a_client_that_never_joined_is_unknown(world: World) -> None:
-    """No request to it is sent or answered."""
-    with pytest.raises(UnknownEnv, match="no client named 'c' is connected to srv"):
-        world.server.traits("c")
-    assert not world.submit("c", 1)
-    assert not world.submit_reset("c", 2)
+def test_the_first_request_of_a_session_is_a_reset(world: World) -> None:
+    """A client refuses another one, and moves nothing."""
+    world.step("a")
+    world.settle()
+    assert "the first request of a session is not a reset" in world.clients["a"].ended[0]
+    assert not world.clients["a"].executed
 
 
 def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
     """The client stays free for a better one."""
-    with pytest.raises(BadAction, match=r"srv/a.*expected shape \(2,\)"):
-        world.server.step("a", 1, np.zeros(3, np.float32), {}, 0.0)
-    assert world.submit("a", 2)
+    with pytest.raises(BadAction, match=r"srv/0.*expected shape \(2,\)"):
+        world.server.step(world.places[0], np.zeros(3, np.float32), {})
+    world.reset("a")
 
 
 @pytest.mark.parametrize("options", [{"x": object()}, {0: "x"}, {"x": {"y": 2**70}}])
 def test_reset_options_that_cannot_travel_are_refused(world: World, options: Any) -> None:
     """They would arrive as something else, or not at all."""
     with pytest.raises(ValueError, match="options can't be sent"):
-        world.submit_reset("a", 1, options=options)
-    assert world.submit_reset("a", 2)
+        world.server.check_reset("srv/0", 1, options)
 
 
 def test_an_exception_arrives_with_its_traceback_and_the_env_goes_on(world: World) -> None:
     """The env can be stepped again after it raised."""
-    world.take()
+    world.reset("a")
+    world.settle()
     client = world.clients["a"]
     client.raises = True
-    world.submit("a", 1)
+    world.step("a")
     world.settle()
-    result = only(world.take())
-    assert result.number == 1
-    assert result.error == ErrorText("Oops", "no", "trace")
+    assert world.take()[1:] == [ErrorText("Oops", "no", "trace")]
     client.raises = False
-    world.submit("a", 2)
+    world.step("a")
     world.settle()
-    assert only(world.take()).error is None
+    assert only(world.take()).observation.tolist() == [1, 1, 1]
 
 
 def test_an_answer_that_nobody_waits_for_ends_the_session(world: World) -> None:
     """A second answer, and one to another request."""
-    world.take()
     for name, count in (("a", 2), ("b", 1)):
         client = world.clients[name]
-        world.submit(name, 1)
+        world.reset(name)
         world.to_client(client)
         number = client.todo.number if client.todo else 0
         for _ in range(count):
@@ -112,191 +98,63 @@ def test_an_answer_that_nobody_waits_for_ends_the_session(world: World) -> None:
         client.flush()
         world.settle()
         assert "which is not in flight" in client.ended[0]
-        assert name not in world.server.clients
-    answered, lost = world.take()
-    assert (answered.client, answered.is_loss) == ("a", False)
-    assert (lost.client, lost.is_loss) == ("b", True)
+    assert world.server.clients() == {}
+    assert [len(one.answers) for one in world.seen] == [1, 0]
+    assert [len(one.lost) for one in world.seen] == [1, 1]
 
 
-def test_a_client_that_dies_in_a_step_leaves_one_marked_result(world: World) -> None:
-    """Truncated, at its last observation, with the cause."""
-    world.take()
-    world.submit("a", 1)
-    world.clients["a"].kill()
+@pytest.mark.parametrize(("way", "in_order"), [("kill", False), ("cut", False), ("leave", True)])
+def test_a_client_that_is_gone_is_lost_once(world: World, way: str, in_order: bool) -> None:
+    """Its place is empty, and it may come back to that."""
+    world.reset("a")
+    getattr(world.clients["a"], way)()
     world.settle()
-    assert "a" not in world.server.clients
-    result = only(world.take())
-    assert (result.number, result.truncated, result.terminated) == (1, True, False)
-    assert result.observation.tolist() == [1, 1, 0]
-    assert "connection broke" in result.info["client_lost"]
-
-
-def test_a_request_to_a_client_that_is_known_to_be_absent_is_not_answered(world: World) -> None:
-    """There is no series of marked results: the next result is the client's first one."""
-    world.submit("a", 1)
-    world.clients["a"].kill()
-    world.settle()
-    world.take()
-    assert not world.submit("a", 2)
-    assert not world.take()
-    world.clients["a"].connect()
-    world.settle()
-    result = only(world.take())
-    assert result.number is None
-    assert result.observation.tolist() == [1, 2, 0]
-
-
-def test_a_loss_without_a_pending_request_is_reported_by_the_next_step(world: World) -> None:
-    """The trainer learns that the episode ended before it sees the next one."""
-    world.take()
-    world.clients["a"].kill()
-    world.clients["a"].connect()
-    world.settle()
-    assert not world.take(), "the first result waits until the loss is reported"
-    assert world.submit("a", 1)
-    lost, first = world.take()
-    assert "client_lost" in lost.info
-    assert (first.number, first.observation.tolist()) == (None, [1, 2, 0])
-
-
-def test_a_reset_replaces_a_loss_and_a_first_result(world: World) -> None:
-    """After a reset, the end of the last episode does not matter."""
-    world.take()
-    world.clients["a"].kill()
-    world.clients["a"].connect()
-    world.settle()
-    assert world.submit_reset("a", 2)
-    world.settle()
-    assert only(world.take()).number == 2
-
-
-def test_a_client_is_lost_again_after_a_reset_that_replaced_its_first_result(world: World) -> None:
-    """The marked result shows the observation that the reset began with."""
-    world.take()
-    world.clients["a"].kill()
-    world.clients["a"].connect()
-    world.settle()
-    assert world.submit_reset("a", 1)
-    world.clients["a"].kill()
-    world.settle()
-    lost = only(world.take())
-    assert (lost.number, lost.is_loss, lost.observation.tolist()) == (1, True, [1, 2, 0])
-
-
-def test_a_client_that_is_lost_again_unseen_reports_the_first_loss(world: World) -> None:
-    """Nobody has seen the session in between."""
-    world.take()
-    world.clients["a"].cut()
-    world.clients["a"].connect()
-    world.settle()
-    world.clients["a"].leave()
-    world.settle()
-    assert world.submit("a", 1)
-    assert "its connection broke" in only(world.take()).info["client_lost"]
-    assert not world.submit("a", 2)
-
-
-def test_a_broken_connection_ends_the_session_on_both_sides(world: World) -> None:
-    """The env must be made safe, and another session begins; nothing is sent twice."""
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    client.cut()
-    assert client.ended == ["the connection broke"]
-    client.execute()
-    client.connect()
-    world.settle()
-    lost, first = world.take()
-    assert (lost.number, lost.is_loss, first.number) == (1, True, None)
-    assert client.session.phase is Phase.SERVING
-    assert (client.steps, len(client.executed)) == (0, 2)
-
-
-def test_an_answer_over_a_connection_that_is_gone_is_not_sent_over_the_next(world: World) -> None:
-    """A step may end after its session has."""
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    assert client.todo is not None
-    number = client.todo.number
-    client.cut()
-    client.session.finish(number, client.ret())
-    client.flush()
-    assert not client.outbox[1:]
-
-
-def test_a_busy_client_may_be_silent_without_limit(world: World) -> None:
-    """A step may take hours; the connection shows that the client lives."""
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    world.pass_time(10_000.0)
-    assert world.server.deadline() is None
-    client.execute()
-    world.settle()
-    assert only(world.take()).number == 1
-
-
-def test_a_step_past_its_timeout_loses_the_client() -> None:
-    """One marked result; the client learns that its session is over."""
-    world = World(step_timeout=3.0)
+    ((cause, was_in_order),) = world.seen[0].lost
+    assert was_in_order == in_order
+    assert cause.startswith("client 'a': ")
     world.join_all()
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    while "a" in world.server.clients:
-        world.pass_time(0.5)
-    assert world.now <= 4.0
-    assert "no result of a step within 3.0 s" in only(world.take()).info["client_lost"]
-    client.execute()
-    world.settle()
-    assert any("within 3.0 s" in cause for cause in client.ended)
-
-
-def test_a_client_that_leaves_sends_a_reason(world: World) -> None:
-    """Its reason is in the marked result."""
-    world.take()
-    world.submit("a", 1)
-    world.clients["a"].leave()
-    world.settle()
-    assert "it left: enough" in only(world.take()).info["client_lost"]
-
-
-def test_a_client_that_leaves_before_the_trainer_saw_it_may_come_back() -> None:
-    """There is no loss to report, because no request would report it."""
-    world = World("a")
-    client = world.clients["a"]
-    client.connect()
-    world.to_server(client)
-    world.to_client(client)
-    client.execute()
-    client.leave()
-    for route, parts in client.outbox:  # All have arrived when the trainer reads.
-        if parts is None:
-            world.server.disconnected(route)
-        else:
-            world.server.receive(route, parts)
-    client.outbox.clear()
-    world.flush()
+    assert world.seen[0].taken == ["a", "a"]
     assert not world.take()
-    client.connect()
-    world.settle()
-    assert only(world.take()).observation.tolist() == [1, 2, 0]
 
 
-def test_a_client_that_was_dismissed_for_lack_of_room_may_come_back(world: World) -> None:
-    """Its first result is reported as if it had never been there."""
-    world.take()
-    world.server.dismiss("a", "no place")
-    world.flush()
+def test_who_gets_which_place() -> None:
+    """First the last one, then the one whose request has waited longest, then the first."""
+    world = World("abcd", places=3)
+    world.clients["b"].connect()
     world.settle()
-    assert world.clients["a"].ended == ["the server ended the session: no place"]
+    assert world.server.clients() == {"srv/0": "b"}
+    world.seen[1].since, world.seen[2].since = 5.0, 4.0
+    world.clients["a"].connect()
+    world.settle()
+    assert world.server.clients() == {"srv/0": "b", "srv/2": "a"}
+    world.clients["b"].cut()
+    world.settle()
+    world.clients["b"].connect()
+    world.settle()
+    assert world.server.clients() == {"srv/0": "b", "srv/2": "a"}
     world.join_all()
-    assert only(world.take()).number is None
+    assert world.clients["d"].refused == ["all 3 places are taken"]
+    world.clients["c"].leave()
+    world.settle()
+    world.clients["d"].connect()
+    world.settle()
+    assert world.server.clients()["srv/1"] == "d"
+
+
+def test_a_listed_name_has_its_own_place() -> None:
+    """Others are refused for good, whether there is room or not."""
+    world = World("abx", places="ba")
+    world.join_all()
+    assert world.server.clients() == {"srv/b": "b", "srv/a": "a"}
+    assert world.clients["x"].refused == ["the places of srv are for b, a"]
+    assert world.server.refused == {"x": "the places of srv are for b, a"}
+
+
+def test_a_key_is_for_the_names_that_it_was_made_for(world: World) -> None:
+    client = Client("c", 3)
+    client.session.connected()
+    world.server.receive(b"c:9", client.session.outbox.popleft(), {"arm"})
+    assert world.server.refused == {"c": "its key was made for 'arm', not for 'c'"}
 
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:
@@ -309,31 +167,20 @@ def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -
     assert second.refused == ["a client named 'a' is here already"]
     assert first.session.phase is Phase.SERVING
     # A message to the first one finds no connection.
-    world.submit("a", 1)
+    world.reset("a")
     second.connect()
     world.settle()
     assert second.session.phase is Phase.SERVING
 
 
-def test_a_restarted_server_gets_its_clients_back() -> None:
-    """A new server knows no session; the client says hello again."""
-    world = World("a")
-    world.join_all()
-    client = world.clients["a"]
-    world.server = ServerSessions("srv")
-    client.cut()
-    world.join_all()
-    assert client.session.phase is Phase.SERVING
-    assert set(world.server.clients) == {"a"}
-
-
 def test_a_server_that_closes_says_goodbye(world: World) -> None:
-    """Clients end their sessions at once and hang up."""
+    """Clients end their sessions at once and hang up; no place hears of it."""
     world.server.close("done")
     world.flush()
     world.settle()
     assert world.clients["a"].ended == ["the server ended the session: done"]
     assert world.clients["a"].session.phase is Phase.AWAY
+    assert not world.seen[0].lost
 
 
 def meta(**changes: Any) -> EnvMeta:
@@ -350,15 +197,15 @@ def meta(**changes: Any) -> EnvMeta:
     [
         ("c/d", {}, "must be printable and without '/'"),
         ("c\n", {}, "must be printable and without '/'"),
-        ("c", {}, "its spaces, num_envs or agents differ"),
-        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "differ"),
+        ("c", {}, "its spaces or agents differ"),
+        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "2 sub-environments"),
         ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "agents": ("x",)}, "differ"),
     ],
 )
 def test_a_client_that_does_not_fit_is_refused_for_good(
     world: World, name: str, changes: dict[str, Any], says: str
 ) -> None:
-    """The client receives the reason and gives up."""
+    """The client receives the reason and gives up; that the places are taken doesn't matter."""
     other_client = ClientSession(meta(**changes), name)
     other_client.connected()
     world.server.receive(b"r", other_client.outbox.popleft())
@@ -366,71 +213,74 @@ def test_a_client_that_does_not_fit_is_refused_for_good(
     assert isinstance(event, Refused)
     assert not event.retry
     assert says in event.text
-    assert "c" not in world.server.clients
+    assert says in next(iter(world.server.refused.values()))
 
 
 def test_another_version_is_refused_with_both_versions(world: World) -> None:
     """Neither side guesses."""
     hello = ClientHello(version=9, name="z", observation_space={}, action_space={})
     world.server.receive(b"r", Writer().write(hello))
-    assert b"speaks version 2, not 9" in world.server.outbox.popleft().parts[0]
+    assert b"speaks version 3, not 9" in world.server.outbox.popleft().parts[0]
+
+
+@pytest.mark.parametrize(("hardware", "heartbeat"), [(True, 1.0), (False, 5.0)])
+def test_the_welcome_says_how_soon_either_end_misses_the_other(
+    hardware: bool, heartbeat: float
+) -> None:
+    """Sooner where something real moves; a client that doesn't say so counts as that."""
+    world = World("")
+    session = ClientSession(meta(), "a", hardware=hardware)
+    session.connected()
+    hello = session.outbox.popleft()
+    world.server.receive(b"r", hello)
+    event = session.receive(world.server.outbox.popleft().parts)
+    assert event.heartbeat == heartbeat
+    assert ClientHello(version=3, name="a", observation_space={}, action_space={}).hardware
 
 
 def test_a_session_is_that_of_its_connection(world: World) -> None:
     """Nothing that another connection says belongs to it."""
-    world.take()
-    world.submit("a", 1)
+    world.reset("a")
     client = world.clients["a"]
     world.to_client(client)
     client.execute()
     (_, result), client.outbox[:] = client.outbox[0], []
     assert result is not None
     world.server.receive(b"s", result)
-    assert not world.server.take()
+    assert not world.take()
     assert client.route
     world.server.receive(client.route, result)
-    assert only(world.server.take()).number == 1
-
-
-def answered_once() -> tuple[World, Any, bytes, bytes]:
-    """Return a client that has executed a step, and the parts of its unsent result."""
-    world = World("a")
-    world.join_all()
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    client.execute()
-    (_, parts), client.outbox[:] = client.outbox[0], []
-    header, frame = parts or []
-    return world, client, header, frame
+    assert len(world.take()) == 1
 
 
 @pytest.mark.parametrize("spoil", ["whole", "frame"])
 def test_a_message_that_is_malformed_ends_the_session(spoil: str) -> None:
     """It says why."""
-    world, client, header, _ = answered_once()
-    parts = {"whole": [b"nonsense"], "frame": [header, b"short"]}[spoil]
-    world.server.receive(client.route or b"", parts)
+    world = World("a")
+    world.join_all()
+    client = world.clients["a"]
+    world.reset("a")
+    world.to_client(client)
+    client.execute()
+    (_, parts), client.outbox[:] = client.outbox[0], []
+    header, _ = parts or []
+    spoilt = {"whole": [b"nonsense"], "frame": [header, b"short"]}[spoil]
+    world.server.receive(client.route or b"", spoilt)
     world.flush()
-    lost = only(world.take())
-    assert lost.is_loss
-    assert "a message of it" in lost.info["client_lost"]
+    assert "a message of it is malformed" in world.seen[0].lost[0][0]
     world.settle()
     assert client.ended
     world.join_all()
-    assert world.submit("a", 2)
+    assert world.serving("a")
 
 
 def test_a_client_hangs_up_at_a_malformed_message(world: World) -> None:
     """It ends its session with the reason, and comes back."""
-    world.take()
     client = world.clients["a"]
     client.receive([b"\xc1"])
     assert "a message of the server is malformed" in client.ended[0]
     world.settle()
-    assert world.submit("a", 1)
-    assert "it left: a message of the server is malformed" in only(world.take()).info["client_lost"]
+    assert "it left: a message of the server is malformed" in world.seen[0].lost[0][0]
     world.join_all()
     assert world.serving("a")
 
@@ -439,11 +289,10 @@ def test_info_that_cannot_be_sent_is_named_once(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The result arrives without it, each time."""
-    world.take()
     client = world.clients["a"]
     with caplog.at_level(logging.WARNING):
-        for number in (1, 2):
-            world.submit("a", number)
+        for _ in range(2):
+            world.reset("a")
             world.to_client(client)
             assert client.todo is not None
             ret = client.ret()
@@ -462,9 +311,8 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Without that key. Otherwise the server would refuse the result and request it forever."""
-    world.take()
     client = world.clients["a"]
-    world.submit("a", 1)
+    world.reset("a")
     world.to_client(client)
     assert client.todo is not None
     number, client.todo = client.todo.number, None
@@ -482,29 +330,41 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
 
 def test_extras_are_sent_to_a_client_that_reads_them() -> None:
     """Columns of the policy reach the env; those that can't be sent are dropped."""
-    server = ServerSessions("srv")
+    seen = Recorder()
+    place = ClientPlace("srv/0", seen)
+    server = ServerSessions("srv", [place])
     session = ClientSession(meta(), "a", reads_extras=True, free_actions=True)
     session.connected()
     server.receive(b"r", session.outbox.popleft())
     session.receive(server.outbox.popleft().parts)
-    session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
+    server.reset(place, None, None)
+    event: Any = session.receive(server.outbox.popleft().parts)
+    session.answer(event.number, ResultFields(np.zeros(3), 0.0, False, False), {}, {}, 0, 0)
     server.receive(b"r", session.outbox.popleft())
     chunk = {"chunk": np.ones((4, 2)), "mode": "fast"}
-    server.step("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
+    server.step(place, chunk, {"log_prob": -0.5, "net": object()})
     event = session.receive(server.outbox.popleft().parts)
     assert np.array_equal(event.action["chunk"], chunk["chunk"])
     assert event.action["mode"] == "fast"
     assert event.extras == {"log_prob": -0.5}
 
 
-@pytest.mark.parametrize("stray", [Welcome(env_id="x"), Refusal(text="no", retry=False)])
-def test_a_second_answer_to_a_hello_ends_the_session(world: World, stray: Any) -> None:
-    """So does a second hello."""
+@pytest.mark.parametrize(
+    "stray",
+    [
+        Welcome(env_id="x", heartbeat=5.0),
+        Refusal(text="no", retry=False),
+        Step(number=1),
+    ],
+)
+def test_a_client_ends_a_session_whose_server_breaks_the_rules(world: World, stray: Any) -> None:
     client = world.clients["a"]
     client.receive(Writer().write(stray))
     assert client.ended
-    other = world.clients["b"]
-    other.session.connected()
-    other.flush()
-    world.settle()
-    assert other.refused or other.ended
+
+
+def test_a_request_before_the_welcome_is_refused() -> None:
+    session = ClientSession(meta(), "a")
+    session.connected()
+    event: Any = session.receive(Writer().write(Reset(number=1)))
+    assert "a request without a session" in event.text

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 def test_clients_have_tracks_by_their_names(tmp_path: Path) -> None:
-    """With their requests; a free slot has no track."""
-    kwargs = {"min_clients": 2, "connect_timeout": HANG, "heartbeat": 5.0}
+    """With their requests."""
+    kwargs = {"clients": ["left", "right"], "connect_timeout": HANG}
     entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
     with sync.build_env_group(entry) as group:
         address = group["robots-0"].address
@@ -31,8 +31,8 @@ def test_clients_have_tracks_by_their_names(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
     seen = Seen(tmp_path / "run.json")
-    tracks = [track for process, track in seen.tracks if process == "env_server robots-0"]
+    tracks = [track for process, track in seen.tracks if process.startswith("place robots-0/")]
     assert sorted(tracks) == ["robots-0/left", "robots-0/right"]
     for track in tracks:
         names = [one.name for one in seen.of(track)]
-        assert names == ["join", *["step"] * 5]
+        assert names == ["reset", *["step"] * 5]

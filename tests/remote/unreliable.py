@@ -20,11 +20,13 @@ from rlightning_aio.protocol.net.client_session import (
     Refused,
     ResetRequest,
     StepRequest,
+    Welcomed,
 )
-from rlightning_aio.protocol.net.server_session import ServerSessions
+from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
 from rlightning_aio.types import EnvMeta, EnvRet
 
 if TYPE_CHECKING:
+    from rlightning_aio.protocol.net.announcements import Announcement
     from rlightning_aio.protocol.net.server_session import RemoteResult
 
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -107,7 +109,7 @@ class Client:
             else:
                 self.refused.append(event.text)
             self.hang_up()
-        elif event is not None:
+        elif event is not None and not isinstance(event, Welcomed):
             self.todo = event
 
     def leave(self) -> None:
@@ -126,7 +128,7 @@ class Client:
         key = (self.route, request.number)
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
-        if self.raises and request.number:
+        if self.raises:
             self.session.fail(request.number, ErrorText("Oops", "no", "trace"))
         else:
             self.steps = 0 if isinstance(request, ResetRequest) else self.steps + 1
@@ -140,26 +142,63 @@ class Client:
         return EnvRet(env_id="env", observation=self.observation(), last_reward=float(self.steps))
 
 
-class World:
-    """One server and its clients; messages wait until they are delivered or lost."""
+class Recorder:
+    """What happens at a place.
 
-    def __init__(self, names: str = "ab", **server: Any) -> None:
-        self.now = 0.0
-        self.server = ServerSessions("srv", **server)
+    Attributes:
+        taken: the clients that have taken it; lost: why they were lost, and if in order.
+        answers: that the next test has not taken yet.
+        since: when the request was sent that waits for a client.
+    """
+
+    def __init__(self) -> None:
+        self.taken: list[str] = []
+        self.lost: list[tuple[str, bool]] = []
+        self.answers: list[RemoteResult | ErrorText] = []
+        self.since: float | None = None
+
+    def on_taken(self, client: str, announced: Announcement) -> None:
+        del announced
+        self.taken.append(client)
+
+    def on_answer(self, answer: RemoteResult | ErrorText) -> None:
+        self.answers.append(answer)
+
+    def on_lost(self, cause: str, *, in_order: bool) -> None:
+        self.lost.append((cause, in_order))
+
+    def waits_since(self) -> float | None:
+        return self.since
+
+
+class World:
+    """One server and its clients; messages wait until they are delivered or lost.
+
+    Args:
+        names: of the clients.
+        places: how many, or the names of their clients.
+        server: further arguments of the server.
+    """
+
+    def __init__(self, names: str = "ab", places: int | str = 2, **server: Any) -> None:
+        listed = [""] * places if isinstance(places, int) else list(places)
+        self.seen = [Recorder() for _ in listed]
+        self.places = [
+            ClientPlace(f"srv/{name or k}", self.seen[k], name) for k, name in enumerate(listed)
+        ]
+        self.server = ServerSessions("srv", self.places, **server)
         self.clients = {name: Client(name, k + 1) for k, name in enumerate(names)}
-        self.results: list[RemoteResult] = []
         self.delivered: dict[tuple[str, bool], list[list[bytes]]] = {}
 
     def flush(self) -> None:
         """Put the messages of the server onto the network."""
         while self.server.outbox:
             route, parts = self.server.outbox.popleft()
-            client = self.clients[route.decode().partition(":")[0]]
-            if client.route == route:
+            client = self.clients.get(route.decode().partition(":")[0])
+            if client is not None and client.route == route:
                 client.inbox.append(parts)
             else:
                 self.server.disconnected(route)
-        self.results += self.server.take()
 
     def to_server(self, client: Client) -> None:
         route, parts = client.outbox.pop(0)
@@ -174,11 +213,6 @@ class World:
         parts = client.inbox.pop(0)
         self.delivered.setdefault((client.name, False), []).append(parts)
         client.receive(parts)
-
-    def pass_time(self, seconds: float) -> None:
-        self.now += seconds
-        self.server.tick(self.now)
-        self.flush()
 
     def settle(self) -> None:
         """Deliver everything in order, and let clients work, until nothing moves."""
@@ -201,20 +235,30 @@ class World:
             client.connect()
         self.settle()
 
-    def submit(self, name: str, number: int) -> bool:
-        answered = self.server.step(name, number, ACTION.sample(), EXTRAS, self.now)
-        self.flush()
-        return answered
+    def place_of(self, name: str) -> ClientPlace | None:
+        """The place that a client has."""
+        for place in self.places:
+            if place.session is not None and place.session.name == name:
+                return place
+        return None
 
-    def submit_reset(self, name: str, number: int, **options: Any) -> bool:
-        answered = self.server.reset(
-            name, number, options.get("seed"), options.get("options"), self.now
-        )
+    def reset(self, name: str, seed: int | None = None, options: Any = None) -> None:
+        place = self.place_of(name)
+        assert place is not None
+        self.server.reset(place, seed, options)
         self.flush()
-        return answered
 
-    def take(self) -> list[RemoteResult]:
-        taken, self.results = self.results, []
+    def step(self, name: str) -> None:
+        place = self.place_of(name)
+        assert place is not None
+        self.server.step(place, ACTION.sample(), EXTRAS)
+        self.flush()
+
+    def take(self) -> list[Any]:
+        """The answers since the last call, by place."""
+        taken = [answer for one in self.seen for answer in one.answers]
+        for one in self.seen:
+            one.answers.clear()
         return taken
 
     def serving(self, name: str) -> bool:

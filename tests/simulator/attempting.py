@@ -342,9 +342,7 @@ class Attempts(InContext):
     def _script(self, played: Played, steps: int | None = None) -> Script:
         """The script of an env, where some steps of an attempt lead to."""
         env, spec = self.by_id[played.episode.env_id], played.episode.spec
-        code = words_of(env.entry.layout, played.episode.first).code
-        require(env.client is None or env.client.is_code(code), "another client", code)
-        script = Script(env.codes[0] if env.client is None else code, env.entry.own_limit)
+        script = Script(env.codes[0], env.entry.own_limit)
         script.reset(spec.seed, None if spec.options is None else {**spec.options})
         for act in played.acts[:steps]:
             script.step(*act)

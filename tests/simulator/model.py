@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -116,8 +116,7 @@ class Request:
     """What an env was asked, and by whom.
 
     Attributes:
-        kind: ``step``, ``reset``, ``restore`` (a reset to a saved state), ``call``, or ``join``: of
-            a client that was not asked.
+        kind: ``step``, ``reset``, ``restore`` (a reset to a saved state), or ``call``.
         saved: the state to which it is restored: one of these.
         acts: of a step, one for each sub-environment.
         due: `auto_reset` resets the env in place of its step.
@@ -126,7 +125,6 @@ class Request:
         interrupted: Ctrl-C may have ended it, in an env of this process.
         deaths: of the host, before it was sent.
         before: whether the env was in limbo before it was sent.
-        seeds: of which one is its seed: that of a client depends on who else is there.
     """
 
     kind: str
@@ -140,16 +138,11 @@ class Request:
     interrupted: bool = False
     deaths: int = 0
     before: bool = False
-    seeds: Sequence[int] = ()
     saved: Sequence[State] = ()
 
     @property
     def resets(self) -> bool:
         return self.kind == "reset" or self.due
-
-    def alternatives(self) -> list[Request]:
-        """The same with each seed that it may have."""
-        return [replace(self, seed=seed, seeds=()) for seed in self.seeds] or [self]
 
 
 class Expected(NamedTuple):
@@ -323,17 +316,7 @@ class Env:
 
     @property
     def idle(self) -> bool:
-        return self.request is None and not self.gone and self.is_known
-
-    @property
-    def is_known(self) -> bool:
-        """The trainer knows its id."""
-        return self.client is None or self.client.is_known
-
-    @property
-    def shared_id(self) -> str:
-        """Its id in batches: that of its server if it has one."""
-        return self.env_id.partition("/")[0]
+        return self.request is None and not self.gone
 
     @property
     def may_be_lost(self) -> bool:
@@ -351,13 +334,16 @@ class Env:
 
     @property
     def was_reset(self) -> bool:
-        return self.state.scripts.subs[0].episode > 0
+        is_shown = self.client is None or self.client.is_shown
+        return is_shown and self.state.scripts.subs[0].episode > 0
 
     def fresh(self) -> State:
         return State(self.codes, self.entry)
 
     def after_loss(self) -> list[State]:
         """The states in which a replacement may be."""
+        if self.client is not None:
+            return [state.copy() for state in self.client.befores]
         states = [state.copy() for state in (*self.loose, *self.torn)] + [self.fresh()]
         # Its mark may have been set since then.
         marks = {one.scripts.subs[0].mark for one in (self.state, *self.loose)}
@@ -366,6 +352,8 @@ class Env:
     def adopt(self, state: State, *others: State) -> None:
         """Note the state that it has shown, and others that show the same but for their mark."""
         mark = state.scripts.subs[0].mark
+        if self.client is not None:
+            self.client.befores.clear()
         self.state, self.dirty, self.torn = state, False, []
         self.loose = [other for other in others if other.scripts.subs[0].mark != mark]
 
@@ -439,16 +427,10 @@ class Model:
 
     def send(self, env: Env, request: Request) -> None:
         """Note a request that was accepted."""
-        if env.client is not None and env.request is not None and env.request.kind == "join":
-            env.request = None
-            self.counts["asked as they were back"] += 1
-        is_idle = env.idle or not (env.is_known or env.request)
-        require(is_idle, "a busy env was asked again", env.env_id)
+        require(env.idle, "a busy env was asked again", env.env_id)
         request.before, request.deaths = env.limbo, env.deaths
         context = self.context
         if env.client is not None:
-            if request.kind == "reset" or context is not None:
-                env.client.asked.append(("reset", 0))
             env.client.asked.extend(request.acts)
         if request.kind == "step" and context is not None:
             request.due = env.state.cut or (context.on_done and env.state.ended)
@@ -479,9 +461,8 @@ class Model:
 
     def abort(self, env: Env) -> None:
         """Note that nobody gets what a request leads to: it may have been done, or its env lost."""
-        if env.client is not None:
-            env.client.note_aborted()
-            return
+        if env.client is not None:  # It may be sent away for that.
+            env.client.note_trouble()
         before = [env.state.copy(), env.fresh(), *env.after_loss()]
         # Without a request it was a call that was given up before.
         done = [] if env.request is None else [env.request, Request("reset")]
@@ -504,8 +485,6 @@ class Model:
             env = self.envs.get(row.env_id)
             require(env is not None, "a result of a stranger", row)
             assert env is not None
-            if env.client is not None and env.request is None:
-                env.client.note_pending(is_pending=True)
             request = env.request
             require(request is not None, "a result that nobody asked for", row)
             assert request is not None
@@ -528,8 +507,10 @@ class Model:
         _check_sent(env, request, row)
         if env.client is not None:
             require(restarted[0] == ("client_lost" in row.info), "marked, or not", row)
-            env.client.judge(self, request, row)
-            return
+            require(request.kind != "reset" or "client" in row.info, "of no client", row)
+            own = {name: value for name, value in row.info.items() if name != "client"}
+            row = row._replace(info=own)
+            env.client.is_shown = True
         if request.kind == "restore":
             require(not restarted[0], "a restore is marked")
             self._judge_restored(env, request, row)
@@ -651,12 +632,15 @@ class Model:
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
             is_replaced = env.entry.on_death != "raise" or env.host.aborted
             require(is_replaced, "marked, where a death is to be raised")
-        self.judge_heads(row)
+        cause = "worker_restarted" if env.client is None else "client_lost"
+        self.judge_heads(row, cause)
         self._judge_blame(env, row.info.get("env_at_fault"))
         again = [Request("reset")]
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
+        if env.client is not None and request.kind == "reset":  # Whoever comes gets all of it.
+            again.append(Request("reset", seed=request.seed, options=request.options))
         raised = self._may_be_rebuilt(env, request)  # Before that.
         env.errors = env.errors[0], self._most_errors(env)
         found = [
@@ -672,7 +656,7 @@ class Model:
         env.put_away = False
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
-        self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
+        self.counts["hung"] += row.info[cause].startswith("hung")
 
     def _judge_blame(self, env: Env, at_fault: str | None) -> None:
         """Check who is said to have ended the worker of an env."""
@@ -724,11 +708,10 @@ class Model:
             else:
                 env.seen = max(env.seen + 1, request.deaths)
             return
-        if env.client is not None:
-            if isinstance(fault, EnvAway):
-                env.client.note_away(request)
-                return
-            env.client.note_raised(request)
+        if env.client is not None and isinstance(fault, EnvAway):
+            require(env.may_be_lost or not env.client.is_shown, "away, and it was there", request)
+            self.counts["clients away"] += 1
+            return
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
         if request.kind == "restore":
@@ -928,8 +911,7 @@ def _check_sent(env: Env, request: Request, row: Row) -> None:
 def rows_of(batch: BatchedData, envs: dict[str, Env], flags: Sequence[bool] | None) -> list[Row]:
     """The results of a batch, one by one."""
     env_ids = batch.env_ids()
-    shared = [env_id.partition("/")[0] for env_id in env_ids]
-    require(batch.ids() == shared and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
+    require(batch.ids() == env_ids and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
     require(flags is None or len(flags) == len(env_ids), "as many flags as results", flags)
     names = {envs[env_id].entry.name for env_id in env_ids if env_id in envs}
     parts = [batch] if len(names) == 1 else list(batch.by_entry().values())

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import zmq
 from simulator.processes import Killed, Process
 
-from rlightning_aio.protocol.net.wire import ping_ms
+from rlightning_aio.protocol.net.wire import DEFAULT_HEARTBEAT, ping_ms
 from rlightning_aio.remote import client as client_module
 from rlightning_aio.remote.client import RemoteEnvClient
 
@@ -169,7 +169,7 @@ class _Listener:
         self.connections: dict[bytes, _Connection] = {}
         self._network = network
         self._sessions = sessions
-        self.silence = sum(ping_ms(settings.heartbeat)) / 1000
+        self.silence = sum(ping_ms(settings.heartbeat or DEFAULT_HEARTBEAT)[:2]) / 1000
         self._port = settings.port
         self._descriptor = -1
         self._has_more = False
@@ -207,15 +207,12 @@ class _Listener:
     def is_hung_up(self) -> bool:
         return False
 
-    def deadline(self) -> float | None:
-        return self._sessions.deadline()
-
     def lose(self, route: bytes) -> None:
         """Find out that a connection is gone."""
         if self.connections.pop(route, None) is not None:
             self.incoming.append((route, None))
 
-    def pump(self, now: float) -> None:
+    def pump(self) -> None:
         self._has_more = False
         while self.incoming:
             route, parts = self.incoming.popleft()
@@ -223,12 +220,10 @@ class _Listener:
                 self._sessions.disconnected(route)
             else:
                 self._sessions.receive(route, parts)
-        self._sessions.tick(now)
         self._send()
 
     def flush(self) -> None:
         self._send()
-        self._has_more = self._sessions.has_results
 
     def _send(self) -> None:
         outbox = self._sessions.outbox
@@ -238,6 +233,7 @@ class _Listener:
                 self.connections[route].send([bytes(part) for part in parts], to_server=False)
             else:
                 self._sessions.disconnected(route)
+                self._has_more = True
 
 
 class _Frame:

@@ -36,6 +36,7 @@ from simulator.world import Faults
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import (
     BadAction,
+    EnvAway,
     EnvBusy,
     EnvFault,
     EpisodeLost,
@@ -78,7 +79,7 @@ class Play(Session):
         calm = calm and not {"snapshots", "die"} <= self.features  # States that are put back kill.
         starts_fail = faults != Faults()
         self.model = Model(self.envs, self.counts, starts_fail=starts_fail, calm=calm)
-        ids = list(dict.fromkeys(env.shared_id for env in self.envs))
+        ids = [env.env_id for env in self.envs]
         require(ids == self.group.env_ids, "ids", self.group.env_ids)
         rng = Random(self.program.seed)
         for client in self.clients:
@@ -121,10 +122,6 @@ class Play(Session):
         """Raise what tasks have raised, and forget those that have ended."""
         if wait and self.tasks:
             _, late = await asyncio.wait(self.tasks, timeout=self.hang)
-            if late and self.clients and not self.group.pending:
-                for task in late:  # A collect whose result another call took waits for clients.
-                    task.cancel()
-                _, late = await asyncio.wait(late, timeout=self.hang)
             require(not late, "a call hangs", late)
         for task in [task for task in self.tasks if task.done()]:
             self.tasks.remove(task)
@@ -137,16 +134,8 @@ class Play(Session):
         # env whose worker has died takes no further part in a restore.
         nested = {env.env_id for env in owed if env.env_id in self.nested or self.is_lost(env)}
         found = set(self.group.pending) - nested
-        self.note_clients()
         pending = {env.env_id for env in self.model.pending()} - nested
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
-
-    def note_clients(self) -> None:
-        """Note which clients have joined, and which requests were withdrawn from absent ones."""
-        if self.clients:
-            pending = self.group.pending
-            for client in self.clients:
-                client.note_pending(is_pending=client.env.env_id in pending)
 
     def is_lost(self, env: Env) -> bool:
         """A call waits for it that its worker may have been lost in."""
@@ -155,18 +144,19 @@ class Play(Session):
     async def finish(self) -> None:
         await self.look_at_tasks(wait=True)
         for client in self.clients:
+            client.revive(self.address)
+        for client in self.clients:
             await self.interruptible(self.lose(client))
         while self.model.pending(COLLECTOR):
             await self.interruptible(self.collect(deadline=self.hang))
         if self.context is not None:
             self.leave()
-        for client in self.clients:
-            while not await self.interruptible(self.expect(client)):
-                pass
         for env in self.model.envs.values():
             # Errors of the env, or of a call that was given up, may come first; and each call may
             # send no more of the order to start than a narrow channel takes.
             for k in range(30):
+                if env.client is not None:
+                    env.client.revive(self.address)
                 if env.gone or await self.interruptible(self.use(env)):
                     break
                 # It may still be starting.
@@ -182,9 +172,9 @@ class Play(Session):
         return await self.reset([env]) and await self.step_on([env])
 
     async def lose(self, client: Client) -> None:
-        """A client that is killed as it owes a result is found soon."""
+        """A client that is killed as it owes a result is found soon, and the next one answers."""
         env, heartbeat = client.env, self.plan(client.env).heartbeat
-        if not client.is_alive or client.may_be_lost or not (env.idle and env in self.ready()):
+        if env.may_be_lost or not (env.idle and env in self.ready()):
             return
         batch, requests = self.response(Random(0), [env], plain=True)
         if [*requests] != [env.env_id]:
@@ -192,25 +182,13 @@ class Play(Session):
         self.send_async(requests, lambda: self.group.step_async(batch))
         assert client.process is not None
         client.process.end(-9)
+        client.start(self.address)
         began = self.world.now_ns
         while client.env.request is not None:
             await self.collect(deadline=self.hang)
         took = (self.world.now_ns - began) / 1e9
         require(took <= 1.5 * heartbeat + 30.0, "a dead client is found late", client.name, took)
         self.counts["clients found dead"] += 1
-
-    async def expect(self, client: Client) -> bool:
-        """Have a client be there, and what it still owes collected; True."""
-        for _ in range(30):
-            if (client.hangs or client.is_leaving) and client.process is not None:
-                client.process.end(-9)
-            if not client.is_alive:
-                client.start(self.address)
-            if client.env.idle and await self.reset([client.env]) and not client.is_out:
-                return True
-            await self.collect(deadline=30.0)
-            self.check_pending()
-        raise Violation(f"client {client.name} does not come")
 
     # -- comparing
 
@@ -231,23 +209,17 @@ class Play(Session):
             found = await self.done(call())
         except EnvFault as fault:
             self.note_faults(fault)
+            if isinstance(fault, EnvAway) and {*ids_of(fault)} != {*requests} and not fault.results:
+                self.counts["too few clients"] += 1  # Of a reset of everyone: nothing was sent.
+                self.withdraw(requests)
+                return False
             if next(iter(requests.values())).kind == "call":
                 self.fail_values(fault, requests)
             else:
-                if next(iter(requests.values())).kind == "reset":
-                    results = [] if fault.results is None else fault.results.env_ids()
-                    named = [env_id for one in (fault, *fault.others) for env_id in ids_of(one)]
-                    there = self.there(requests, [*results, *named])
-                    requests = {env_id: requests[env_id] for env_id in there}
                 self.fail(fault, requests, owner)
             return False
         except EnvBusy:
             self.refuse_busy(requests)
-            return False
-        except TimeoutError as error:  # Of a reset of everyone.
-            require(all(client.may_be_lost for client in self.clients), "too few", repr(error))
-            self.counts["too few clients"] += 1
-            self.withdraw(requests)
             return False
         except asyncio.CancelledError:
             if self.clients:  # It may have waited for clients.
@@ -269,21 +241,16 @@ class Play(Session):
         """Find out what of an interrupted call was sent; its results wait for a collect."""
         pending = self.group.pending
         for env_id, request in requests.items():
-            client = self.model.envs[env_id].client
             if env_id not in pending and request.kind != "call":
                 self.model.withdraw(self.model.envs[env_id])
-            elif client is not None and client.may_be_back:
-                request.sent = None  # It may be pending with its first result alone.
         self.model.orphan(owner)
 
     def withdraw(self, requests: dict[str, Request]) -> None:
         """Note that none of these requests was sent."""
         pending = self.group.pending
         for env_id in requests:
-            env = self.model.envs[env_id]
-            is_back = env.client is not None and env.client.may_be_back  # Without a request.
-            require(env_id not in pending or is_back, "refused, and sent nevertheless", env_id)
-            self.model.withdraw(env)
+            require(env_id not in pending, "refused, and sent nevertheless", env_id)
+            self.model.withdraw(self.model.envs[env_id])
 
     def refuse_busy(self, requests: dict[str, Request]) -> None:
         """A call that was given up may still run in an env."""
@@ -291,7 +258,6 @@ class Play(Session):
             request.before and self.model.envs[env_id].host.mortal  # Others end it by themselves.
             for env_id, request in requests.items()
         )
-        limbo = limbo or any(client.may_be_back for client in self.clients)
         require(limbo, "busy, and nothing was asked", *requests)
         self.withdraw(requests)
 
@@ -369,9 +335,8 @@ class Play(Session):
     # -- drawing
 
     def ready(self) -> list[Env]:
-        """Envs that can be stepped; the first results of clients that are back answer that."""
-        back = [env for env in self.model.envs.values() if is_back(env)]
-        return [env for env in self.model.idle() if env.was_reset and not env.dirty] + back
+        """Envs that can be stepped."""
+        return [env for env in self.model.idle() if env.was_reset and not env.dirty]
 
     def local(self, envs: list[Env]) -> list[Env]:
         """Those that no client lends."""
@@ -408,7 +373,7 @@ class Play(Session):
             return batch.respond(**self.written), requests
         self.written = {}
         values = [PolicyResponse(env.env_id, **own) for env, own in zip(envs, sent, strict=True)]
-        return BatchedData([env.shared_id for env in envs], values), requests
+        return BatchedData([env.env_id for env in envs], values), requests
 
     def answerable(self, rng: Random, envs: list[Env]) -> BatchedData | None:
         """A batch of results, or a part of one, that has only such envs."""
@@ -515,10 +480,7 @@ class Play(Session):
             with self.expected(RLightningError, "a second collect"):
                 await self.done(self.group.collect_async(**rules))
             return
-        self.note_clients()
         self.collecting, nothing = True, not self.collectable()
-        if nothing and self.clients:  # It waits for one to join.
-            rules["deadline"] = min(rules.get("deadline", 30.0), 30.0)
         try:
             batch, flags = await self.done(self.group.collect_async(**rules))
         except TimeoutError as error:
@@ -538,7 +500,6 @@ class Play(Session):
         except NothingPending as error:
             self.count(error)
             require(nothing or not self.collectable(), "nothing pending, and something is")
-            require(not self.clients, "nothing pending, and clients may join")
             return
         finally:
             self.collecting = False
@@ -557,15 +518,14 @@ class Play(Session):
     def check_count(self, batch: BatchedData, rules: dict[str, Any]) -> None:
         """As many results as the rules say."""
         there = {env.env_id for env in self.collectable()}
-        for env_id in {*batch.env_ids()} - there:
-            require(self.model.envs[env_id].client, "a result that nobody asked for", env_id)
+        require({*batch.env_ids()} <= there, "a result that nobody asked for", batch.env_ids())
         most = min(rules.get("max_results") or len(there), len(there))
         need = most if rules.get("wait_all") else min(rules.get("min_results", 1), most)
         most = len(there.union(batch.env_ids()))
         most = min(rules.get("max_results") or most, most)
         require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
-        order = [env_id for env_id, env in self.model.envs.items() if env.client is None]
-        places = [order.index(env_id) for env_id in batch.env_ids() if env_id in order]
+        order = list(self.model.envs)
+        places = [order.index(env_id) for env_id in batch.env_ids()]
         require(places == sorted(places), "not in the group's order", places)
 
     async def op_reset(self, rng: Random) -> None:
@@ -601,37 +561,22 @@ class Play(Session):
         in_order = [env.env_id for env in envs] == [
             env_id for env_id in self.model.envs if env_id in {env.env_id for env in envs}
         ]
-        everyone = in_order and rng is not None and all(map(is_unasked, others))
-        if rng is not None and self.clients:
-            everyone = everyone and "tasks" not in self.features and rng.random() < 0.7
-        if everyone:  # Also clients that may have joined.
-            envs = list(self.model.envs.values())
-            for env in others:
-                env.request = None
+        everyone = in_order and rng is not None and not others
         seed, options, requests = self.resets(envs, rng)
-        if rng is not None and not self.clients:
+        if rng is not None:
             everyone = drops or (everyone and rng.random() < 0.7)
+        if self.clients and "tasks" in self.features:  # It may wait for one, with nothing sent.
+            everyone = False
         ids = None if everyone else [*requests]
 
         def take(found: Any) -> None:
             batch, flags = found
             require(flags == [False] * len(batch), "flags", flags)
             owner = self.owner_of(requests)
-            there = self.there(requests, batch.env_ids()) if everyone else requests
-            require(sorted(batch.env_ids()) == sorted(there), "other envs", batch.env_ids())
-            local = [env_id for env_id in batch.env_ids() if self.model.envs[env_id].client is None]
-            require(local == [i for i in there if i in local], "another order", batch.env_ids())
+            require(batch.env_ids() == [*requests], "others, or another order", batch.env_ids())
             self.take(batch, flags, owner)
 
         return await self.answer(requests, lambda: self.group.reset(seed, options, ids), take)
-
-    def there(self, requests: dict[str, Request], found: Iterable[str]) -> list[str]:
-        """Those that were asked: all, but for clients that were not there."""
-        envs = [self.model.envs[env_id] for env_id in {*requests} - {*found}]
-        for env in envs:
-            if env.client is not None and env.client.may_be_lost:
-                self.model.withdraw(env)
-        return [env_id for env_id in requests if self.model.envs[env_id].request is not None]
 
     def resets(
         self, envs: list[Env], rng: Random | None
@@ -646,15 +591,10 @@ class Play(Session):
             if "raise" in self.features and rng.random() < 0.3:
                 options["effect"] = rng.choice(["raise", "raise oddly"])
         seed: Any = None
-        is_known = all(env.client is None for env in envs) or len(envs) < len(self.model.envs)
-        kind = rng.choice(["none", "int", *["list", "mapping"] * is_known])
+        kind = rng.choice(["none", "int", "list", "mapping"])
         if kind == "int":
             seed = rng.randrange(1000)
             seeds = [seed + env.first for env in envs]
-            first = sum(len(env.codes) for env in self.local(self.envs))
-            for env in envs:
-                if env.client is not None:
-                    requests[env.env_id].seeds = [seed + first + k for k in range(3)]
         elif kind == "list":
             seed = seeds = [rng.randrange(1000) for _ in envs]
         elif kind == "mapping":
@@ -684,7 +624,7 @@ class Play(Session):
         ]
         lacks = bool(lacking)
         own = [None] * (1 if lacks else 6)
-        if lacks and not any(env.is_known for env in lacking):  # One may join at any moment.
+        if lacks and any(env.client is not None for env in lacking):  # It may be empty.
             own = []
         limit = rng.choice([math.inf, 1, 2, 3, 5, *own])
         on_done = rng.random() < 0.7
@@ -905,7 +845,7 @@ class Play(Session):
             env = rng.choice(envs)
             await self.mark(env, rng.choice(self.marks(env)))
         if "die" in self.features and rng.random() < 0.3:
-            env = self.kill_soon(rng, self.ready())
+            env = self.kill_soon(rng, self.local(self.ready()))
             await self.notice(rng, env)
 
     async def notice(self, rng: Random, env: Env | None) -> None:
@@ -1188,17 +1128,6 @@ class Play(Session):
             self.tracing.stop()
             self.trace.cleanup()
             self.trace = None
-
-
-def is_back(env: Env) -> bool:
-    """A client that the trainer knows is back, and its first result was not collected."""
-    return env.was_reset and env.request is not None and env.request.kind == "join"
-
-
-def is_unasked(env: Env) -> bool:
-    """A client that has joined, or may have."""
-    has_come = env.request is not None and env.request.kind == "join"
-    return has_come or not env.is_known
 
 
 def ids_of(fault: EnvFault) -> Sequence[str]:

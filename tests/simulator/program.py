@@ -129,7 +129,11 @@ class Plan:
         found = {
             "name": self.name, "backend": "env_server", "max_episode_steps": self.limit,
             "step_timeout": self.timeout, "reset_timeout": self.timeout,
-            "env_kwargs": {"heartbeat": self.heartbeat, "connect_timeout": 900.0},
+            "max_restarts": 1_000_000,
+            "env_kwargs": {
+                "heartbeat": self.heartbeat, "connect_timeout": 900.0,
+                "clients": [f"c{k}" for k in range(self.num_workers)],
+            },
         }  # fmt: skip
         return {name: value for name, value in found.items() if value is not None}
 
@@ -188,7 +192,8 @@ class Program:
                 env_id, codes = f"{plan.name}-{worker}", plan.codes(number, worker)
                 if plan.placement == "client":
                     assert world is not None
-                    envs.append(Client(world, worker, entry).env)
+                    envs.append(Client(world, worker, entry, codes, first).env)
+                    first += plan.num_envs
                     continue
                 # On an event loop each is replaced alone.
                 host = Host(mortal=True) if plan.placement == "loop" else host_of[env_id]

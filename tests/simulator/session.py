@@ -86,7 +86,7 @@ class Session:
             self.envs = self.program.envs(self.group.get_workers(), self.world)
             self.clients = [env.client for env in self.envs if env.client is not None]
             if self.clients:
-                self.address = self.group[self.clients[0].env.shared_id].address
+                self.address = self.group[self.clients[0].env.env_id.partition("/")[0]].address
             self.begin()
             for number, op in enumerate(self.program.ops):
                 await self.play(number, op)
@@ -272,7 +272,7 @@ class Session:
 
     def is_killable(self, env: Env) -> bool:
         """The env is in another process."""
-        return env.host.mortal and self.plan(env).placement != "loop"
+        return env.host.mortal and self.plan(env).placement not in ("loop", "client")
 
     def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
         """What the sub-environments of an env are to do, now and then all the same."""

@@ -67,7 +67,6 @@ class InContext(Session):
 
     def end(self) -> None:
         for client in self.clients:
-            client.done = [act for act in client.done if act[0] != "reset"]
             client.check_done()
 
     def enter(self) -> None:
@@ -338,7 +337,7 @@ class Training(InContext):
         """What was stored of an env; each process of a client has another code, and a trail."""
         if (index, code) not in self.trails:
             before = max((other for place, other in self.trails if place == index), default=-1)
-            is_own = code in env.codes if env.client is None else env.client.is_code(code)
+            is_own = code in env.codes
             require(is_own and code > before, "a transition of another env", index, code)
             together = env.entry.mode != "disabled"
             limits = env.entry.own_limit, self.limit_of(env)

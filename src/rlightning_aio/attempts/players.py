@@ -20,7 +20,7 @@ class _Player(NamedTuple):
 
 
 class Players:
-    """The envs of an initialised group, and clients that are connected.
+    """The envs of an initialised group, and the places that have a client.
 
     Attributes:
         entry_of: the name of the config entry of each env.
@@ -37,13 +37,12 @@ class Players:
         self.refresh()
 
     def refresh(self) -> set[str]:
-        """Look which envs are there now, clients included; return those that are."""
+        """Look which envs are there now; return those that are."""
         present: set[str] = set()
         for worker in self._group.get_workers():
-            if not worker["env_ids"]:  # A server, whose clients may come.
-                self._kinds.setdefault(_Player(worker["entry"]))
             for env_id in worker["env_ids"]:
-                present.add(env_id)
+                if worker["state"] != "empty":
+                    present.add(env_id)
                 if env_id in self._players:
                     continue
                 meta = self._metas.get(env_id)
@@ -103,7 +102,7 @@ class Players:
             return True
         left = {entry for env_id, entry in self.entry_of.items() if env_id not in self.gone}
         lost = {self.entry_of[env_id] for env_id in self.gone} - left
-        return lost.isdisjoint(entries)  # Of a server's entry, no client may be known yet.
+        return lost.isdisjoint(entries)
 
 
 def _can_play(player: _Player, task: str) -> bool:

@@ -14,7 +14,6 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.group.api.facade import asked
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
@@ -37,7 +36,7 @@ __all__ = ["play"]
 _BURST: Final = 16
 """Most attempts that begin in one turn of the event loop, so that it is free for others."""
 _LOOK_SECONDS: Final = 0.2
-"""Between looks for clients of env_servers that have come."""
+"""Between looks for clients that have dialled in."""
 _MOST_LACKING: Final = 1000
 """Most attempts that wait for entries without an env while tasks are read for the others."""
 _SURPLUS: Final = "enough other attempts at its task have ended"
@@ -64,7 +63,7 @@ async def play(
             rewards = attempts.rewards
 
     Args:
-        group: initialised, with nothing `pending` but first results of clients; of any placement.
+        group: initialised, with nothing `pending`; of any placement.
             Each env plays one attempt at a time, also one with sub-environments.
         tasks: `EpisodeSpec`, or tuples (task, seed) or (task, seed, options); an iterable or an
             async iterable, read only as envs become free.
@@ -86,7 +85,7 @@ async def play(
     """
     if size < 1:
         raise ValueError(f"size must be at least 1, not {size!r}")
-    if busy := asked(group):
+    if busy := group.pending:
         raise EnvBusy(f"{busy[0]!r} has a request whose result was not collected; collect it")
     engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
     running = asyncio.create_task(engine.run())

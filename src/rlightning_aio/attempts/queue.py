@@ -90,7 +90,8 @@ class AttemptQueue:
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
         self._rules, self._results = rules, results
         self.players = Players(group)
-        self.free = {id_: None for id_ in self.players.entry_of if id_ not in self.players.gone}
+        present = self.players.refresh()
+        self.free = {id_: None for id_ in self.players.entry_of if id_ in present}
         self.fault: WorkerDied | None = None
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.

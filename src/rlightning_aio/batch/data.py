@@ -125,7 +125,7 @@ class BatchedData:
         """
         if self._ids is None:
             origin = self._origin
-            self._ids = [] if origin is None else origin.names.batch_ids(origin.slots)
+            self._ids = [] if origin is None else origin.names.ids(origin.slots)
         return self._ids
 
     def env_ids(self) -> list[str]:

@@ -1,8 +1,4 @@
-"""`EnvNames`: ids and config entries of the envs of a group, for batches.
-
-Rule: it is immutable. When a client replaces another, the group gets a new one, and earlier batches
-keep theirs.
-"""
+"""`EnvNames`: ids and config entries of the envs of a group, for batches; they never change."""
 
 from __future__ import annotations
 
@@ -23,14 +19,12 @@ class EnvNames:
     """Names of envs, by slot.
 
     Attributes:
-        env_ids: id of each env; empty for a slot without a client.
-        shared_ids: ids in batches: a client has the id of its env_server.
+        env_ids: id of each env.
         entries: number of the config entry of each slot; entry_names: names of the entries.
         index_offset: position in the group of the first sub-environment of each slot.
     """
 
     env_ids: Sequence[str]
-    shared_ids: Sequence[str]
     entries: NDArray[np.intp]
     entry_names: Sequence[str]
     index_offset: NDArray[np.int64]
@@ -39,11 +33,6 @@ class EnvNames:
         """Ids of `slots`, in order."""
         chosen: list[int] = slots.tolist()
         return [self.env_ids[slot] for slot in chosen]
-
-    def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` in batches."""
-        chosen: list[int] = slots.tolist()
-        return [self.shared_ids[slot] for slot in chosen]
 
     def names(self, slots: NDArray[np.intp]) -> list[str]:
         """Config entries of `slots`, in order."""
@@ -55,13 +44,6 @@ class EnvNames:
         return replace(
             self,
             env_ids=self.ids(slots),
-            shared_ids=self.batch_ids(slots),
             entries=self.entries[slots],
             index_offset=self.index_offset[slots],
         )
-
-    def renamed(self, slot: int, env_id: str, index_offset: int) -> EnvNames:
-        """Copy, with another env in `slot`."""
-        env_ids, offsets = list(self.env_ids), self.index_offset.copy()
-        env_ids[slot], offsets[slot] = env_id, index_offset
-        return replace(self, env_ids=env_ids, index_offset=offsets)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import ConfigError, RLightningError
@@ -114,9 +113,8 @@ class Responder:
     def __init__(
         self, group: EnvGroup, policy: Policy | dict[str, Policy | None] | None, seed: int | None
     ) -> None:
-        self._known = {meta.env_id: meta.action_space for meta in group.metas}
-        handles = (group[env_id] for env_id in group.env_ids)
-        self._servers = [handle for handle in handles if isinstance(handle, ServerHandle)]
+        known = {meta.env_id: meta.action_space for meta in group.metas}
+        self._space_of = known.get
         self._group = group
         by_chance = RandomPolicy(self._space_of, seed)
         self._any: Policy | None = None
@@ -128,13 +126,6 @@ class Responder:
             self._any = by_chance if policy is None else policy
         self._separate = isinstance(policy, dict) or _differ(group.get_action_spaces())
         self._separate |= policy is not None and _differ(group.get_observation_spaces())
-
-    def _space_of(self, env_id: str) -> gym.Space[Any] | None:
-        """Return the action space of an env, or of a client that has joined since."""
-        if env_id not in self._known:
-            for server in self._servers:
-                self._known.update((meta.env_id, meta.action_space) for meta in server.metas)
-        return self._known.get(env_id)
 
     async def __call__(self, batch: BatchedData) -> list[BatchedData]:
         """Return batches of responses that together answer `batch`.

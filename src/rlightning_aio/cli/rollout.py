@@ -165,9 +165,9 @@ async def _collect(
     timeline = contextlib.nullcontext() if trace is None else group.trace(trace)
     async with group:
         with timeline:
-            for server in (group[env_id] for env_id in group.env_ids):
-                if isinstance(server, ServerHandle):
-                    progress.say(f"{server.env_id} listens at {server.address}")
+            for server_id in dict.fromkeys(one.partition("/")[0] for one in group.env_ids):
+                if isinstance(server := group[server_id], ServerHandle):
+                    progress.say(f"{server_id} listens at {server.address}")
             progress.begin("first reset")
             batch, _ = await group.reset(seed=done.seed)
             respond = Responder(group, policy, done.seed)

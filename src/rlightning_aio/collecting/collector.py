@@ -18,7 +18,6 @@ import numpy as np
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio._core.group.api.facade import (
-    asked,
     default_min_results,
     ensure_auto_reset,
     is_resettable,
@@ -207,7 +206,7 @@ class Collector(Generic[G, R]):
         if batch is not None:
             if seed is not None:
                 raise ValueError("restart: a seed is of a reset, and a batch is in place of one")
-            lacking = {meta.env_id for meta in self._group.metas if not _is_server(meta)}
+            lacking = {meta.env_id for meta in self._group.metas}
             lacking.difference_update(batch.env_ids())
             if lacking:
                 raise ValueError(
@@ -232,8 +231,8 @@ class Collector(Generic[G, R]):
 
         The rollout owns its arrays until the second call after it. Cancellation and errors lose
         nothing: the next call continues. An env whose error was raised takes part again from a
-        reset that you have sent by `reset_async`, or else this resets it; but robots and clients
-        are reset only by you. Other envs go on.
+        reset that you have sent by `reset_async`, or else this resets it; but what moves something
+        real is reset only by you. Other envs go on.
 
         Raises:
             ResetNeeded: an earlier call was interrupted by Ctrl-C; call `restart`.
@@ -242,7 +241,7 @@ class Collector(Generic[G, R]):
                 for each entry; or these envs can't fill a block.
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env whose worker is
                 not replaced takes part no more.
-            RLightningError: only robots or clients are left that have raised.
+            RLightningError: only envs that move something real are left that have raised.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """
         return run(self._collect(), self._group)
@@ -314,7 +313,7 @@ class Collector(Generic[G, R]):
             for env_id in self._failed:
                 if not is_resettable(self._group, env_id):
                     raise self._refusal(env_id, "restart() has the next collect reset all envs")
-            if asked(self._group):  # By a start that was cancelled, or before `restart`.
+            if self._group.pending:  # By a start that was cancelled, or before `restart`.
                 with suppress(EnvFault):
                     yield self._group.drain
             try:
@@ -366,24 +365,21 @@ class Collector(Generic[G, R]):
         group = self._group
         if not self._metas:
             self._metas = {meta.env_id: meta for meta in group.metas}
-        if env_id not in self._metas:
-            for server_id in [meta.env_id for meta in group.metas if _is_server(meta)]:
-                self._metas.update((meta.env_id, meta) for meta in group[server_id].metas)
         return self._metas.get(env_id)
 
     # -- after errors -----------------------------------------------------------------
 
     def _note(self, fault: EnvFault) -> None:
-        """Note envs whose error was raised; clients that are away come back by themselves."""
+        """Note envs whose error was raised."""
         for one in (fault, *fault.others):
-            if not isinstance(one, EnvAway):
-                self._failed.update(one.env_ids if isinstance(one, WorkerDied) else [one.env_id])
+            env_ids = one.env_ids if isinstance(one, WorkerDied | EnvAway) else ()
+            self._failed.update(env_ids or [one.env_id])
 
     def _rejoin(self) -> None:
         """Begin episodes of envs whose error was raised, except of those that are given up.
 
         Raises:
-            WorkerDied, EnvHung: all envs are given up, and no client can come.
+            WorkerDied, EnvHung: all envs are given up.
             RLightningError: only envs that may move something real are left, or a block needs one.
         """
         pending = self._group.pending
@@ -412,22 +408,17 @@ class Collector(Generic[G, R]):
 
     def _has_others(self) -> bool:
         """Return True if results are there or may come."""
-        has_results = bool(self._expecting or self._unanswered)
-        return has_results or any(map(_is_server, self._group.metas))
+        return bool(self._expecting or self._unanswered)
 
     # -- blocks -------------------------------------------------------------------
 
     def _lay_out(self) -> None:
         """Compute the number of steps of a block, once all envs have been reset."""
         for meta in self._group.metas:
-            if _is_server(meta) or (meta.num_envs > 1 and meta.autoreset != "same_step"):
-                why = (
-                    "has clients that come and go"
-                    if _is_server(meta)
-                    else "has sub-environments that are reset together, or each a step later"
-                )
+            if meta.num_envs > 1 and meta.autoreset != "same_step":
                 raise ValueError(
-                    f"no [T, N] block can be made with env {meta.env_id!r}, which {why}; collect "
+                    f"no [T, N] block can be made with env {meta.env_id!r}, which has "
+                    "sub-environments that are reset together, or each a step later; collect "
                     "chains of any length, with min_results instead of wait_all"
                 )
         kinds = self._kinds.values()
@@ -516,7 +507,3 @@ class Collector(Generic[G, R]):
             for name, kind in self._kinds.items()
         }
         return cast("R", found[""] if self._policies is None else found)
-
-
-def _is_server(meta: EnvMeta) -> bool:
-    return meta.observation_space is None

@@ -84,7 +84,7 @@ def evaluate(
     Envs are reset at their ends, and at the limits of an open `auto_reset`, or else at their own.
 
     Args:
-        group: with nothing `pending` and without env_servers.
+        group: with nothing `pending`.
         policy: called with a batch of results (`BatchedData`). It returns actions, or columns by
             name with ``action``, or what `BatchedData.respond` returns, or a list of such; with an
             asynchronous group, it may be awaitable. Or a model with the `predict` of
@@ -109,9 +109,9 @@ def evaluate(
 
     Raises:
         EnvBusy: an env has a request in flight, or a result that was not collected.
-        ValueError: a number is out of its range, the group has an env_server, an entry has no
-            policy, an episode is in the queue twice, no entry of the group or more than one can
-            play it, a queue has a `seed`, a queue or `video` is given for an env with
+        ValueError: a number is out of its range, the spaces of an env_server are not known yet, an
+            entry has no policy, an episode is in the queue twice, no entry of the group or more
+            than one can play it, a queue has a `seed`, a queue or `video` is given for an env with
             sub-environments, or an env to be filmed has not the ``render_mode`` ``rgb_array``.
         BadAction: the policy's actions don't fit; nothing was sent.
         WorkerDied, EnvHung: no env is left that could play an episode.
@@ -191,8 +191,8 @@ def _check(group: Any, min_results: int | None, episodes: int | None, *, films: 
     for meta in group.metas:
         if meta.action_space is None:
             raise ValueError(
-                f"{meta.env_id} is an env_server, whose clients come and go; evaluate a group "
-                "without env_servers"
+                f"no client has dialled in for {meta.env_id} yet, so its spaces are not known: "
+                "reset() the group before, which waits for clients"
             )
     if pending := group.pending:
         raise EnvBusy(

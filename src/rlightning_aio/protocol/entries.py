@@ -44,11 +44,9 @@ class Operation(IntEnum):
     RESET = 2
     CALL = 3
     """Calls a method; the reply is its value."""
-    JOIN = 4
-    """Not requested: the first result of a client."""
-    SNAPSHOT = 5
+    SNAPSHOT = 4
     """The reply is the state of the env."""
-    RESTORE = 6
+    RESTORE = 5
     """A reset to a saved state; the reply is the last result of that time."""
 
 

@@ -17,6 +17,7 @@ import signal
 import socket
 import time
 from math import ceil
+from pathlib import Path
 from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -40,16 +41,20 @@ from rlightning_aio.protocol.net.client_session import (
     Refused,
     ResetRequest,
     StepRequest,
+    Welcomed,
 )
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
 from rlightning_aio.protocol.net.texts import LOG
 from rlightning_aio.protocol.net.wire import (
+    DEFAULT_HEARTBEAT,
     HANDSHAKE_SECONDS,
+    HARDWARE_HEARTBEAT,
     MAX_FRAME_BYTES,
     MAX_NAME_LENGTH,
     ping_ms,
 )
+from rlightning_aio.registry import ENVS
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
@@ -76,9 +81,10 @@ _Socket = zmq.Socket[bytes]
 class RemoteEnvClient:
     """Lends one env to the env_server of a trainer's group.
 
-    It dials in, and dials again with growing pauses whenever the server is gone. Each time the
-    server lets it in, the env is reset and a new session begins. When a session ends and the env
-    did not end it, the client calls ``env.on_disconnect()``, so that a robot stops.
+    It dials in, and dials again with growing pauses whenever the server is gone. When the server
+    lets it in, it waits: a trainer's first request is always a reset, and nothing moves before.
+    When a session ends and the env did not end it, the client calls ``env.on_disconnect()``, so
+    that a robot stops.
 
     Args:
         env: newly built. The client owns it, initialises it and closes it.
@@ -86,8 +92,10 @@ class RemoteEnvClient:
         port: of the server; None with a whole address.
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
-        name: unique at the server; by default this machine's name and the process id.
-        heartbeat: seconds within which a dead server is found.
+        name: unique at the server; by default that of the keys, or else this machine's name and
+            the process id.
+        hardware: the env moves something real: a trainer then never resets it by itself. None:
+            what the registry says of its backend.
 
     Attributes:
         name: of the client.
@@ -107,9 +115,10 @@ class RemoteEnvClient:
         *,
         keys: str | os.PathLike[str] | None = None,
         name: str | None = None,
-        heartbeat: float = 5.0,
+        hardware: bool | None = None,
     ) -> None:
-        self.name = name or f"{socket.gethostname()}-{os.getpid()}"
+        given_by_keys = "" if keys is None else Path(keys).name
+        self.name = name or given_by_keys or f"{socket.gethostname()}-{os.getpid()}"
         if len(self.name) > MAX_NAME_LENGTH:
             raise ConfigError(
                 f"a client's name has {len(self.name)} characters; {MAX_NAME_LENGTH} are allowed"
@@ -119,13 +128,16 @@ class RemoteEnvClient:
         self._env = env
         self._address = _address(hostname, port)
         self._keys = None if keys is None else read_client_keys(keys)
-        self._heartbeat = heartbeat
+        if hardware is None:
+            hardware = ENVS.is_hardware(env.config.backend)
+        self._heartbeat = HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT
         try:
             self._session = ClientSession(
                 initialised(env),
                 self.name,
                 free_actions=env.transforms_actions or has_preprocess_fn(env),
                 reads_extras=reads_extras(env),
+                hardware=hardware,
             )
         except UnsupportedSpace as error:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
@@ -133,6 +145,8 @@ class RemoteEnvClient:
         self._env_step = step_of(env)
         self._input = input_of(env)
         self._request: StepRequest | ResetRequest | None = None
+        # The env was reset or stepped, or a session has ended, since it was asked that last.
+        self._asks_if_finished = False
         self._trouble = ""
         self._logged_state = Phase.AWAY.value
         self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
@@ -173,16 +187,16 @@ class RemoteEnvClient:
     def run(self) -> None:
         """Serve until ``env.is_finish()`` is true; connect first if necessary.
 
-        ``is_finish`` is called at least after every reset, step and `on_disconnect`.
+        ``is_finish`` is called after every reset, step and `on_disconnect`, and not before.
 
         Raises:
             ClientRefused: the server will never let this client in.
-            Exception: an error of the env in the reset that opens a session, in ``is_finish``
-                or in ``on_disconnect``. Errors of steps and later resets go to the trainer.
+            Exception: an error of the env in ``is_finish`` or in ``on_disconnect``. Errors of
+                steps and resets go to the trainer.
         """
         try:
             self.connect()
-            while not self._env.is_finish():
+            while not self._is_finished():
                 if self._request is None:
                     self._wait(None)
                 else:
@@ -192,6 +206,10 @@ class RemoteEnvClient:
             self._leave(f"{type(error).__name__}: {error}")
             raise
         self._leave("the env is finished")
+
+    def _is_finished(self) -> bool:
+        asks, self._asks_if_finished = self._asks_if_finished, False
+        return asks and self._env.is_finish()
 
     def close(self) -> None:
         """Leave the server and close the env; idempotent."""
@@ -231,9 +249,10 @@ class RemoteEnvClient:
         dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         dealer.set(zmq.CONNECT_TIMEOUT, int(1000 * HANDSHAKE_SECONDS))
         dealer.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
-        interval, patience = ping_ms(self._heartbeat)
+        interval, patience, given_to_peer = ping_ms(self._heartbeat)
         dealer.set(zmq.HEARTBEAT_IVL, interval)
         dealer.set(zmq.HEARTBEAT_TIMEOUT, patience)
+        dealer.set(zmq.HEARTBEAT_TTL, given_to_peer)
         if self._keys is not None:
             dealer.set(zmq.CURVE_SERVERKEY, self._keys.server)
             dealer.set(zmq.CURVE_PUBLICKEY, self._keys.public)
@@ -329,8 +348,11 @@ class RemoteEnvClient:
     def _apply(self, event: Event | None) -> None:
         if isinstance(event, StepRequest | ResetRequest):
             self._request, self._trouble = event, ""
-            if event.number:
-                self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
+            self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
+        elif isinstance(event, Welcomed):
+            self._trouble = ""
+            self.num_sessions += 1
+            self._heartbeat = event.heartbeat  # ZeroMQ takes it for the next connection.
         elif isinstance(event, Refused):
             self._flush()
             self._hang_up()
@@ -345,13 +367,11 @@ class RemoteEnvClient:
             self._hang_up()
             self._trouble = ""
             LOG.warning("%s: session over: %s", self.name, event.cause)
+            self._asks_if_finished = True
             self._env.on_disconnect()
 
     def _execute(self, request: StepRequest | ResetRequest) -> None:
-        if request.number == 0:
-            self.num_sessions += 1
-            self._reset(ResetRequest(0))
-            return
+        self._asks_if_finished = True
         try:
             if isinstance(request, ResetRequest):
                 self._reset(request)

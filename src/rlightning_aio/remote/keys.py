@@ -216,21 +216,30 @@ class ListedKeys:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._changed_ns: dict[Path, int] = {}
-        self._keys: set[bytes] = set()
+        self._names: dict[bytes, set[str]] = {}
         self._warned: set[str] = set()
 
     def callback(self, domain: str, key: bytes) -> bool:
         """Return True if there is a file with the public key `key` (Z85 text)."""
         del domain
+        if self.names(key):
+            return True
+        _log.warning("the key %r of a client is not in %s", key.decode(), self._directory)
+        return False
+
+    def names(self, key: bytes) -> set[str]:
+        """Return the names of the clients that a key was made for."""
         changed_ns = self._times()
         # What was written a moment ago may be written again within one tick of the file system.
         is_settled = time.time_ns() - max(changed_ns.values(), default=0) > _TICK_NS
         if changed_ns != self._changed_ns or not is_settled:
-            self._changed_ns = changed_ns
-            self._keys = {found for path in changed_ns if (found := self._key_in(path)) is not None}
-        if key not in self._keys:
-            _log.warning("the key %r of a client is not in %s", key.decode(), self._directory)
-        return key in self._keys
+            self._changed_ns, self._names = changed_ns, {}
+            for path in changed_ns.keys() - {self._directory}:
+                try:
+                    self._names.setdefault(read_public_key(path), set()).add(path.stem)
+                except ConfigError as error:
+                    self._warn(f"{error}; its client is not let in")
+        return self._names.get(key, set())
 
     def _times(self) -> dict[Path, int]:
         """Return when the directory and each file in it were last changed."""
@@ -244,15 +253,6 @@ class ListedKeys:
                 if path.is_file():
                     times[path] = path.stat().st_mtime_ns
         return times
-
-    def _key_in(self, path: Path) -> bytes | None:
-        if path == self._directory:
-            return None
-        try:
-            return read_public_key(path)
-        except ConfigError as error:
-            self._warn(f"{error}; its client is not let in")
-            return None
 
     def _warn(self, text: str) -> None:
         """Log a warning once."""

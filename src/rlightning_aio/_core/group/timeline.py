@@ -265,7 +265,7 @@ def _executed(record: HostRecord, owed: dict[int, int]) -> list[tuple[int, int]]
     """
     if isinstance(record.host, Executing) or record.is_starting or record.is_down:
         return []  # In this process nothing is executed now.
-    if record.membership is not None or record.awaits_several or record.host.needs_loop:
+    if record.awaits_several or record.host.needs_loop:
         return list(owed.items())[: record.config.max_concurrency]  # At the same time.
     assert record.killable is not None
     entry, began = record.killable.current_request()
@@ -273,8 +273,8 @@ def _executed(record: HostRecord, owed: dict[int, int]) -> list[tuple[int, int]]
 
 
 def _title(record: HostRecord) -> str:
-    if record.membership is not None:
-        return f"env_server {record.membership.server_id}"
+    if record.place is not None:
+        return f"place {record.place.env_id}"
     where = "inline" if record.killable is None else "worker"
     return f"{where} {record.host.host_id} ({record.config.name})"
 

@@ -3,8 +3,8 @@
 A `Host` starts, accepts requests, and ends. It reports everything by completions, which it appends
 to the queue of its group (see `messages`). What only some hosts can do has a default there, which
 does nothing. Three more protocols are optional: a host that can hang is `Killable`, one that
-executes in the thread of the caller is `Executing`, and one whose envs join and leave has
-`Membership`. The core checks for these, never for a class of hosts. A host with a descriptor has
+executes in the thread of the caller is `Executing`, and one whose worker starts itself is
+`SelfStarting`. The core checks for these, never for a class of hosts. A host with a descriptor has
 the driver watch it, or a part of it, as a `Source`.
 Left out on purpose: waiting. Neither side ever waits.
 """
@@ -33,7 +33,8 @@ __all__ = [
     "Host",
     "HostFactory",
     "Killable",
-    "Membership",
+    "SelfStarting",
+    "Server",
     "Source",
     "Wiring",
 ]
@@ -216,17 +217,16 @@ class Executing(Protocol):
         ...
 
 
-@runtime_checkable
-class Membership(Host, Protocol):
-    """A host whose envs join and leave (an env_server).
-
-    It also posts results that answer no request (`Joined`), and its results wake the driver.
+class Server(Protocol):
+    """The one listener of several hosts that start themselves.
 
     Attributes:
-        server_id: the name of its envs in a batch.
+        server_id: the id of the entry as a whole.
+        connect_timeout: seconds that a call waits for such hosts alone.
     """
 
     server_id: str
+    connect_timeout: float
 
     def address(self) -> str:
         """Return the address that clients connect to, as ``tcp://host:port``.
@@ -236,47 +236,58 @@ class Membership(Host, Protocol):
         """
         ...
 
-    def members(self) -> Mapping[str, EnvMeta]:
-        """Return the envs that have joined, by the name of their client."""
+    def clients(self) -> Mapping[str, str]:
+        """Return the names of the clients that are there, by the ids of their envs."""
         ...
 
-    def member_indices(self) -> list[int]:
-        """Return the indices of the envs that have joined, in the order of their names."""
-        ...
-
-    def num_sub_envs(self, index: int) -> int:
-        """Return the number of sub-environments of an env that has joined."""
-        ...
-
-    def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
-        """Raise `BadAction` if an env can't get these; the action may be in the row."""
-        ...
-
-    def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
-        """Raise ValueError if an env can't get these."""
-        ...
-
-    def missing(self, waited: float) -> float | None:
-        """Return the seconds that a reset may wait for missing envs; None if none is missing.
-
-        Args:
-            waited: seconds that it has waited already.
-
-        Raises:
-            TimeoutError: it has waited longer than that.
-        """
+    def refused(self) -> Mapping[str, str]:
+        """Return why clients were refused for good, by name."""
         ...
 
     def is_readable(self) -> bool:
-        """Return True if `tick` would read anything."""
+        """Return True if `poll` would read anything."""
         ...
 
-    def deadline(self) -> float | None:
-        """Return the latest time for the next `tick` (monotonic seconds); None if there is none."""
+    def poll(self) -> None:
+        """Read what clients sent, without blocking."""
         ...
 
-    def tick(self, now: float) -> None:
-        """Read what clients sent, and find clients that are gone. `now` is monotonic seconds."""
+
+@runtime_checkable
+class SelfStarting(Host, Protocol):
+    """A host whose worker starts itself: a place of an env_server, for a client that dials in.
+
+    It has one env. It posts `Taken` when somebody has dialled in, and `Died` when that one is gone.
+    Between them, and at no other time, it accepts requests; the first one is a reset.
+
+    Attributes:
+        server: shared with the other places.
+        env_id: of its env.
+        client: name of the client that is there; empty if none is.
+    """
+
+    server: Server
+
+    @property
+    def env_id(self) -> str: ...
+
+    @property
+    def client(self) -> str: ...
+
+    def admit(self) -> None:
+        """Note that the group has applied a `Taken`: what it submits now is for that client."""
+        ...
+
+    def forget(self) -> None:
+        """Don't repeat the reset that was lost with the last client."""
+        ...
+
+    def check_step(self, action: Any, extras: dict[str, Any]) -> None:
+        """Raise `BadAction` if a step can't be sent; the action may be in the row."""
+        ...
+
+    def check_reset(self, seed: int | None, options: dict[str, Any] | None) -> None:
+        """Raise `ValueError` if a reset can't be sent."""
         ...
 
 
@@ -292,8 +303,8 @@ class Wiring:
         rings: by host, those of live workers.
         num_hosts: of the group.
         configs: all entries.
-        objection: returns the reason why an env that joins by itself is refused, or None.
-        is_idle: True if a slot has no request and no result to collect.
+        objection: returns the reason why an env that a client brings is refused, or None.
+        busy_since: when the request was sent that a slot has not answered; None if it has.
         resources: shared by hosts of one kind, and made by the first of them; released by
             `release(seconds)` after the hosts.
         shares_thread: other tasks run in the trainer's thread while a procedure waits.
@@ -308,7 +319,7 @@ class Wiring:
     num_hosts: int
     configs: Sequence[EnvConfig]
     objection: Callable[[EnvMeta], str | None]
-    is_idle: Callable[[int], bool]
+    busy_since: Callable[[int], float | None]
     resources: dict[object, Shared]
     shares_thread: bool = False
 

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -42,7 +40,6 @@ __all__ = [
     "EnvStarted",
     "EnvState",
     "ErrorText",
-    "Joined",
     "Lost",
     "NewSchema",
     "NotBuilt",
@@ -51,6 +48,7 @@ __all__ = [
     "Reported",
     "Result",
     "StartOrder",
+    "Taken",
     "Value",
     "Withdrawn",
     "WorkerPlace",
@@ -166,6 +164,7 @@ class Death:
             answered already, or be 0. Where envs are awaitable, the first is the one whose code
             ran, or 0 if all envs waited.
         refused: the system did not let it start.
+        in_order: it has left, as it may.
     """
 
     cause: str
@@ -173,6 +172,7 @@ class Death:
     stderr_tail: str = ""
     requests: tuple[int, ...] = ()
     refused: bool = False
+    in_order: bool = False
 
 
 class Built(NamedTuple):
@@ -226,16 +226,11 @@ class Reported(NamedTuple):
 
 
 class Result(NamedTuple):
-    """A request is done; `out_of_band` (a pickle, or an object) completes its row.
-
-    Attributes:
-        is_loss: the result is not from the env, but marks that it is gone.
-    """
+    """A request is done; `out_of_band` (a pickle, or an object) completes its row."""
 
     host_id: int
     entry: int
     out_of_band: bytes | OutOfBand
-    is_loss: bool = False
 
 
 class Value(NamedTuple):
@@ -270,33 +265,30 @@ class Lost(NamedTuple):
 
 
 class Withdrawn(NamedTuple):
-    """A request will not be answered: its env is away, or it was aborted, and the caller knows."""
+    """A request that was aborted will not be answered: it had not begun."""
 
     host_id: int
     entry: int
 
 
-class Joined(NamedTuple):
-    """An env joined by itself, with a first result that answers no request.
+class Taken(NamedTuple):
+    """A client has dialled in, so the host accepts requests.
 
     Attributes:
-        env_index: its index in the host.
-        slab: the slab of the host from now on; None if it is the same as before.
-        write: writes the result into the row, which may still hold a result that was not
-            collected; returns the part that is out of band.
+        slab: of all places of the entry, if this is its first client.
+        first_slot: of the entry's places.
     """
 
     host_id: int
-    env_index: int
     meta: EnvMeta
     traits: ClientTraits
     slab: Slab | None
-    write: Callable[[], OutOfBand | None]
+    first_slot: int
 
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Lost | Withdrawn | Joined
+    | Reported | Result | Value | Raised | Lost | Withdrawn | Taken
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

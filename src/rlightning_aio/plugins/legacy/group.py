@@ -83,6 +83,14 @@ class EnvGroup:
         self._core_id_of = dict(zip(self.env_ids, core_ids, strict=True))
         num_local = sum(len(ids) for entry, ids in entries if entry.backend != SERVER)
         self._local, self._servers = core_ids[:num_local], core_ids[num_local:]
+        # Clients come and go, so there are places to spare, which whoever dials in takes.
+        self._places = _places_of(self._group.env_ids, self._servers)
+        self._id_of |= {
+            place: f"{self._id_of[server_id]}/{place.rpartition('/')[2]}"
+            for place, server_id in self._places.items()
+        }
+        if self._places:
+            self._group.reset_async(env_ids=list(self._places))
         self.env_list = [EnvHandle(self, env_id) for env_id in self.env_ids[:num_local]]
         self.env_servers = [
             ServerHandle(self._group[one], self._id_of[one]) for one in self._servers
@@ -133,7 +141,7 @@ class EnvGroup:
         """Reset every env with exactly these arguments. Return results in the group's order.
 
         What local envs still owe, as after Ctrl-C, is awaited and dropped. Clients of env_servers
-        get only `seed` and `options`.
+        get only `seed` and `options`; this waits for the first of them.
         """
         while self._local_pending():
             with contextlib.suppress(EnvFault):
@@ -147,10 +155,7 @@ class EnvGroup:
             if self._local:
                 options = {ARGUMENTS: (args, kwargs)} if args or kwargs else None
                 rows += self._rows(self._group.reset(options=options, env_ids=self._local)[0])
-            for core_id in self._servers:
-                seed, options = kwargs.get("seed"), kwargs.get("options")
-                found: Any = self._group[core_id].reset(seed, options)
-                rows += [self._row_of_client(core_id, ret) for ret in found]
+            rows += self._first_results(kwargs.get("seed"), kwargs.get("options"))
         return _batch_and_flags(rows)
 
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:
@@ -203,10 +208,13 @@ class EnvGroup:
             raise ValueError(f"timeout must be a positive number of seconds, not {timeout!r}")
         rows, in_flight = self._kept, bool(self._group.pending)
         if not rows or (wait_all and in_flight):
-            if not in_flight and not self._servers:  # Whose clients may come by themselves.
+            if not in_flight:
                 _log.warning("collect_async: nothing was sent, so there is nothing to collect")
                 return _batch_and_flags([])
-            rows = [*rows, *self._collected(timeout=timeout, wait_all=wait_all and in_flight)]
+            how: dict[str, Any] = {"timeout": timeout, "wait_all": wait_all and in_flight}
+            if wait_all and self._places:  # Nobody may ever take the places to spare.
+                how = {"min_results": max(1, len(_owing(self._group)))}
+            rows = [*rows, *self._collected(**how)]
         self._kept = []
         self._num_steps["async"] += len(rows)
         return _batch_and_flags(rows)
@@ -223,7 +231,8 @@ class EnvGroup:
             if core_id is None:
                 raise UnknownEnv(f"no env of this group has the id {env_id!r}; nothing was sent")
             if core_id in self._servers:
-                steps.append((core_id, _for_client(core_id, response)))
+                client = _for_client(core_id, response)
+                steps.append((client.env_id, client))
                 continue
             if core_id in owing:
                 self._await([core_id])
@@ -235,6 +244,18 @@ class EnvGroup:
         return (BatchedData(ids, responses) if steps else None), due
 
     # -- results
+
+    def _first_results(self, seed: Any, options: Any) -> list[_Row]:
+        """Reset clients, and wait for the first of those that are there, or that come."""
+        if not self._places:
+            return []
+        pending = set(self._group.pending)
+        if idle := [place for place in self._places if place not in pending]:
+            self._group.reset_async(seed=seed, options=options, env_ids=idle)
+        rows, self._kept = self._kept, []
+        while not rows or _owing(self._group).intersection(idle):
+            rows += self._rows(self._group.collect_async()[0])
+        return rows
 
     def _local_pending(self) -> set[str]:
         return set(self._group.pending).intersection(self._local)
@@ -255,7 +276,7 @@ class EnvGroup:
         rets: Any = [one.observation for one in ours] if self._servers else batch.observation
         rows: list[_Row] = []
         for k, (core_id, ret) in enumerate(zip(batch.ids(), rets, strict=True)):
-            if core_id in self._servers:
+            if core_id in self._places:
                 rows.append(self._row_of_client(core_id, ours[k]))
                 continue
             if restarted[k]:
@@ -267,15 +288,9 @@ class EnvGroup:
         return rows
 
     def _row_of_client(self, core_id: str, ours: Any) -> _Row:
-        env_id = self._own_id(ours.env_id)
+        env_id = self._id_of[ours.env_id]
         fields: dict[str, Any] = {**vars(ours), "env_id": env_id, "_extra": ours._extra}
-        return _Row(self._id_of[core_id], named("EnvRet")(**fields))
-
-    def _own_id(self, core_id: str) -> str:
-        if core_id in self._id_of:
-            return self._id_of[core_id]
-        server_id, _, client = core_id.rpartition("/")
-        return f"{self._id_of[server_id]}/{client}"
+        return _Row(self._id_of[self._places[core_id]], named("EnvRet")(**fields))
 
     @contextlib.contextmanager
     def _own_ids(self, rows: list[_Row]) -> Generator[None]:
@@ -287,9 +302,9 @@ class EnvGroup:
                 rows += self._rows(fault.results)
             fault.results = _batch_and_flags(rows)[0] if rows else None
             for one in (fault, *fault.others):
-                one.env_id = self._own_id(one.env_id)
+                one.env_id = self._id_of[one.env_id]
                 if isinstance(one, WorkerDied):
-                    one.env_ids = tuple(map(self._own_id, one.env_ids))
+                    one.env_ids = tuple(map(self._id_of.__getitem__, one.env_ids))
             raise
 
     @contextlib.contextmanager
@@ -448,6 +463,18 @@ class ServerHandle:
 
     def finish_rollout(self) -> None:
         """Do nothing."""
+
+
+def _places_of(env_ids: Sequence[str], servers: Sequence[str]) -> dict[str, str]:
+    """Return the env_server of each place."""
+    found = {env_id: env_id.rpartition("/")[0] for env_id in env_ids}
+    return {place: server_id for place, server_id in found.items() if server_id in servers}
+
+
+def _owing(group: Any) -> set[str]:
+    """Return the ids of what owes a result and is there."""
+    empty = [worker["env_ids"] for worker in group.get_workers() if worker["state"] == "empty"]
+    return set(group.pending).difference(*empty)
 
 
 def _for_client(core_id: str, response: Any) -> PolicyResponse:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import itertools
+import math
 import uuid
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,6 +27,8 @@ __all__ = ["ARGUMENTS", "SERVER", "EnvMaker", "HostedEnv", "entries_of", "off_de
 ARGUMENTS: Final = "rlightning"
 """Key in a reset's options for the arguments of RLightning's `reset`."""
 SERVER: Final = "env_server"
+_PLACES: Final = 32
+"""For clients of a server, as many as RLightning's has."""
 _PASSED_ON: Final = (
     "placement", "envs_per_process", "step_timeout", "reset_timeout", "start_timeout",
     "close_timeout", "on_worker_death", "on_env_error", "max_restarts", "imports", "interpreter",
@@ -142,6 +145,9 @@ def entries_of(
         port = config.get("zmq_port")
         if port is not None:
             arguments.setdefault("port", int(port))
+        if not arguments.keys() & {"clients", "num_clients", "min_clients"}:
+            arguments["clients"] = _PLACES
+        arguments.setdefault("connect_timeout", math.inf)
         name, fields = _new_name(config.name, taken), _passed_on(config)
         entry = EnvConfig(name=name, backend=SERVER, env_kwargs=arguments, **fields)
         found.append((entry, [f"{uuid.uuid4()}-{len(makers) + k}"]))

@@ -128,7 +128,9 @@ class RemoteEnvClient:
         result in `run`, and its `reset` waits for that.
         """
         if self._client is None:
-            self._client = OurClient(_DialledEnv(self.env), *self._address, name=self._name)
+            self._client = OurClient(
+                _DialledEnv(self.env), *self._address, name=self._name, hardware=False
+            )
         self._client.connect()
 
     def run(self) -> None:

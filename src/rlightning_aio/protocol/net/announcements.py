@@ -37,7 +37,6 @@ class ClientKind(NamedTuple):
 
     observation_space: dict[str, Any]
     action_space: dict[str, Any]
-    num_envs: int
     agents: tuple[str, ...]
 
 
@@ -54,8 +53,8 @@ class Announcement(NamedTuple):
 def announced(
     hello: ClientHello,
     size: int,
-    server_id: str,
     kind: ClientKind | None,
+    num_envs: int,
     objection: Callable[[EnvMeta], str | None],
 ) -> Announcement:
     """Return the contents of a hello whose header has `size` bytes.
@@ -63,8 +62,8 @@ def announced(
     Args:
         hello: of a client.
         size: see above.
-        server_id: env_id of the server.
-        kind: of the clients that have joined; None before the first.
+        kind: of the first client that was let in; None before.
+        num_envs: sub-environments of each client's env, by the configuration.
         objection: returns the trainer's reason to refuse an env, or None.
 
     Raises:
@@ -79,7 +78,7 @@ def announced(
     try:
         # The trainer may let its own arithmetic raise; a client's bounds must not.
         with np.errstate(all="ignore"):
-            return _announcement(hello, f"{server_id}/{hello.name}", kind, objection)
+            return _announcement(hello, kind, num_envs, objection)
     except WireError as error:
         raise Rejection(str(error)) from None
     # Gymnasium, NumPy and pydantic raise their own errors for unexpected inputs.
@@ -89,8 +88,8 @@ def announced(
 
 def _announcement(
     hello: ClientHello,
-    env_id: str,
     known: ClientKind | None,
+    num_envs: int,
     objection: Callable[[EnvMeta], str | None],
 ) -> Announcement:
     observation_space = space_from(hello.observation_space)
@@ -98,18 +97,22 @@ def _announcement(
     kind = ClientKind(
         describe(observation_space, "observation"),
         describe(action_space, "action"),
-        hello.num_envs,
         tuple(hello.agents),
     )
+    if hello.num_envs != num_envs:
+        raise WireError(
+            f"its env has {hello.num_envs} sub-environments, and num_envs of the entry is "
+            f"{num_envs}"
+        )
     if known is not None and kind != known:
         raise WireError(
-            "its spaces, num_envs or agents differ from those of this server's other "
-            "clients; give each kind of env an env_server entry of its own"
+            "its spaces or agents differ from those of this server's first client; give each "
+            "kind of env an env_server entry of its own"
         )
     if hello.agents:
         _check_agents(hello.agents, observation_space, action_space)
     meta = EnvMeta(
-        env_id=env_id,
+        env_id=hello.name,
         observation_space=observation_space,
         action_space=action_space,
         num_envs=hello.num_envs,
@@ -122,7 +125,7 @@ def _announcement(
     return Announcement(
         kind,
         meta,
-        ClientTraits(hello.free_actions, hello.reads_extras),
+        ClientTraits(hello.free_actions, hello.reads_extras, hello.hardware),
         ResultLayout(observation_space, hello.num_envs, hello.agents),
         SpaceLayout(action_space, "action"),
     )

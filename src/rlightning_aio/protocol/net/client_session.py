@@ -42,7 +42,15 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["ClientSession", "Ended", "Phase", "Refused", "ResetRequest", "StepRequest"]
+__all__ = [
+    "ClientSession",
+    "Ended",
+    "Phase",
+    "Refused",
+    "ResetRequest",
+    "StepRequest",
+    "Welcomed",
+]
 
 _MAX_TEXT: Final = 50_000
 _LATEST_NS: Final = 2**63 - 1
@@ -75,6 +83,13 @@ class ResetRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class Welcomed:
+    """The server let this client in; either end has `heartbeat` seconds to miss the other."""
+
+    heartbeat: float
+
+
+@dataclass(frozen=True, slots=True)
 class Ended:
     """The session has ended, and with it the trainer's control of the env; hang up."""
 
@@ -89,7 +104,7 @@ class Refused:
     retry: bool
 
 
-Event = StepRequest | ResetRequest | Ended | Refused
+Event = StepRequest | ResetRequest | Welcomed | Ended | Refused
 
 
 class ClientSession:
@@ -100,6 +115,7 @@ class ClientSession:
         name: of the client, unique at its server.
         free_actions: the env accepts actions that do not fit its action space.
         reads_extras: the env reads columns that the policy attaches to the action.
+        hardware: the env moves something real.
 
     Attributes:
         phase: state of the connection.
@@ -116,6 +132,7 @@ class ClientSession:
         *,
         free_actions: bool = False,
         reads_extras: bool = False,
+        hardware: bool = True,
     ) -> None:
         self.phase = Phase.AWAY
         self.outbox: deque[list[bytes]] = deque()
@@ -132,6 +149,7 @@ class ClientSession:
             autoreset=meta.autoreset,
             free_actions=free_actions,
             reads_extras=reads_extras,
+            hardware=hardware,
         )
         # Neither is None, because `describe` accepted them.
         observation_space = cast("gym.Space[Any]", meta.observation_space)
@@ -141,6 +159,7 @@ class ClientSession:
         self._reader: Reader[FromServer] = Reader(FromServer)
         self._writer = Writer()
         self._lost_keys: set[str] = set()
+        self._last_number = 0
 
     # The connection
 
@@ -192,11 +211,15 @@ class ClientSession:
             self.phase = Phase.AWAY
             return Refused(in_one_line(message.text), message.retry)
         self.phase = Phase.SERVING
-        return ResetRequest(0)
+        self._last_number = 0
+        return Welcomed(message.heartbeat)
 
     def _on_request(self, message: Step | Reset, frames: Sequence[Part]) -> Event | None:
         if self.phase is not Phase.SERVING:
             raise WireError("a request without a session")
+        if not self._last_number and not isinstance(message, Reset):
+            raise WireError("the first request of a session is not a reset")
+        self._last_number = message.number
         if isinstance(message, Reset):
             return ResetRequest(message.number, message.seed, message.options)
         if self._free_actions:

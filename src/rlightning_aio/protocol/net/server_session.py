@@ -1,10 +1,11 @@
 """`ServerSessions`: the trainer's end of env_server, without I/O.
 
-Rule: a connection is a session. It begins with a hello and ends with the connection, a goodbye or
-the first message that breaks the rules, and nothing is sent twice. Every request ends in exactly
-one result or one typed error, and every loss of a client is reported once: by the request in flight
-or, if there is none, by the next step. Messages come in, messages and results are queued, and time
-is an argument. Deliberately left out: sockets, keys, and the group's own bookkeeping.
+Rule: an env_server has places, and a connection of a client that was let in is a session at one of
+them. It begins with a hello and ends with the connection, a goodbye or the first message that
+breaks the rules. Nothing is sent twice, and nothing is sent unasked. Every request of a session
+ends in its result, in its error, or with the session. Messages come in, and messages are queued;
+what happens at a place goes to its host. Deliberately left out: sockets, keys, time limits, and
+what the end of a session means.
 """
 
 from __future__ import annotations
@@ -12,9 +13,9 @@ from __future__ import annotations
 import logging
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
-from rlightning_aio.errors import BadAction, EnvBusy, UnknownEnv
+from rlightning_aio.errors import BadAction
 from rlightning_aio.outcomes import BLAMES
 from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.error_text import ErrorText
@@ -22,6 +23,8 @@ from rlightning_aio.protocol.net.announcements import Rejection, announced
 from rlightning_aio.protocol.net.payload import Packed
 from rlightning_aio.protocol.net.texts import LOG, in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
+    DEFAULT_HEARTBEAT,
+    HARDWARE_HEARTBEAT,
     Bye,
     ClientHello,
     ClientResult,
@@ -39,14 +42,15 @@ from rlightning_aio.protocol.net.wire import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from rlightning_aio.protocol.net.announcements import Announcement, ClientKind
-    from rlightning_aio.types import ClientTraits, EnvMeta
+    from rlightning_aio.types import EnvMeta
 
-__all__ = ["OutgoingMessage", "RemoteResult", "ServerSession", "ServerSessions"]
+__all__ = ["ClientPlace", "OutgoingMessage", "PlaceEvents", "RemoteResult", "ServerSessions"]
 
-_MAX_SESSIONS: Final = 512
+_MAX_REFUSED: Final = 8
+"""Refusals that an error repeats."""
 
 
 class OutgoingMessage(NamedTuple):
@@ -61,49 +65,61 @@ class RemoteResult:
     """The result of one request to a client.
 
     Attributes:
-        client: name of the client.
-        number: number of the request as it was submitted; None for a first result, which
-            answers no request.
         observation: read-only arrays in the shape of the observation space.
-        reward, terminated, truncated: numbers, arrays ``[num_envs]``, or dicts of either
-            by agent.
-        info, extra: as the env returned them; ``info["client_lost"]`` says why a client is lost.
+        reward, terminated, truncated: numbers, arrays ``[num_envs]``, or dicts of either by agent.
+        info, extra: as the env returned them.
         busy_ns: duration of the env's call, by the client's clock.
         sent_ns: time at which the env produced the result, in ns since the epoch by the
             client's clock; 0 if the client sent none.
-        error: the env's exception; the other fields are then unset.
-        is_reset: the result begins an episode.
-        is_loss: the result only marks that the client was lost.
     """
 
-    client: str
-    number: int | None
-    observation: Any = None
-    reward: Any = 0.0
-    terminated: Any = False
-    truncated: Any = False
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
     info: dict[str, Any] = field(default_factory=dict[str, Any])
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
     busy_ns: int = 0
     sent_ns: int = 0
-    error: ErrorText | None = None
-    is_reset: bool = False
-    is_loss: bool = False
 
 
-class _Request(NamedTuple):
-    """A request in flight.
+class PlaceEvents(Protocol):
+    """What learns of the events at a place."""
+
+    def on_taken(self, client: str, announced: Announcement) -> None:
+        """Note that a client has taken the place; it gets nothing until it is asked."""
+        ...
+
+    def on_answer(self, answer: RemoteResult | ErrorText) -> None:
+        """Note the result or the error of the request in flight."""
+        ...
+
+    def on_lost(self, cause: str, *, in_order: bool) -> None:
+        """Note that the client is gone; `in_order`: it said goodbye."""
+        ...
+
+    def waits_since(self) -> float | None:
+        """Return when the request that waits for a client was sent; None if there is none."""
+        ...
+
+
+@dataclass(slots=True, eq=False)
+class ClientPlace:
+    """One env of an env_server, which one client at a time may provide.
 
     Attributes:
-        number: as the trainer submitted it.
-        operation: ``step`` or ``reset``.
-        timeout: seconds allowed; deadline: when they end (monotonic seconds).
+        env_id: of the env.
+        events: of its host.
+        name: of the only client that may take it; empty for any.
+        last: name of the client that had it last.
+        session: of the client that is there.
     """
 
-    number: int
-    operation: str
-    timeout: float | None
-    deadline: float | None
+    env_id: str
+    events: PlaceEvents
+    name: str = ""
+    last: str = ""
+    session: ServerSession | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -114,99 +130,61 @@ class ServerSession:
         name: of the client.
         route: address of the connection.
         announced: contents of its hello.
-        joined: the first result has arrived.
-        first: the first result, while an earlier session's loss is not reported.
-        request: in flight.
-        last_number: number of the last request on the wire; 0 is the reset that begins a session.
-        observation: the last one that was queued.
+        place: that it has taken.
+        last_number: number of the last request.
+        is_asked: that request is in flight.
     """
 
     name: str
     route: bytes
     announced: Announcement
-    joined: bool = False
-    first: RemoteResult | None = None
-    request: _Request | None = None
+    place: ClientPlace
     last_number: int = 0
-    observation: Any = None
-
-    def result(self, message: ClientResult, frames: Sequence[Part]) -> RemoteResult:
-        """Return the contents of a result.
-
-        Raises:
-            WireError: they are not what the client announced.
-        """
-        header = (message.reward, message.terminated, message.truncated)
-        request = self.request
-        return RemoteResult(
-            self.name,
-            None if request is None else request.number,
-            *self.announced.results.unpack(frames, message.texts, header),
-            message.info,
-            message.extra,
-            message.busy_ns,
-            message.sent_ns,
-            is_reset=request is None or request.operation == "reset",
-        )
-
-    def marked(self, cause: str) -> RemoteResult:
-        """Return the result of the request in flight, or of the next one, of a lost client."""
-        return RemoteResult(
-            self.name,
-            None if self.request is None else self.request.number,
-            *self.announced.results.cut_short(self.observation),
-            info={"client_lost": f"client {self.name!r}: {cause}"},
-            is_loss=True,
-        )
+    is_asked: bool = False
 
 
 class ServerSessions:
     """All sessions of one env_server.
 
     Args:
-        server_id: env_id of the server; its clients' envs are ``<server_id>/<name>``.
-        step_timeout, reset_timeout: seconds after which a client that has not answered counts as
-            lost; None for never.
+        server_id: id of the server.
+        places: of the server, in order.
+        num_envs: sub-environments of each client's env.
+        heartbeat: seconds that clients are told; None: 5, and 1 for those that are hardware.
         objection: returns the trainer's reason to refuse an env, or None.
 
     Attributes:
-        clients: the env of each client that has joined (its first result has come), by name.
         outbox: messages that wait to be sent, oldest first; the sender removes them.
+        refused: why clients were refused for good, by name; only the last ones.
     """
 
     def __init__(
         self,
         server_id: str,
+        places: Sequence[ClientPlace],
         *,
-        step_timeout: float | None = None,
-        reset_timeout: float | None = None,
+        num_envs: int = 1,
+        heartbeat: float | None = None,
         objection: Callable[[EnvMeta], str | None] = lambda _: None,
     ) -> None:
-        self.clients: dict[str, EnvMeta] = {}
         self.outbox: deque[OutgoingMessage] = deque()
+        self.refused: dict[str, str] = {}
         self._server_id = server_id
-        self._timeouts = {"step": step_timeout, "reset": reset_timeout}
+        self._places = places
+        self._num_envs = num_envs
+        self._heartbeat = heartbeat
         self._objection = objection
         self._reader: Reader[FromClient] = Reader(FromClient)
         self._writer = Writer()
         self._last_warning = ""
         self._dropped_extras: set[str] = set()
+        # Of the first client, which decides for all places.
         self._kind: ClientKind | None = None
         self._by_route: dict[bytes, ServerSession] = {}
-        self._by_name: dict[str, ServerSession] = {}
-        self._losses: dict[str, RemoteResult] = {}
-        self._results: list[RemoteResult] = []
-        self._check_at: float | None = None
 
-    @property
-    def has_results(self) -> bool:
-        """True if `take` would return any result."""
-        return bool(self._results)
-
-    def take(self) -> list[RemoteResult]:
-        """Return all queued results, oldest first; each is returned once."""
-        results, self._results = self._results, []
-        return results
+    def clients(self) -> dict[str, str]:
+        """Return the names of the clients that are there, by the ids of their envs."""
+        return {p.env_id: p.session.name for p in self._places if p.session is not None}
 
     def holds(self, route: bytes) -> bool:
         """Return True if the connection `route` has a session."""
@@ -214,79 +192,41 @@ class ServerSessions:
 
     # -- requests -------------------------------------------------------------------
 
-    def traits(self, client: str) -> ClientTraits:
-        """Return how a client that is present treats requests."""
-        if (session := self._by_name.get(client)) is None:
-            raise UnknownEnv(f"no client named {client!r} is connected to {self._server_id}")
-        return session.announced.traits
-
-    def check_step(self, client: str, action: Any, extras: Mapping[str, Any]) -> None:
-        """Raise `BadAction` if `client` is present and the step cannot be sent to it."""
-        if (session := self._by_name.get(client)) is not None:
-            self._step_parts(session, action, extras)
+    def check_step(self, place: ClientPlace, action: Any, extras: Mapping[str, Any]) -> None:
+        """Raise `BadAction` if a client is there and the step can't be sent to it."""
+        if place.session is not None:
+            self._step_parts(place.session, action, extras)
 
     def check_reset(
-        self, client: str, seed: int | list[int] | None, options: dict[str, Any] | None
+        self, env_id: str, seed: int | list[int] | None, options: dict[str, Any] | None
     ) -> None:
-        """Raise `ValueError` if `client` is present and the reset cannot be sent to it."""
-        if (session := self._by_name.get(client)) is not None:
-            self._reset_parts(session, seed, options)
+        """Raise `ValueError` if the reset can't be sent to any client."""
+        try:
+            self._writer.write(Reset(number=1, seed=seed, options=options))
+        except Untransferable as error:
+            raise ValueError(f"reset of {env_id}: seed or options can't be sent: {error}") from None
 
-    def step(
-        self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
-    ) -> bool:
-        """Request a step.
+    def step(self, place: ClientPlace, action: Any, extras: Mapping[str, Any]) -> None:
+        """Request a step of the client that is there.
 
         Args:
-            client: name of a client.
-            number: returned with the result.
+            place: of the client, which has answered its last request.
             action: fits the client's action space, unless the client transforms actions.
             extras: columns that the policy attached; sent if the client reads them.
-            now: monotonic seconds.
-
-        Returns:
-            True if a result with `number` will come. False if the client is absent and the
-            trainer knows that; its next first result comes when it is back.
 
         Raises:
-            EnvBusy: the client has not answered its last request.
-            BadAction: the action does not fit, or the response cannot be sent.
+            BadAction: the action doesn't fit, or the response can't be sent.
         """
-        session = self._by_name.get(client)
-        if (loss := self._losses.pop(client, None)) is not None:
-            loss.number = number
-            self._results.append(loss)
-            if session is not None and session.first is not None:
-                first, session.first = session.first, None
-                self._add(session, first)
-            return True
-        if session is None or not session.joined:
-            return False
-        self._send(session, "step", number, self._step_parts(session, action, extras), now)
-        return True
+        session = _session_at(place)
+        self._send(session, self._step_parts(session, action, extras))
 
     def reset(
-        self,
-        client: str,
-        number: int,
-        seed: int | list[int] | None,
-        options: dict[str, Any] | None,
-        now: float,
-    ) -> bool:
-        """Request a reset, after which no earlier loss is reported.
-
-        Returns and raises as `step`, and raises `ValueError` for options that cannot be sent.
-        """
-        session = self._by_name.get(client)
-        if session is None or not session.joined:
-            self._losses.pop(client, None)
-            return False
-        parts = self._reset_parts(session, seed, options)
-        self._losses.pop(client, None)
-        if session.first is not None:
-            session.observation, session.first = session.first.observation, None
-        self._send(session, "reset", number, parts, now)
-        return True
+        self, place: ClientPlace, seed: int | list[int] | None, options: dict[str, Any] | None
+    ) -> None:
+        """Request a reset of the client that is there."""
+        session = _session_at(place)
+        number = session.last_number + 1
+        self._send(session, self._writer.write(Reset(number=number, seed=seed, options=options)))
 
     def _step_parts(
         self, session: ServerSession, action: Any, extras: Mapping[str, Any]
@@ -304,19 +244,7 @@ class ServerSessions:
             return self._writer.write(step, packed.frames)
         except (Misfit, Untransferable) as error:
             raise BadAction(
-                f"response for {session.announced.meta.env_id}: {error}; nothing was sent"
-            ) from None
-
-    def _reset_parts(
-        self, session: ServerSession, seed: int | list[int] | None, options: dict[str, Any] | None
-    ) -> list[bytes]:
-        try:
-            return self._writer.write(
-                Reset(number=session.last_number + 1, seed=seed, options=options)
-            )
-        except Untransferable as error:
-            raise ValueError(
-                f"reset of {session.announced.meta.env_id}: seed or options can't be sent: {error}"
+                f"response for {session.place.env_id}: {error}; nothing was sent"
             ) from None
 
     def _portable_extras(self, extras: Mapping[str, Any]) -> dict[str, Any]:
@@ -330,31 +258,23 @@ class ServerSessions:
             )  # fmt: skip
         return kept
 
-    def _send(
-        self, session: ServerSession, operation: str, number: int, parts: list[bytes], now: float
-    ) -> None:
-        if session.request is not None:
-            raise EnvBusy(
-                f"{session.announced.meta.env_id} has not answered its last "
-                f"{session.request.operation}; collect the result first"
-            )
+    def _send(self, session: ServerSession, parts: list[bytes]) -> None:
+        assert not session.is_asked
         session.last_number += 1
-        deadline = None
-        if (timeout := self._timeouts[operation]) is not None:
-            deadline = now + timeout
-            if self._check_at is None or deadline < self._check_at:
-                self._check_at = deadline
-        session.request = _Request(number, operation, timeout, deadline)
+        session.is_asked = True
         self.outbox.append(OutgoingMessage(session.route, parts))
 
     # -- messages -------------------------------------------------------------------
 
-    def receive(self, route: bytes, parts: Sequence[Part]) -> None:
+    def receive(
+        self, route: bytes, parts: Sequence[Part], allowed: Collection[str] | None = None
+    ) -> None:
         """Read one message and answer it. No content makes it raise.
 
         Args:
             route: of the connection, for answers.
             parts: header and frames.
+            allowed: names that the key of the connection was made for; None: any.
         """
         session = self._by_route.get(route)
         try:
@@ -362,7 +282,7 @@ class ServerSessions:
             if session is not None:
                 self._handle(session, message, frames)
             elif isinstance(message, ClientHello):
-                self._on_hello(message, len(parts[0]), route)
+                self._on_hello(message, len(parts[0]), route, allowed)
             # A client may have sent other messages before it read that its session is over.
         except WireError as error:
             text = in_one_line(str(error))
@@ -377,23 +297,60 @@ class ServerSessions:
             self._last_warning = text
             LOG.warning("%s: %s", self._server_id, text)
 
-    def _on_hello(self, hello: ClientHello, size: int, route: bytes) -> None:
+    def _on_hello(
+        self, hello: ClientHello, size: int, route: bytes, allowed: Collection[str] | None
+    ) -> None:
         """Answer a hello whose header has `size` bytes."""
         try:
-            self._let_in(hello, size, route)
+            self._let_in(hello, size, route, allowed)
         except Rejection as error:
             text = in_one_line(str(error))
             self._warn(in_one_line(f"refused the client {hello.name!r}: {text}"))
+            if not error.retry:
+                name = in_one_line(hello.name)
+                self.refused.pop(name, None)
+                self.refused[name] = text
+                if len(self.refused) > _MAX_REFUSED:
+                    del self.refused[next(iter(self.refused))]
             self._post(route, Refusal(text=text, retry=error.retry))
 
-    def _let_in(self, hello: ClientHello, size: int, route: bytes) -> None:
-        if hello.name in self._by_name:
+    def _let_in(
+        self, hello: ClientHello, size: int, route: bytes, allowed: Collection[str] | None
+    ) -> None:
+        if allowed is not None and hello.name not in allowed:
+            names = ", ".join(map(repr, sorted(allowed)))
+            raise Rejection(f"its key was made for {names}, not for {hello.name!r}")
+        listed = [place.name for place in self._places if place.name]
+        if listed and hello.name not in listed:
+            raise Rejection(f"the places of {self._server_id} are for {', '.join(listed)}")
+        # Of a client that is refused for good, whether there is room doesn't matter.
+        found = announced(hello, size, self._kind, self._num_envs, self._objection)
+        if any(session.name == hello.name for session in self._by_route.values()):
             raise Rejection(f"a client named {hello.name!r} is here already", retry=True)
-        if len(self._by_name) >= _MAX_SESSIONS:
-            raise Rejection(f"{len(self._by_name)} clients are here already", retry=True)
-        found = announced(hello, size, self._server_id, self._kind, self._objection)
-        self._by_route[route] = self._by_name[hello.name] = ServerSession(hello.name, route, found)
-        self._post(route, Welcome(env_id=found.meta.env_id))
+        place = self._place_for(hello.name)
+        if place is None:
+            raise Rejection(f"all {len(self._places)} places are taken", retry=True)
+        self._kind = found.kind
+        place.last = hello.name
+        place.session = self._by_route[route] = ServerSession(hello.name, route, found, place)
+        heartbeat = self._heartbeat
+        if heartbeat is None:
+            heartbeat = HARDWARE_HEARTBEAT if hello.hardware else DEFAULT_HEARTBEAT
+        self._post(route, Welcome(env_id=place.env_id, heartbeat=heartbeat))
+        LOG.info("%s: the client %r has taken %s", self._server_id, hello.name, place.env_id)
+        place.events.on_taken(hello.name, found)
+
+    def _place_for(self, name: str) -> ClientPlace | None:
+        """Return the empty place that a client gets; None if there is none."""
+        empty = [place for place in self._places if place.session is None]
+        empty = [place for place in empty if place.name in {"", name}]
+        for place in empty:
+            if name in {place.name, place.last}:
+                return place
+        waiting = [(since, k) for k, p in enumerate(empty) if (since := p.events.waits_since())]
+        if waiting:
+            return empty[min(waiting)[1]]
+        return empty[0] if empty else None
 
     def _handle(self, session: ServerSession, message: FromClient, frames: Sequence[Part]) -> None:
         """Read a message of a session.
@@ -403,51 +360,30 @@ class ServerSessions:
         """
         if isinstance(message, Bye):
             cause = f"it left: {in_one_line(message.reason) or 'no reason given'}"
-            self._lose(session, cause, logging.INFO)
+            self._lose(session, cause, in_order=True)
             return
         if isinstance(message, ClientHello):
             raise WireError("a second hello")
-        request = session.request
-        if message.number != session.last_number or (request is None and session.joined):
+        if message.number != session.last_number or not session.is_asked:
             raise WireError(f"an answer to request {message.number}, which is not in flight")
         if isinstance(message, ClientResult):
-            result = session.result(message, frames)
-            if request is None:
-                self._join(session, result)
-            else:
-                session.request = None
-                self._add(session, result)
-            return
-        error = ErrorText(
-            in_one_line(message.exception_type),
-            in_one_line(message.text),
-            in_lines(message.traceback),
-            message.blame if message.blame in BLAMES else "",
-        )
-        if request is None:
-            self._dismiss(session, f"its first reset raised {error.summary}")
-            return
-        session.request = None
-        self._results.append(RemoteResult(session.name, request.number, error=error))
-
-    def _join(self, session: ServerSession, result: RemoteResult) -> None:
-        kind = session.announced.kind
-        if self._kind is not None and kind != self._kind:
-            # A client of another kind joined while this one was resetting.
-            self._dismiss(session, "its spaces differ from those of the other clients")
-            return
-        self._kind = kind
-        session.joined = True
-        self.clients[session.name] = session.announced.meta
-        LOG.info("%s: the client %r has joined", self._server_id, session.name)
-        if session.name in self._losses:
-            session.first = result
+            header = (message.reward, message.terminated, message.truncated)
+            answer = RemoteResult(
+                *session.announced.results.unpack(frames, message.texts, header),
+                message.info,
+                message.extra,
+                message.busy_ns,
+                message.sent_ns,
+            )
         else:
-            self._add(session, result)
-
-    def _add(self, session: ServerSession, result: RemoteResult) -> None:
-        session.observation = result.observation
-        self._results.append(result)
+            answer = ErrorText(
+                in_one_line(message.exception_type),
+                in_one_line(message.text),
+                in_lines(message.traceback),
+                message.blame if message.blame in BLAMES else "",
+            )
+        session.is_asked = False
+        session.place.events.on_answer(answer)
 
     def _post(self, route: bytes, message: Welcome | Refusal | Bye) -> None:
         self.outbox.append(OutgoingMessage(route, self._writer.write(message)))
@@ -459,57 +395,32 @@ class ServerSessions:
         if (session := self._by_route.get(route)) is not None:
             self._lose(session, cause)
 
-    def dismiss(self, client: str, cause: str) -> None:
-        """Send a client away, with the reason. No request reports that."""
-        if (session := self._by_name.get(client)) is not None:
-            self._dismiss(session, cause)
-            self._losses.pop(client, None)
+    def dismiss(self, place: ClientPlace, cause: str) -> None:
+        """Send the client at a place away, with the reason."""
+        if place.session is not None:
+            self._dismiss(place.session, cause)
 
     def close(self, reason: str) -> None:
-        """End all sessions and send every client the reason. No loss is reported."""
-        for route in self._by_route:
+        """End all sessions and send every client the reason. No place hears of that."""
+        for route, session in self._by_route.items():
+            session.place.session = None
             self._post(route, Bye(reason=reason))
-        for table in (self._by_route, self._by_name, self._losses, self.clients, self._results):
-            table.clear()
-        self._check_at = None
-
-    def deadline(self) -> float | None:
-        """Return the time at which `tick` is due (monotonic seconds); None if never."""
-        return self._check_at
-
-    def tick(self, now: float) -> None:
-        """Dismiss clients whose time is up. Call it after reading all messages."""
-        if self._check_at is None or now < self._check_at:
-            return
-        waiting = [one for one in self._by_name.values() if one.request and one.request.deadline]
-        for session in waiting:
-            request = session.request
-            if request and request.deadline and now >= request.deadline:
-                cause = f"no result of a {request.operation} within {request.timeout} s"
-                self._dismiss(session, cause)
-        left = [one.request.deadline for one in waiting if one.request and one.request.deadline]
-        self._check_at = min(left, default=None)
+        self._by_route.clear()
 
     def _dismiss(self, session: ServerSession, cause: str) -> None:
         """End a session and send its client the reason."""
         self._post(session.route, Bye(reason=cause))
         self._lose(session, cause)
 
-    def _lose(self, session: ServerSession, cause: str, level: int = logging.WARNING) -> None:
-        """End a session. The request in flight reports `cause`, or the next one does."""
-        # A peer that never joins can be lost as often as it likes.
-        level = level if session.joined else logging.INFO
+    def _lose(self, session: ServerSession, cause: str, *, in_order: bool = False) -> None:
+        """End a session."""
+        level = logging.INFO if in_order else logging.WARNING
         LOG.log(level, "%s: lost the client %r: %s", self._server_id, session.name, cause)
-        del self._by_route[session.route], self._by_name[session.name]
-        self.clients.pop(session.name, None)
-        if session.request is not None:
-            self._results.append(session.marked(cause))
-            session.request = None
-        elif session.joined and session.first is None:
-            num_results = len(self._results)
-            self._results = [
-                r for r in self._results if r.client != session.name or r.number is not None
-            ]
-            # Otherwise its first result was never taken.
-            if len(self._results) == num_results:
-                self._losses[session.name] = session.marked(cause)
+        del self._by_route[session.route]
+        session.place.session = None
+        session.place.events.on_lost(f"client {session.name!r}: {cause}", in_order=in_order)
+
+
+def _session_at(place: ClientPlace) -> ServerSession:
+    assert place.session is not None
+    return place.session

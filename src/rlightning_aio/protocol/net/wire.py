@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = [
+    "DEFAULT_HEARTBEAT",
     "DTYPES",
     "HANDSHAKE_SECONDS",
+    "HARDWARE_HEARTBEAT",
     "MAX_FRAME_BYTES",
     "MAX_HEADER_BYTES",
     "MAX_HELLO_BYTES",
@@ -52,7 +54,7 @@ __all__ = [
     "portable",
 ]
 
-VERSION: Final = 2
+VERSION: Final = 3
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_HELLO_BYTES: Final = 256 << 10
 """Size of a hello's header; reading one takes 50 ms at most."""
@@ -60,6 +62,9 @@ MAX_FRAME_BYTES: Final = 64 << 20
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
+DEFAULT_HEARTBEAT: Final = 5.0
+HARDWARE_HEARTBEAT: Final = 1.0
+"""Seconds within which an end that is gone is found."""
 HANDSHAKE_SECONDS: Final = 2.0
 """Time for the handshake of a connection."""
 
@@ -91,11 +96,11 @@ class Untransferable(ValueError):
     """The format has no form for a value that should be sent."""
 
 
-def ping_ms(heartbeat: float) -> tuple[int, int]:
-    """Return how often ZMQ pings a peer that may be silent for `heartbeat` seconds, and how long
-    it waits for a sign of life then, in milliseconds.
+def ping_ms(heartbeat: float) -> tuple[int, int, int]:
+    """Return how often ZMQ pings a peer that may be silent for `heartbeat` seconds, how long it
+    waits for a sign of life then, and after which silence the peer is to give up, in milliseconds.
     """
-    return max(1, int(250 * heartbeat)), max(2, int(500 * heartbeat))
+    return int(250 * heartbeat), int(500 * heartbeat), int(750 * heartbeat)
 
 
 class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
@@ -114,12 +119,16 @@ class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
     """Actions may not fit the action space: the client transforms them."""
     reads_extras: bool = False
     """The client reads columns that the policy attaches to the action."""
+    hardware: bool = True
+    """The env moves something real, which only its user's reset may set in motion."""
 
 
 class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
-    """Server: you are in. The client resets its env and sends result 0."""
+    """Server: you are in. The first request will be a reset; until then, nothing moves."""
 
     env_id: str
+    heartbeat: float
+    """Seconds within which either end finds that the other is gone."""
 
 
 class Refusal(Struct, tag="refusal", tag_field="type", kw_only=True):

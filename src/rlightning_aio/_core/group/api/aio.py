@@ -14,7 +14,7 @@ from rlightning_aio._core.group.api.facade import only_result, steps_of
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
-    ServerHandleInterface,
+    ServerHandle,
 )
 from rlightning_aio._core.group.drivers.aio_driver import AioDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
@@ -117,8 +117,8 @@ class EnvGroup(GroupInterface):
             self._core.restore(time.monotonic(), snapshot, env_ids, source)
         )
 
-    def __getitem__(self, env_id: str) -> EnvHandle:
-        return self._handle(env_id, EnvHandle, ServerHandle)
+    def __getitem__(self, env_id: str) -> Any:
+        return self._handle(env_id, EnvHandle)
 
     def episode(
         self, env_id: str, seed: int | None = None, options: dict[str, Any] | None = None
@@ -144,10 +144,10 @@ class EnvGroup(GroupInterface):
         return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
     async def offload(self) -> None:
-        await self.call("offload")
+        await self.call("offload", env_ids=self._local_ids)
 
     async def reload(self) -> None:
-        await self.call("reload")
+        await self.call("reload", env_ids=self._local_ids)
 
     async def close(self) -> None:
         try:
@@ -190,20 +190,6 @@ class EnvHandle(EnvHandleInterface):
 
     async def reload(self) -> None:
         await super().reload()
-
-
-class ServerHandle(ServerHandleInterface, EnvHandle):
-    """An env_server of an asynchronous group; its clients' envs have handles of their own.
-
-    Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
-    and `reload` raise NotImplementedError.
-    """
-
-    async def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> list[EnvRet | MultiAgentEnvRet]:
-        procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
-        return (await self._driver.run(procedure))[0].values()
 
 
 def build_env_group(

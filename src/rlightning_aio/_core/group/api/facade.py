@@ -19,7 +19,6 @@ from rlightning_aio._core.group.state.conditions import NO_SPAN
 from rlightning_aio._core.group.timeline import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction
-from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -36,7 +35,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AutoResetContext",
     "Facade",
-    "asked",
     "default_min_results",
     "ensure_auto_reset",
     "is_resettable",
@@ -113,16 +111,10 @@ def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     return AutoResetContext(core, None, on_done=True, needs_limits=False)
 
 
-def asked(group: Any) -> list[str]:
-    """Ids as in `EnvGroup.pending`, but for clients that have come and were asked nothing yet."""
-    return group._driver.look(partial(group._core.pending, unasked=False))  # noqa: SLF001
-
-
 def is_resettable(group: Any, env_id: str) -> bool:
-    """Return False if an env may move something real, or is a client's, which may."""
-    envs = group._core.envs  # noqa: SLF001
-    slot = envs.find_one(env_id)
-    return slot < len(envs.all) and not ENVS.is_hardware(envs.configs[slot].backend)
+    """Return False if an env moves something real."""
+    core = group._core  # noqa: SLF001
+    return not core.tables.record_of(core.envs.find_one(env_id)).is_hardware
 
 
 def default_min_results(group: Any) -> int:
@@ -157,17 +149,17 @@ class Facade:
 
     @property
     def env_ids(self) -> list[str]:
-        """Ids of the local envs, then of the env_servers, in order."""
-        envs = self._core.envs
-        return [*envs.local_ids, *envs.server_ids]
+        """Ids of the local envs, then of the places of env_servers, in order."""
+        return list(self._core.envs.env_ids)
 
     def __len__(self) -> int:
         """The number of envs, each env_server counted once."""
-        return len(self.env_ids)
+        envs = self._core.envs
+        return envs.num_local + len(envs.server_ids)
 
     def size(self) -> int:
         """The number of local envs."""
-        return len(self._core.envs.local_ids)
+        return self._core.envs.num_local
 
     @property
     def metas(self) -> list[EnvMeta]:
@@ -180,7 +172,8 @@ class Facade:
         return self._core.supervisor.metas
 
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
-        """Observation space of each env, in the order of `env_ids`; None for an env_server.
+        """Observation space of each env, in the order of `env_ids`; None for a place
+        of an env_server before the first client of its entry has dialled in.
 
         Raises:
             GroupClosed: the group was not initialised, or is closed.
@@ -188,7 +181,8 @@ class Facade:
         return [meta.observation_space for meta in self.metas]
 
     def get_action_spaces(self) -> list[gym.Space[Any] | None]:
-        """Action space of each env, in the order of `env_ids`; None for an env_server.
+        """Action space of each env, in the order of `env_ids`; None for a place
+        of an env_server before the first client of its entry has dialled in.
 
         Raises:
             GroupClosed: the group was not initialised, or is closed.
@@ -240,12 +234,12 @@ class Facade:
     ) -> None:
         """Send a reset to each env; `collect_async` returns the first observations.
 
-        Never blocks, and doesn't wait for clients of an env_server.
+        Never blocks. What goes to a place without a client is pending until one dials in.
 
         Args:
             seed: as for `reset`.
             options: a dict, passed to each env.
-            env_ids: the envs to reset; None for all local ones and all connected clients.
+            env_ids: the envs to reset; None for all.
 
         Raises (before anything is sent):
             EnvBusy: an env has a reply outstanding, or appears twice.
@@ -357,16 +351,16 @@ class Facade:
         return self._driver.look(self._core.sums.by_env)
 
     def get_workers(self) -> list[dict[str, Any]]:
-        """The current state of each host: each worker, this process, and each env_server.
+        """The current state of each host: each worker, this process, each place for a client.
 
         Never waits; other tasks may be waiting for results or for `init`.
 
-        Keys: ``entry``; ``env_ids`` (for an env_server, of the connected clients); ``given_up``
+        Keys: ``entry``; ``env_ids``; ``client`` (its name, of a place that has one); ``given_up``
         (ids of envs that no request reaches any more: all of a failed worker, or an awaitable one
         that is not rebuilt); ``pid`` (of a process on this machine, else None); ``state``
         (``"new"`` before `init`, ``"starting"``, ``"up"``, ``"down"`` before a replacement,
-        ``"failed"``, ``"closed"``); ``owed`` (ids of envs with a request in flight, the oldest
-        first, which is the order of execution);
+        ``"empty"`` of a place without a client, ``"failed"``, ``"closed"``); ``owed`` (ids of envs
+        with a request in flight, the oldest first, which is the order of execution);
         ``owed_seconds`` (the age of the oldest); ``restarts`` (the number of replacements).
 
         Raises:

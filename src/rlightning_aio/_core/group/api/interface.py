@@ -14,14 +14,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rlightning_aio._core.group.engine.core import Core
-    from rlightning_aio._core.hosts.base import Membership
+    from rlightning_aio._core.hosts.base import Server
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.types import EnvMeta, PolicyResponse
+    from rlightning_aio.types import PolicyResponse
 
-__all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandleInterface"]
+__all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandle"]
 
 E = TypeVar("E", bound="EnvHandleInterface")
-S = TypeVar("S", bound="ServerHandleInterface")
 
 
 class GroupInterface(Facade):
@@ -30,8 +29,8 @@ class GroupInterface(Facade):
     def init(self) -> Any:
         """Start all worker processes in parallel, and build their envs.
 
-        Returns one `EnvMeta` for each local env, then one without spaces for each env_server,
-        in the order of `env_ids`. If it fails or is cancelled, nothing is left running.
+        Returns one `EnvMeta` for each env, in the order of `env_ids`. It doesn't wait for clients:
+        the place of one has no spaces yet. If it fails or is cancelled, nothing is left running.
 
         Raises:
             StartFailed: an env could not be built, or took longer than ``start_timeout``.
@@ -57,8 +56,8 @@ class GroupInterface(Facade):
             seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
                 gives one seed for each env, a mapping seeds by id.
             options: a dict, passed to each env.
-            env_ids: the envs to reset; the results have this order. None: all local envs, then
-                the clients of env_servers, after waiting until enough have joined.
+            env_ids: the envs to reset; the results have this order. None: all, after waiting until
+                every place of an env_server has a client.
 
         Returns the first observations, in fresh arrays (views, if the group was built with
         ``zero_copy``), and a list of flags that are all False. Cancelled, it leaves the results
@@ -70,9 +69,8 @@ class GroupInterface(Facade):
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
             TypeError: the options are no dict, or can't be sent to a worker or a client.
-            TimeoutError: too few clients of an env_server have joined in time.
-            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
-                others' results are in the error's ``results``.
+            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or no client has dialled in for
+                it; the others' results are in the error's ``results``.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError
@@ -96,6 +94,7 @@ class GroupInterface(Facade):
             UnknownEnv: no env of this group has that id.
             EnvRaised, EnvAway, WorkerDied, EnvHung: an env failed; the others' results are in the
                 error's ``results``.
+            ResetNeeded: the env of an env_server was never reset; nothing was sent.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError
@@ -126,7 +125,7 @@ class GroupInterface(Facade):
         step limit, as in `BatchedData.limit_reached`. Cancelled, it loses no result.
 
         Raises:
-            NothingPending: no request is outstanding, and no client can join.
+            NothingPending: no request is outstanding.
             ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
                 `max_results`.
             TimeoutError: `deadline` has passed; the next call returns the results.
@@ -147,8 +146,8 @@ class GroupInterface(Facade):
         Within a second, whatever an env does: an awaitable env's step is cancelled, and the env is
         closed and rebuilt. An env of a worker or a Ray actor may end its step within 0.2 seconds;
         then its worker is killed and replaced, which costs other envs in it their episodes, as
-        any death does (`on_worker_death` and `max_restarts` don't count this one). An env_server
-        ends the client's session, and the client may come back with a new one. Only in this process
+        any death does (`on_worker_death` and `max_restarts` don't count this one). So is a client,
+        which may come back with a new session. Only in this process
         nothing can end a step that has begun; those that haven't are withdrawn.
 
         The episodes are over: reset the envs, or step them, which resets them first and marks the
@@ -193,7 +192,7 @@ class GroupInterface(Facade):
             name: of a method of each env or of its simulator's wrappers, outermost first;
                 ``get_attr`` and ``set_attr`` read and set an attribute.
             args: of the method.
-            env_ids: the envs; None for all local envs.
+            env_ids: the envs; None for all.
             kwargs: of the method.
 
         Returns a list with the value of each env, in the order of `env_ids`: copies from a worker,
@@ -274,12 +273,17 @@ class GroupInterface(Facade):
         """
         raise NotImplementedError
 
-    def _handle(self, env_id: str, of_env: type[E], of_server: type[S]) -> E | S:
-        server = self._core.supervisor.members.server(env_id)
-        if server is not None:
-            return of_server(self, server)
+    def _handle(self, env_id: str, of_env: type[E]) -> Any:
+        for server in self._core.supervisor.places.servers:
+            if server.server_id == env_id:
+                return ServerHandle(server)
         self._core.envs.find_one(env_id)
         return of_env(self, env_id)
+
+    @property
+    def _local_ids(self) -> list[str]:
+        envs = self._core.envs
+        return list(envs.env_ids[: envs.num_local])
 
     def offload(self) -> Any:
         """Free the device memory of every local env until `reload`.
@@ -393,11 +397,10 @@ class EnvHandleInterface:
         return self.call("reload")
 
 
-class ServerHandleInterface(EnvHandleInterface):
-    """The methods of a handle on one env_server."""
+class ServerHandle:
+    """One env_server of a group; its places are envs with handles of their own."""
 
-    def __init__(self, group: Any, server: Membership) -> None:
-        super().__init__(group, server.server_id)
+    def __init__(self, server: Server) -> None:
         self._server = server
 
     @property
@@ -410,36 +413,6 @@ class ServerHandleInterface(EnvHandleInterface):
         return self._server.address()
 
     @property
-    def clients(self) -> list[str]:
-        """Ids of the envs of connected clients, ``<server id>/<client name>``."""
-        return [f"{self.env_id}/{name}" for name in self._server.members()]
-
-    @property
-    def metas(self) -> list[EnvMeta]:
-        """Metadata of these clients' envs, in the same order."""
-        return list(self._server.members().values())
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
-
-        Args:
-            seed: client k, in the order of their names, gets ``seed + k`` (counting
-                sub-environments).
-            options: passed to each.
-
-        Returns a list with one result for each client, in the order of their names. Cancelled
-        while the clients reset, it leaves the results to the group's `collect_async`.
-
-        Raises:
-            TimeoutError: too few clients have joined within ``connect_timeout``.
-            EnvBusy: a client has a reply outstanding; nothing was sent.
-            TypeError: the options can't be sent to a client; nothing was sent.
-            EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
-                results are in the error's ``results``.
-            GroupClosed: the group was not initialised, or is closed.
-        """
-        raise NotImplementedError
-
-    def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Raise NotImplementedError, because methods of remote envs can't be called."""
-        raise NotImplementedError(f"{self.env_id} is an env_server; it can't call {name}()")
+    def clients(self) -> dict[str, str]:
+        """Names of the clients that are there, by the ids of their envs."""
+        return dict(self._server.clients())

@@ -13,7 +13,7 @@ from rlightning_aio._core.group.api.facade import only_result, steps_of
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
-    ServerHandleInterface,
+    ServerHandle,
 )
 from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
@@ -117,14 +117,14 @@ class EnvGroup(GroupInterface):
     ) -> tuple[BatchedData, list[bool]]:
         return self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids, source))
 
-    def __getitem__(self, env_id: str) -> EnvHandle:
-        return self._handle(env_id, EnvHandle, ServerHandle)
+    def __getitem__(self, env_id: str) -> Any:
+        return self._handle(env_id, EnvHandle)
 
     def offload(self) -> None:
-        self.call("offload")
+        self.call("offload", env_ids=self._local_ids)
 
     def reload(self) -> None:
-        self.call("reload")
+        self.call("reload", env_ids=self._local_ids)
 
     def close(self) -> None:
         try:
@@ -152,20 +152,6 @@ class EnvHandle(EnvHandleInterface):
         slot = self._core.envs.find_one(self._env_id)
         procedure = self._core.calls.call_one(time.monotonic(), slot, (name, args, kwargs))
         return self._driver.run(procedure)
-
-
-class ServerHandle(ServerHandleInterface, EnvHandle):
-    """An env_server of a synchronous group; its clients' envs have handles of their own.
-
-    Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
-    and `reload` raise NotImplementedError.
-    """
-
-    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> list[EnvRet | MultiAgentEnvRet]:
-        procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
-        return self._driver.run(procedure)[0].values()
 
 
 def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:

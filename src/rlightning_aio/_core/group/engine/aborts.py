@@ -15,13 +15,11 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY
 from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
-    from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
@@ -40,15 +38,14 @@ class Aborts:
         tables: Tables,
         supervisor: Supervisor,
         results: Results,
-        arrivals: Arrivals,
         waiting: Waiting,
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
+        self._record_of = tables.record_of
         self._episodes = tables.episodes
         self._supervisor = supervisor
         self._results = results
-        self._arrivals = arrivals
         self._intake = waiting.intake
         self._waiting = waiting
         self._sums = tables.sums
@@ -62,9 +59,7 @@ class Aborts:
             self._results.let_go(ready)
             self._sums.note_failures(ready, _WHY.kind)
         failed = self._requests.collector.free(slots.tolist())
-        dropped = np.concatenate((ready, failed))
-        self._abandon(dropped)
-        self._arrivals.admit(dropped, self._intake.now)
+        self._abandon(np.concatenate((ready, failed)))
 
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.
@@ -78,6 +73,7 @@ class Aborts:
         requests.abort(wanted, [self._fault(slot) for slot in wanted.tolist()])
         self._sums.note_failures(new, _WHY.kind)
         self._abandon(new)
+        self._supervisor.places.withdraw(new)
         for host_id, entry in self._supervisor.detector.abort(new, now):
             requests.end(host_id, entry)
         self._waiting.poll()
@@ -85,7 +81,6 @@ class Aborts:
         self._waiting.wake_serving()  # It may have results of these that it has not handed out.
         chosen = set(slots.tolist())
         now = yield from self._waiting.until(now, lambda: len(requests.unwanted & chosen))
-        self._arrivals.admit(slots, self._intake.now)
         return now
 
     def _is_wanted(self, slot: int) -> bool:
@@ -105,9 +100,13 @@ class Aborts:
         return fault
 
     def _abandon(self, slots: NDArray[np.intp]) -> None:
-        """Note that episodes are over; only its user resets a robot, or the env of a client."""
+        """Note that episodes are over; only its user resets what moves something real."""
         chosen: list[int] = slots.tolist()
         for slot in chosen:
-            backend = self._envs.configs[slot].backend
-            if slot < len(self._envs.all) and not ENVS.is_hardware(backend):
+            record = self._record_of(slot)
+            if record.place is not None and not record.was_shown:
+                continue  # It has no episode yet.
+            if record.is_hardware:
+                record.needs_reset = record.place is not None
+            else:
                 self._episodes.lose([slot], _WHY)

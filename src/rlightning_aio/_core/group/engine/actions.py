@@ -61,7 +61,7 @@ def write_actions(
     columns = columns_of_responses(batch)
     in_rows = beside is None or not np.count_nonzero(beside)
     if columns is not None and len(layout.slabs) == 1 and in_rows:
-        rows = rows_in(layout, slots, envs.all)
+        rows = rows_in(layout, slots, envs.local)
         write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
     else:
         _write_one_by_one(batch, slots, envs, layout, beside)

@@ -16,7 +16,6 @@ from rlightning_aio._core.group.drivers.wait import TURN, Wait
 from rlightning_aio._core.group.engine.waiting import REPLIES
 from rlightning_aio.batch.contents import are_over, lost_rows
 from rlightning_aio.batch.data import BatchedData
-from rlightning_aio.errors import EnvAway
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -209,12 +208,6 @@ class AgentSteps:
                 seeds = [cast("EpisodeStart", step.what).seed for step in asked]
             return self._resets.prepared(now, seeds, first.options, env_ids)
         slots, packed = self._steps.write(BatchedData(env_ids, [step.what for step in asked]), now)
-        if len(slots) < len(asked):
-            raise EnvAway(
-                f"the client of env {env_ids[0]!r} has left since its last result; the first "
-                "result of one that is back comes through collect_async",
-                env_id=env_ids[0],
-            )
         return slots, partial(self._steps.send, slots, packed, now)
 
     def _hand_out(self, ticket: Ticket) -> bool:
@@ -224,10 +217,8 @@ class AgentSteps:
         for slot, fault in ticket.errors.items():
             if not (reply := self._ended(slot)).done():
                 reply.set_exception(fault)
-        failed = [*ticket.errors]
         ticket.errors.clear()
         slots = self._requests.settle_ended(ticket)
-        self._steps.note_freed(failed)
         if len(slots):
             batch, _ = self._steps.hand_out(slots)
             self._resolve(batch, slots)

@@ -15,7 +15,6 @@ import numpy as np
 
 from rlightning_aio._core.group.engine.aborts import Aborts
 from rlightning_aio._core.group.engine.agent_steps import AgentSteps
-from rlightning_aio._core.group.engine.arrivals import Arrivals
 from rlightning_aio._core.group.engine.calls import Calls
 from rlightning_aio._core.group.engine.dispatch import Dispatch
 from rlightning_aio._core.group.engine.intake import Intake
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.episodes.seeds import Seeds
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Membership
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Core"]
@@ -69,17 +67,16 @@ class Core:
         self.lifetime = tables.lifetime
         self.sums = tables.sums
         self.results = results = Results(tables, zero_copy=zero_copy)
-        arrivals = Arrivals(tables, results)
-        self.intake = intake = Intake(tables, supervisor, results, arrivals)
+        self.intake = intake = Intake(tables, supervisor, results)
         self.apply_completions = intake.apply_completions
         self.waiting = waiting = Waiting(tables, supervisor, poller, intake)
         dispatch = Dispatch(tables, supervisor, poller, waiting)
-        self.steps = Steps(tables, supervisor, results, arrivals, dispatch, waiting)
+        self.steps = Steps(tables, supervisor, results, dispatch, waiting)
         self.calls = Calls(tables, dispatch, waiting)
         self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, results, waiting)
         self._resets = Resets(tables, supervisor, dispatch, results, waiting)
         self.agent_steps = AgentSteps(tables, self.steps, self._resets, waiting)
-        self._aborts = Aborts(tables, supervisor, results, arrivals, waiting)
+        self._aborts = Aborts(tables, supervisor, results, waiting)
 
     # -- life -------------------------------------------------------------------------
 
@@ -120,24 +117,13 @@ class Core:
         """Reset envs and wait for all of them; without `env_ids`, drop what is in flight first."""
         with self.observed.call("reset", now):
             # What another call waits for is not dropped; the reset is refused then.
-            others = self.steps.collecting or np.count_nonzero(self.requests.owner > COLLECTOR)
-            if env_ids is None and not (others or self.supervisor.members.possible):
+            others = self.waiting.collecting or np.count_nonzero(self.requests.owner > COLLECTOR)
+            if env_ids is None and not others:
+                self.supervisor.places.take_back(COLLECTOR)
                 with suppress(EnvFault):
                     yield from self._drain(now, None)
                 now = self.tables.clock()
             return self.steps.settled(*(yield from self._resets.reset(now, seed, options, env_ids)))
-
-    def reset_members(
-        self,
-        now: float,
-        server: Membership,
-        seed: int | None,
-        options: dict[str, Any] | None,
-    ) -> Procedure[tuple[BatchedData, Flags]]:
-        """Reset all envs that have joined a host and wait for them."""
-        with self.observed.call("reset", now):
-            replied = yield from self._resets.reset_members(now, server, seed, options)
-            return self.steps.settled(*replied)
 
     def reset_async(
         self,
@@ -179,7 +165,7 @@ class Core:
         self.steps.check_collectable()
         collector, unwanted = self.requests.collector, self.requests.unwanted
         end = None if deadline is None else now + deadline
-        self.steps.collecting = True
+        self.waiting.collecting = True
         try:
             self.intake.now = now
             now = yield from self.waiting.until(
@@ -188,7 +174,7 @@ class Core:
             if deadline is not None:
                 yield from self._aborts.end(self._all_slots, now)
         finally:
-            self.steps.collecting = False
+            self.waiting.collecting = False
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
             slots = collector.pop_ready(collector.num_ready)
@@ -216,13 +202,9 @@ class Core:
             replied = yield from self._snapshots.restore(now, data, env_ids, source)
             return self.steps.settled(*replied)
 
-    def pending(self, *, unasked: bool = True) -> list[str]:
-        """Return the ids of envs whose result, value or error was not returned yet.
-
-        Not `unasked`: without clients whose first result answers no request.
-        """
+    def pending(self) -> list[str]:
+        """Return the ids of envs whose result, value or error was not returned yet."""
         self.lifetime.check_open()
         self.intake.apply_completions()
         state, owner = self.requests.state, self.requests.owner
-        slots = np.flatnonzero((state != State.IDLE) & (owner != NOBODY))
-        return self.envs.names.ids(slots if unasked else slots[~self.requests.joined(slots)])
+        return self.envs.names.ids(np.flatnonzero((state != State.IDLE) & (owner != NOBODY)))

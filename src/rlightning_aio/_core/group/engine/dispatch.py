@@ -102,14 +102,11 @@ class Dispatch:
         return self._requests.is_idle(slot)
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
-        """Raise `NotImplementedError` if any of `slots` belongs to a member."""
-        if (
-            self._supervisor.members.possible
-            and (remote := slots[slots >= len(self._envs.all)]).size
-        ):
+        """Raise `NotImplementedError` if any of `slots` belongs to a client."""
+        if (remote := slots[slots >= self._envs.num_local]).size:
             raise NotImplementedError(
-                f"can't {what} {self._envs.describe(int(remote[0]))}: remote envs answer when they "
-                "can; use step_async and collect_async"
+                f"can't {what} {self._envs.describe(int(remote[0]))}: clients answer resets and "
+                "steps only; nothing was sent"
             )
 
     def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> Packed:
@@ -117,9 +114,9 @@ class Dispatch:
         chosen = slots[out_of_band.positions].tolist()
         try:
             for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
-                record = self._record_of(slot)
-                if record.membership is not None:
-                    record.membership.check_step(slot - record.slots.start, action, extras)
+                place = self._record_of(slot).place
+                if place is not None:
+                    place.check_step(action, extras)
             return out_of_band.positions, [
                 self.packed(slot, content, "the response")
                 for slot, content in zip(chosen, out_of_band.contents, strict=True)
@@ -142,12 +139,23 @@ class Dispatch:
             packed.append(self.packed(slot, given, "the options"))
         return packed
 
-    def _check_reset(self, slot: int, seed: int | None, options: dict[str, Any]) -> None:
-        record = self._record_of(slot)
-        if record.membership is None:
+    def resets_of_places(
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
+    ) -> list[Any]:
+        """Return what resets of places are sent with, which is never in a row."""
+        found: list[Any] = []
+        for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
+            given = (None if seed < 0 else seed, options)
+            self._check_reset(slot, *given)
+            found.append(given)
+        return found
+
+    def _check_reset(self, slot: int, seed: int | None, options: dict[str, Any] | None) -> None:
+        place = self._record_of(slot).place
+        if place is None:
             return
         try:
-            record.membership.check_reset(slot - record.slots.start, seed, options)
+            place.check_reset(seed, options)
         except ValueError as error:
             raise TypeError(f"{error}; nothing was sent") from error
 

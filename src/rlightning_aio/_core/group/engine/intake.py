@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.supervision.fault_messages import without_terminal
 from rlightning_aio._core.hosts.messages import (
     Attached,
@@ -20,13 +19,13 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Died,
     ErrorText,
-    Joined,
     Lost,
     NewSchema,
     NotBuilt,
     Raised,
     Reported,
     Result,
+    Taken,
     Value,
     Withdrawn,
 )
@@ -36,12 +35,12 @@ from rlightning_aio.protocol.entries import Operation, answers_with_value
 from rlightning_aio.protocol.slab import AS_BEFORE
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.results import Results
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.errors import EnvFault, EnvRaised
@@ -64,7 +63,6 @@ class Intake:
         tables: Tables,
         supervisor: Supervisor,
         results: Results,
-        arrivals: Arrivals,
     ) -> None:
         self.now = 0.0
         self._completions = tables.completions
@@ -76,7 +74,6 @@ class Intake:
         self._supervisor = supervisor
         self._results = results
         self._episodes = tables.episodes
-        self._arrivals = arrivals
         self._sums = tables.sums
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
@@ -86,7 +83,7 @@ class Intake:
             Lost: self._on_lost,
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
-            Joined: self._on_joined,
+            Taken: self._on_taken,
             Died: self._on_died,
             **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
         }
@@ -112,8 +109,8 @@ class Intake:
         self._requests.deliver(self._requests.alone(slot))
         if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
-        if completion.is_loss:
-            self._results.mark_away(slot)
+        record = self._record_of(slot)
+        record.was_shown, record.needs_reset = True, False
         if self._conditions.unusual:
             self._note_answered(self._requests.alone(slot))
 
@@ -206,27 +203,48 @@ class Intake:
             self._fail(alone, lambda _: fault)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
-        slot = self._requests.end(completion.host_id, completion.entry)
-        if slot is None:
-            return
-        self._episodes.ended_without_result(slot)
-        if self._requests.owner[slot] == COLLECTOR:
-            self._arrivals.withdraw(slot)
-            return
-        text = (
-            f"the client of {self._envs.describe(slot)} is not connected; its next first result "
-            "comes through collect_async when it is back"
+        self._requests.end(completion.host_id, completion.entry)
+
+    def _on_taken(self, completion: Taken) -> None:
+        """Give a client the request that was held for it.
+
+        What moves something real gets a reset that its user has asked for, and nothing else: a
+        request without arguments is one that was made of a step, or of one that was lost.
+        """
+        record = self._supervisor.records[completion.host_id]
+        for entries, arguments in self._supervisor.take(completion):
+            if record.is_hardware and arguments is None:
+                slots = np.array(record.slots, np.intp)
+                self._requests.in_flight[completion.host_id] -= len(entries)
+                self._end_by_loss(slots, self._away)
+            else:
+                record.host.submit(entries, arguments)
+        self._requests.anything_ended = True
+
+    def _away(self, slots: NDArray[np.intp]) -> EnvAway:
+        slot = slots.item(0)
+        return EnvAway(
+            f"{self._envs.describe(slot)} moves something real now, and only a reset that you ask "
+            "for may set that in motion; reset it to go on",
+            env_id=self._envs.env_ids[slot],
         )
-        away = EnvAway(text, env_id=self._envs.env_ids[slot])
-        self._fail(self._requests.alone(slot), lambda _: away)
+
+    def end_held(self, records: Sequence[HostRecord]) -> None:
+        """End requests that have waited for clients for too long, with one error for each call."""
+        slots = self._supervisor.places.drop(records)
+        self._fail(slots, lambda _: self._supervisor.places.away(records))
+
+    def _end_by_loss(
+        self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
+    ) -> None:
+        """End requests that report a loss, and are no longer in flight, in an error."""
+        for slot in slots.tolist():
+            self._episodes.ended_without_result(slot)
+        self._fail(slots, error_for)
 
     def _on_new_schema(self, completion: NewSchema) -> None:
         slots = self._supervisor.records[completion.host_id].slots
         self._results.note_schema(slots.start, completion.number, completion.schema)
-
-    def _on_joined(self, completion: Joined) -> None:
-        slots = self._supervisor.records[completion.host_id].slots
-        self._arrivals.join(completion, slots.start, self.now)
 
     def _fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
@@ -251,7 +269,9 @@ class Intake:
             self._fail(owed, loss.error)
             return
         self._keep_ready(loss.slots)
-        if loss.resets:
+        record = self._supervisor.records[loss.host_id]
+        is_lost = loss.resets if record.place is None else record.was_shown
+        if is_lost:
             # The episodes of aborted requests were lost before.
             over = {slot for slot in unwanted if episodes.why_lost(slot) is not None}
             episodes.lose([slot for slot in loss.slots if slot not in over], loss.why)
@@ -273,7 +293,8 @@ class Intake:
             return
         self._episodes.report_losses(slots)
         entries = self._requests.ask_again(host_id, slots)
-        self._layout.write_seeds(slots, np.full(len(slots), AS_BEFORE))
+        if self._supervisor.records[host_id].place is None:  # Which remembers its reset itself.
+            self._layout.write_seeds(slots, np.full(len(slots), AS_BEFORE))
         self._supervisor.submit(host_id, entries, None)
 
     def _note_answered(self, slots: NDArray[np.intp]) -> None:

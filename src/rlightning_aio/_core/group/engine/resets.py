@@ -1,17 +1,18 @@
 """`Resets`: begins episodes, of envs that a caller names, or of all that are there.
 
-It gives resets to their envs and waits for the replies; the core returns the results. Envs that
-join by themselves may be waited for, and their first results count as those of a reset.
+It gives resets to their envs and waits for the replies; the core returns the results. A reset of
+all envs waits until every place of an env_server has a client.
 """
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Procedure, Wait
-from rlightning_aio._core.group.episodes.seeds import checked_seed, seeds_for
+from rlightning_aio._core.group.episodes.seeds import seeds_for
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_BEFORE
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Membership
 
 __all__ = ["Resets"]
 
@@ -49,7 +49,7 @@ class Resets:
         self._layout = tables.layout
         self._episodes = tables.episodes
         self._supervisor = supervisor
-        self._members = supervisor.members
+        self._places = supervisor.places
         self._dispatch = dispatch
         self._results = results
         self._intake = waiting.intake
@@ -63,9 +63,9 @@ class Resets:
         env_ids: Sequence[str] | None,
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
-        if env_ids is None and self._members.possible:
-            now = yield from self._await_members(now)
-        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        if env_ids is None and self._places.any:
+            now = yield from self._await_clients(now)
+        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         return (yield from self._reset(now, seed, options, slots))
 
     def prepared(
@@ -75,23 +75,6 @@ class Resets:
         slots = self._dispatch.distinct(env_ids)
         return slots, self._prepared(now, seed, options, slots)
 
-    def reset_members(
-        self,
-        now: float,
-        server: Membership,
-        seed: int | None,
-        options: dict[str, Any] | None,
-    ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
-        """Reset all envs that have joined a host, and wait for them."""
-        now = yield from self._await_members(now)
-        slots = np.array(server.member_indices(), np.intp) + server.first_slot
-        seeds = None
-        if seed is not None:
-            self._members.rank()
-            offsets = self._envs.seed_offset[slots]
-            seeds = (checked_seed(seed) + offsets - offsets[:1]).tolist()
-        return (yield from self._reset(now, seeds, options, slots))
-
     def reset_async(
         self,
         now: float,
@@ -100,17 +83,20 @@ class Resets:
         env_ids: Sequence[str] | None,
     ) -> None:
         """Send resets, whose results the collector gets."""
-        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         seeds = self._seeds_for(slots, seed, now)
         self._dispatch.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
         self._send(slots, seeds, options, packed, COLLECTOR, now)
 
-    def _await_members(self, now: float) -> Procedure[float]:
-        """Wait until each host that envs join has enough."""
+    def _await_clients(self, now: float) -> Procedure[float]:
+        """Wait until every place has a client."""
         began = now
-        while (missing := self._members.missing(now - began)) is not None:
-            now = yield Wait(self._supervisor.next_check(began + missing))
+        while empty := self._places.empty():
+            due = began + min(r.place.server.connect_timeout for r in empty if r.place is not None)
+            if now >= due:
+                raise self._places.away(empty)
+            now = yield Wait(self._supervisor.next_check(due if due < math.inf else None))
             self._waiting.check(now)
         return now
 
@@ -125,18 +111,11 @@ class Resets:
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
     ) -> Callable[[Ticket], None]:
         seeds = self._seeds_for(slots, seed, now)
-        joined = self._requests.joined(slots)
-        self._dispatch.check_sendable(now, slots[~joined], "reset")
+        self._dispatch.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
 
         def send(ticket: Ticket) -> None:
-            asked, own_seeds = slots, seeds
-            if joined.any():
-                enough = seed is None and options is None
-                self._take_first_results(slots[joined], ticket, enough=enough)
-                if enough:
-                    asked, own_seeds = slots[~joined], seeds[~joined]
-            self._send(asked, own_seeds, options, packed, ticket.owner, now)
+            self._send(slots, seeds, options, packed, ticket.owner, now)
 
         return send
 
@@ -144,14 +123,17 @@ class Resets:
         """Apply completions, and return the seeds of resets that are about to be sent."""
         self._intake.now = now
         self._intake.apply_completions()
-        if self._members.possible:
-            self._members.rank()
         return seeds_for(self._envs, seed, slots)
 
     def _packed_resets(
         self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
     ) -> list[Any] | None:
-        return None if options is None else self._dispatch.packed_resets(slots, seeds, options)
+        if options is not None:
+            return self._dispatch.packed_resets(slots, seeds, options)
+        if slots.size and int(slots.max()) >= self._envs.num_local:
+            is_place = slots >= self._envs.num_local
+            self._dispatch.resets_of_places(slots[is_place], seeds[is_place], None)
+        return None
 
     def _send(
         self,
@@ -185,19 +167,14 @@ class Resets:
     ) -> None:
         entries = self._requests.issue(slots, Operation.RESET, owner, now)
         self._results.note_unasked(slots)
-        if packed is None:
-            self._layout.write_seeds(slots, seeds)
-        self._dispatch.hand_over(slots, entries, packed)
-
-    def _take_first_results(self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool) -> None:
-        """Use the first results of envs that have just joined for a reset.
-
-        An env that joins has been reset. That is `enough` unless the reset has a seed or options,
-        so a robot that takes minutes to reset isn't reset twice.
-        """
-        if enough:
-            self._requests.claim(slots, ticket)
+        num_local = self._envs.num_local
+        if packed is not None:
+            self._dispatch.hand_over(slots, entries, packed)
             return
-        self._requests.drop(slots)
-        for slot in slots.tolist():
-            self._results.drop(slot)
+        is_place = slots >= num_local
+        local = ~is_place
+        self._layout.write_seeds(slots[local], seeds[local])
+        self._dispatch.hand_over(slots[local], entries[local])
+        # A place has its arguments with it: it may have no row yet.
+        given = self._dispatch.resets_of_places(slots[is_place], seeds[is_place], None)
+        self._dispatch.hand_over(slots[is_place], entries[is_place], given)

@@ -11,7 +11,6 @@ from rlightning_aio._core.group.state.conditions import BESIDE_ROWS
 from rlightning_aio._core.group.state.slab_layout import rows_in
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import UNASKED, copied
-from rlightning_aio.outcomes import Outcome
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import Rows, gather
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -125,22 +124,12 @@ class Results:
         found = self._out_of_band.get(report.slot)
         if isinstance(found, dict):
             info, why = cast("dict[str, Any]", found["info"]), report.why
-            info["worker_restarted"] = why.cause
+            is_place = report.slot >= self._envs.num_local
+            info["client_lost" if is_place else "worker_restarted"] = why.cause
             if why.at_fault is not None:
                 info["env_at_fault"] = why.at_fault
             info["outcome"] = why.outcome(self._envs.env_ids[report.slot])
         self._mark(report.slot)
-
-    def mark_away(self, slot: int) -> None:
-        """Mark a result as one of a client that is gone; it will be truncated."""
-        self.detach_info(slot)
-        found = self._out_of_band.get(slot)
-        if isinstance(found, dict):
-            info = cast("dict[str, Any]", found["info"])
-            env_id = self._envs.env_ids[slot]
-            cause = info.get("client_lost", "its client is gone")
-            info["outcome"] = Outcome("env_away", "infrastructure", cause, env_id)
-        self._mark(slot)
 
     def _mark(self, slot: int) -> None:
         self._restarted[slot] = self._any_restarted = True
@@ -166,13 +155,16 @@ class Results:
     def gather(self, slots: NDArray[np.intp]) -> list[ResultColumns]:
         """Copy the results of `slots` out of their rows: one part for each layout."""
         layout, width, restarted = self._layout, self._info_width, None
-        if len(layout.slabs) == 1:
+        in_first = len(layout.slabs) == 1
+        if not in_first and layout.num_in_first and len(slots):  # Of clients are the others.
+            in_first = slots is self._envs.local or int(slots.max()) < layout.num_in_first
+        if in_first:
             chosen: list[_Chosen] = [(layout.slabs[0], slots, None)]
         else:
             chosen = self._by_slab(slots)
         parts: list[ResultColumns] = []
         for slab, own, positions in chosen:
-            if own is self._envs.all:
+            if own is self._envs.local and layout.num_in_first:
                 rows: Rows = slice(0, len(own))
             else:
                 rows = own if layout.row_is_slot else layout.row[own]
@@ -226,7 +218,7 @@ class Results:
         """Copy the sums of the episodes that end in `part`; its rows are as they were."""
         slots, layout = part.slots, self._layout
         slab = layout.slabs[layout.slab.item(slots.item(0))]
-        rows = rows_in(layout, slots, self._envs.all)
+        rows = rows_in(layout, slots, self._envs.local)
         part.episode_return, part.episode_length = kernel.gather(
             (slab.episode_return, slab.episode_length), rows
         )
@@ -283,9 +275,7 @@ class Results:
         """Fresh columns, or read-only views where the group has those and the rows allow it."""
         if slab.observation is None:
             return None
-        # The rows of envs that join change without a request.
-        has_views = self._zero_copy and slab.sent_ns is None
-        contiguous = _contiguous(rows) if has_views else None
+        contiguous = _contiguous(rows) if self._zero_copy else None
         if contiguous is None:
             return gather(slab.observation, rows)
 

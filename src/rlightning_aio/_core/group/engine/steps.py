@@ -27,17 +27,14 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
-from rlightning_aio.errors import BadAction, EnvAway, NothingPending, RLightningError
+from rlightning_aio.errors import BadAction, NothingPending, RLightningError
 from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_BEFORE, TRUNCATED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
-
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.engine.arrivals import Arrivals
     from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
@@ -72,10 +69,7 @@ class Steps:
 
     Args:
         tables: of the group; batches of results say that they are from these.
-        supervisor, results, arrivals, dispatch, waiting: of the group.
-
-    Attributes:
-        collecting: a call of `collect` waits.
+        supervisor, results, dispatch, waiting: of the group.
     """
 
     def __init__(
@@ -83,7 +77,6 @@ class Steps:
         tables: Tables,
         supervisor: Supervisor,
         results: Results,
-        arrivals: Arrivals,
         dispatch: Dispatch,
         waiting: Waiting,
     ) -> None:
@@ -100,19 +93,19 @@ class Steps:
         self._completions = tables.completions
         self._driver = tables.driver
         self._results = results
-        self._arrivals = arrivals
         self._dispatch = dispatch
         self._waiting = waiting
         self._intake = waiting.intake
         self._sums = tables.sums
-        self.collecting = False
 
     def begin(self) -> None:
         """Note what kind of envs were started."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
-        is_inline = len(hosts) == 1 and isinstance(hosts[0], Executing)
-        self._requests.in_rings = None not in self._requests.rings
-        in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
+        # Places are empty as yet; `_asks_a_place` finds requests to them.
+        local = [host for host in hosts if host.first_slot < envs.num_local]
+        is_inline = len(local) == 1 and isinstance(local[0], Executing)
+        self._requests.in_rings = None not in self._requests.rings[: len(local)]
+        in_one_slab = len(slabs) == 1 and envs.num_local > 0
         ordinary = (
             in_one_slab
             and (is_inline or self._requests.in_rings)
@@ -121,7 +114,7 @@ class Steps:
         )
         self._conditions.note(UNLIKE_ENVS, not ordinary)
         if ordinary:
-            self._all_rows = slice(0, len(envs.all))
+            self._all_rows = slice(0, envs.num_local)
             leaf, column = slabs[0].action_columns[0]
             self._action_shape = leaf.shape
             # Of a Dict or Tuple, `write_column` finds the arrays.
@@ -146,8 +139,6 @@ class Steps:
         try:
             slots, packed = self.write(batch, now)
             send = partial(self.send, slots, packed, now)
-            if self._supervisor.members.possible:
-                send, slots = self._with_back(batch, send, slots), self._arrivals.asked
             ticket, now = yield from self._waiting.ask(now, slots, send)
             if ticket.errors:
                 self._raise_faults(ticket)
@@ -157,31 +148,14 @@ class Steps:
                 self._observed.observer.note_call("step", began)
         return results, flags if self._episodes.auto_reset_is_open else None
 
-    def _with_back(
-        self, batch: BatchedData, send: Callable[[Ticket], None], slots: NDArray[np.intp]
-    ) -> Callable[[Ticket], None]:
-        """Have the first results of envs that are back answer their responses, too."""
-        arrivals = self._arrivals
-        if len(slots) + len(arrivals.back) < len(arrivals.asked):
-            raise EnvAway(
-                "a client of the batch has left, and another has taken its place; nothing was sent",
-                env_id=next(i for i in batch.env_ids() if i not in self._envs.names.env_ids),
-            )
-
-        def send_and_claim(ticket: Ticket) -> None:
-            self._requests.claim(arrivals.back, ticket)
-            send(ticket)
-
-        return send_and_claim if len(arrivals.back) else send
-
     def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
         """Wait for results by the rules of `EnvGroup.collect_async`, and return them."""
         began, waiting, collector = now, self._waiting, self._requests.collector
         try:
-            if self.collecting or self._conditions.unusual:
+            if self._waiting.collecting or self._conditions.unusual:
                 self.check_collectable()
             limits = None if rules.timeout is rules.deadline is None else _Limits(rules, now)
-            self.collecting = True
+            self._waiting.collecting = True
             try:
                 if now >= self._supervisor.look_by:
                     now = yield from waiting.check_now()
@@ -200,9 +174,9 @@ class Steps:
                         break
                     now = yield from waiting.turn(wanted, until)
             finally:
-                self.collecting = False
-            slots, local = collector.pop_ready(most), self._envs.all
-            if len(slots) == len(local) > slots[-1]:
+                self._waiting.collecting = False
+            slots, local = collector.pop_ready(most), self._envs.local
+            if len(slots) == len(local) > slots.item(-1):
                 slots = local  # The same slots, which lie side by side.
             return self.hand_out(slots)
         finally:
@@ -212,7 +186,7 @@ class Steps:
     def check_collectable(self) -> None:
         """Raise an error if the group is closed, or another call collects."""
         self._lifetime.check_open()
-        if self.collecting:
+        if self._waiting.collecting:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
             )
@@ -223,19 +197,14 @@ class Steps:
         if fault is not None:
             self.note_raised(fault)
             raise fault
-        if not total and not self._supervisor.members.possible:
+        if not total:
             raise NothingPending(
                 "nothing to collect: no request is outstanding; send one with step_async"
             )
 
     def note_raised(self, fault: EnvFault) -> None:
         """Note that an error of the collector is raised, so that its envs are free."""
-        self.note_freed(self._requests.collector.take_fault(fault))
-
-    def note_freed(self, slots: Iterable[int]) -> None:
-        """Let envs join that came back before the errors of `slots` were raised."""
-        if self._arrivals.held_back:
-            self._arrivals.admit(np.fromiter(slots, np.intp), self._intake.now)
+        self._requests.collector.take_fault(fault)
 
     # -- check, write, send -----------------------------------------------------------
 
@@ -259,8 +228,10 @@ class Steps:
         slots, columns = answer
         if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
             return self._write_any(batch, now)
+        if self._asks_a_place(slots):
+            return self._write_any(batch, now)
         slab = self._layout.slabs[0]
-        rows: Rows = self._all_rows if slots is self._envs.all else slots
+        rows: Rows = self._all_rows if slots is self._envs.local else slots
         action = columns["action"]
         fits = type(action) is np.ndarray and action.shape == (len(slots), *self._action_shape)
         limit = self._limits.get(action.dtype, -1.0) if fits else -1.0
@@ -276,9 +247,8 @@ class Steps:
         """Do the same for any batch."""
         slots = self._slots_of(batch)
         self._intake.now = now
-        if self._supervisor.members.possible:
-            batch, slots = self._arrivals.drop_gone(batch, slots)
         self._dispatch.check_sendable(now, slots, "step")
+        self._supervisor.places.check_step(slots)
         if not len(slots):
             return slots, None
         out_of_band = write_actions(batch, slots, self._envs, self._layout)
@@ -302,14 +272,17 @@ class Steps:
         """Number the requests of a batch that is written, and give them to their hosts."""
         requests = self._requests
         owner = COLLECTOR if ticket is None else ticket.owner
-        if requests.in_rings and len(slots) and not self._conditions.unusual:
+        is_ordinary = requests.in_rings and len(slots) > 0 and not self._conditions.unusual
+        if is_ordinary and not self._asks_a_place(slots):
             for ring in requests.publish(slots, self._episodes.due[slots], owner, now):
                 ring.wake()
             return
         resets = self._episodes.due[slots]
         if self._episodes.exceptional:
             reports = self._episodes.report_losses(slots)
-            self._layout.write_seeds(slots[reports], np.full(np.count_nonzero(reports), AS_BEFORE))
+            # A place remembers its last reset itself, and may have no row yet.
+            lost = slots[reports & (slots < self._envs.num_local)]
+            self._layout.write_seeds(lost, np.full(len(lost), AS_BEFORE))
             resets = resets | reports
         entries = requests.issue(slots, _STEP, owner, now)
         if b"\1" in resets.tobytes():
@@ -318,8 +291,11 @@ class Steps:
             self._dispatch.hand_over(slots, entries)
         else:
             self._dispatch.hand_over_steps(slots, entries, packed, resets)
-        if self._supervisor.members.possible:
-            self._intake.apply_completions()  # Requests to absent envs are withdrawn immediately.
+
+    def _asks_a_place(self, slots: NDArray[np.intp]) -> bool:
+        """Return True if any of `slots` belongs to a client, or will."""
+        num_local = self._envs.num_local
+        return num_local < len(self._envs) and int(slots.max()) >= num_local
 
     # -- hand out ---------------------------------------------------------------------
 
@@ -337,7 +313,6 @@ class Steps:
             fault.results = self.hand_out(done)[0]
             others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
             fault.add_note(f"the results of {others} of the same call are in the error's `results`")
-        self.note_freed(ticket.errors)
         raise fault
 
     def hand_out(self, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
@@ -364,15 +339,9 @@ class Steps:
             self._requests.hand_out(slots)
         if observer is not None:
             observer.note_results(parts)
-        if self._arrivals.held_back or self._sums.num_batches >= self._hint.due:
-            self._note_returned(slots)
-        return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
-
-    def _note_returned(self, slots: NDArray[np.intp]) -> None:
-        """Let envs join whose rows are free now, and look for a hint."""
-        self._arrivals.admit(slots, self._intake.now)
         if self._sums.num_batches >= self._hint.due:
             self._hint.look()
+        return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
 
     @staticmethod
     def _mark_cut(part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:

@@ -11,27 +11,29 @@ two calls, however many wait.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait
+from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import OF_HOSTS
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
-from rlightning_aio._core.hosts.base import Executing, Membership
+from rlightning_aio._core.hosts.base import Executing, SelfStarting
 from rlightning_aio._core.hosts.spinner import Spinner
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.intake import Intake
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests, Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.base import Host, Server
     from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["REPLIES", "Poller", "Waiting"]
@@ -49,6 +51,7 @@ class Waiting:
 
     Attributes:
         wanted: the numbers of results that calls wait for, and how many calls for each.
+        collecting: a call waits for the collector's results.
         intake: as given.
     """
 
@@ -71,6 +74,9 @@ class Waiting:
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None
         self.wanted: dict[int, int] = {}
+        self.collecting = False
+        # By owner, since when a call waits for empty places alone.
+        self._alone_since: dict[int, float] = {}
 
     def poll(self) -> None:
         """Read and apply the replies that are ready.
@@ -127,6 +133,11 @@ class Waiting:
         Requests to inline envs are executed in that time.
         """
         poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
+        if supervisor.places.num_held or self._alone_since:
+            now, due = self._look_at_places()
+            if due is not None and due <= now:
+                return now
+            until = earliest(until, due)
         self.wanted[wanted] = self.wanted.get(wanted, 0) + 1
         try:
             if poller.inline and poller.execute(1 if self._shares_thread else wanted, until):
@@ -143,16 +154,9 @@ class Waiting:
                     if is_due:
                         now = yield Wait(0.0)
                 else:
-                    is_due = until is not None or supervisor.detector.any_ending
-                    is_due = is_due or self._conditions.unusual & OF_HOSTS != 0
-                    is_due = is_due or supervisor.members.possible
-                    patient = supervisor.patient
-                    now = yield Wait(supervisor.next_check(until)) if is_due else patient
+                    now, is_due = yield from self._sleep(until)
                     if may_spin:
                         poller.slept()
-                    if not is_due:
-                        supervisor.look_by = now + LOOK_SECONDS
-                        is_due = self._conditions.unusual & OF_HOSTS != 0
         finally:  # As `_want`, without a call.
             if (calls := self.wanted.pop(wanted)) > 1:
                 self.wanted[wanted] = calls - 1
@@ -161,6 +165,55 @@ class Waiting:
         if is_due or now >= supervisor.due:
             self.check(now)
         return now
+
+    def _sleep(self, until: float | None) -> Procedure[tuple[float, bool]]:
+        """Wait for replies; return the time, and True if the hosts are to be checked."""
+        supervisor, conditions = self._supervisor, self._conditions
+        is_due = until is not None or supervisor.detector.any_ending
+        is_due = is_due or conditions.unusual & OF_HOSTS != 0
+        now = yield Wait(supervisor.next_check(until)) if is_due else supervisor.patient
+        if not is_due:
+            supervisor.look_by = now + LOOK_SECONDS
+            is_due = conditions.unusual & OF_HOSTS != 0
+        return now, is_due
+
+    def _look_at_places(self) -> tuple[float, float | None]:
+        """End the requests of calls that have waited for clients alone for too long.
+
+        Returns the time, and when to look again: no later, if a call has learned something.
+        """
+        now, due = self._supervisor.clock(), None
+        found = self._supervisor.places.held()
+        for owner in self._alone_since.keys() - found.keys():
+            del self._alone_since[owner]
+        for owner, records in found.items():
+            since = self._since_alone(owner, records, now)
+            if since is None:
+                continue
+            seconds = [r.place.server.connect_timeout for r in records if r.place is not None]
+            expires = since + min(seconds)
+            if now >= expires:
+                self._alone_since.pop(owner, None)
+                self.intake.end_held(records)
+                due = now
+            if expires < math.inf:
+                due = earliest(due, expires)
+        return now, due
+
+    def _since_alone(self, owner: int, records: Sequence[HostRecord], now: float) -> float | None:
+        """Return since when a call waits for nothing but held requests; None if it doesn't."""
+        if owner > 0:
+            ticket = self._tickets.waiting[owner]
+            if ticket.apart:  # Each request is a call of its own.
+                sent: list[int] = [self._requests.sent_ns.item(r.slots.start) for r in records]
+                return min(sent) / 1e9
+            num_left = ticket.remaining
+        else:
+            num_left = self._requests.collector.num_awaited if self.collecting else -1
+        if num_left != len(records):
+            self._alone_since.pop(owner, None)
+            return None
+        return self._alone_since.setdefault(owner, now)
 
     def until(
         self, now: float, num_left: Callable[[], int], end: float | None = None
@@ -221,8 +274,8 @@ class Waiting:
         ticket = self._requests.tickets.open(slots, method=method)
         try:
             send(ticket)
-            if self._supervisor.members.possible:
-                self.poll()  # Replies of members that were read before cause no wake-up.
+            if self._supervisor.places.any:
+                self.poll()  # A client may turn out to be gone as it is asked.
             while ticket.remaining > 0:
                 now = yield from self._next(ticket, ticket.remaining)
                 self.poll()
@@ -287,7 +340,9 @@ class Waiting:
                 self._hand_on()
 
     def _give_up(self, ticket: Ticket) -> None:
-        """Close a ticket whose call no longer waits."""
+        """Close a ticket whose call no longer waits; what is held for clients is never sent."""
+        if self._supervisor.places.num_held:
+            self._supervisor.places.take_back(ticket.owner)
         self._requests.give_up(ticket)
         self.wake()
 
@@ -323,7 +378,8 @@ class Poller:
         self._clock = clock
         self._on_bell: dict[int, Host] = {}
         self._on_loop: list[int] = []
-        self._memberships: dict[int, Membership] = {}
+        # The listeners, each with the hosts that share it.
+        self._servers: list[tuple[Server, list[int]]] = []
         self._spinner = Spinner(enabled=True)
         self._spun = False
 
@@ -331,8 +387,13 @@ class Poller:
         """Add a host of the group."""
         if isinstance(host, Executing):
             self.inline.append((host.host_id, host))
-        elif isinstance(host, Membership):
-            self._memberships[host.host_id] = host
+        elif isinstance(host, SelfStarting):
+            for server, host_ids in self._servers:
+                if server is host.server:
+                    host_ids.append(host.host_id)
+                    break
+            else:
+                self._servers.append((host.server, [host.host_id]))
         elif host.on_bell:
             self._on_bell[host.host_id] = host
         if host.needs_loop:
@@ -345,8 +406,8 @@ class Poller:
         on_bell = self._on_bell
         for host_id in self.bell.with_news() if on_bell else ():
             on_bell[host_id].poll()
-        for host_id, server in self._memberships.items():
-            if self._requests.in_flight[host_id]:
+        for server, host_ids in self._servers:
+            if any(map(self._requests.in_flight.__getitem__, host_ids)):
                 server.poll()
 
     def execute(self, wanted: int, until: float | None) -> bool:
@@ -379,7 +440,7 @@ class Poller:
     def spin(self, wanted: int) -> bool:
         """Spin briefly for `wanted` results; True if they are ready.
 
-        Spin only while there are more cores than busy workers and members (which may run on this
+        Spin only while there are more cores than busy workers and clients (which may run on this
         machine), and while no env that shares this thread is busy, as it couldn't make progress.
         """
         in_flight = self._requests.in_flight
@@ -390,10 +451,10 @@ class Poller:
         for host_id in self._on_bell:
             if in_flight[host_id]:
                 num_busy += 1
-        servers: list[Membership] = []
-        for host_id, server in self._memberships.items():
-            if in_flight[host_id]:
-                num_busy += in_flight[host_id]
+        servers: list[Server] = []
+        for server, host_ids in self._servers:
+            if count := sum(map(in_flight.__getitem__, host_ids)):
+                num_busy += count
                 servers.append(server)
         self._spun = 0 < num_busy < self.num_cores
         if not self._spun:

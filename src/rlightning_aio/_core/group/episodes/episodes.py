@@ -102,7 +102,7 @@ class Episodes:
     """See the module.
 
     Attributes:
-        exceptional: some env is not intact, so results must be checked for reports.
+        exceptional: some env is not intact, so requests and results must be checked for reports.
         due: by slot, whether the env is reset in place of its next step; all False while no
             context is open.
         auto_reset_is_open: an `auto_reset` context is open.
@@ -126,6 +126,8 @@ class Episodes:
         self._restored: dict[int, Position] = {}
         self.exceptional = False
         self.auto_reset_is_open = False
+        # Slots of places without a client: their losses set no condition of the group.
+        self._empty: set[int] = set()
 
     # -- the context ------------------------------------------------------------------
 
@@ -151,7 +153,8 @@ class Episodes:
     def _chosen_limits(self, given: float | None, *, needs_limits: bool) -> NDArray[np.int64]:
         envs = self._envs
         if given is None:
-            present = np.array([bool(env_id) for env_id in envs.env_ids])
+            present = np.ones(len(envs), np.bool_)
+            present[list(self._empty)] = False
             lacking = np.flatnonzero(present & (envs.step_limits == 0) & ~envs.resets_itself)
             if needs_limits and len(lacking):
                 raise ValueError(
@@ -192,8 +195,15 @@ class Episodes:
         else:
             self.due[:] = self._cut
 
-    def note_joined(self, slot: int) -> None:
-        """Use the limit of the env that has just joined at `slot`."""
+    def note_empty(self, slot: int) -> None:
+        """Note that a place has no client: its loss concerns nobody until there is one."""
+        self._empty.add(slot)
+        self._note_losses()
+
+    def note_taken(self, slot: int) -> None:
+        """Note that a place has a client, and use the step limit of that."""
+        self._empty.discard(slot)
+        self._note_losses()
         if self._limits is not None and self._uses_own_limits:
             self._limits[slot] = self._own_limits(slot)
             self._margin = 0
@@ -233,7 +243,9 @@ class Episodes:
             loss = self._losses.get(slot)
             if loss is None:
                 continue
-            if loss.phase is LossPhase.REPORTING:
+            # A reset that the user has asked of a client reports what was lost with the last one.
+            is_told = slot >= self._envs.num_local and loss.why.blame != "caller"
+            if is_told or loss.phase is LossPhase.REPORTING:
                 reports.append(Report(slot, loss.why))
             self._move(slot, LossEvent.ANSWERED)
         return reports
@@ -269,8 +281,12 @@ class Episodes:
             self._losses.pop(slot, None)
         else:
             self._losses[slot] = _Loss(after, known)
+        self._note_losses()
+
+    def _note_losses(self) -> None:
         self.exceptional = bool(self._losses)
-        self._conditions.note(LOST_EPISODE, self.exceptional)
+        is_noticed = self.exceptional and not self._losses.keys() <= self._empty
+        self._conditions.note(LOST_EPISODE, is_noticed)
 
     # -- results ----------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.rings import TrainerBell, bell_size
+from rlightning_aio.registry import load
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
@@ -83,8 +84,8 @@ def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core
         rings=tables.requests.rings,
         num_hosts=len(orders),
         configs=[order.config for order in orders],
-        objection=lambda meta: supervisor.members.objection(meta, supervisor.metas),
-        is_idle=tables.requests.is_idle,
+        objection=supervisor.objection,
+        busy_since=tables.requests.busy_since,
         resources=tables.resources,
         shares_thread=tables.shares_thread,
     )
@@ -101,13 +102,17 @@ def _tables(
     plan: Plan, orders: Sequence[StartOrder], driver: Driver, cores: int, *, shares_thread: bool
 ) -> Tables:
     """Make the state of a group whose hosts get `orders`."""
-    local = [config for config in plan.configs if not placement_for(config).max_members]
-    servers = [config for config in plan.configs if placement_for(config).max_members]
-    envs = EnvTable(
-        [config for config in local for _ in range(config.num_workers)],
-        [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
-        [(f"{config.name}-0", config, placement_for(config).max_members) for config in servers],
-    )
+    configs = [order.config for order in orders for _ in order.worker_indices]
+    env_ids: list[str] = []
+    for order in orders:
+        name, find = order.config.name, placement_for(order.config).places
+        places: list[str] = load(find)(order.config) if find else []
+        env_ids += [
+            f"{name}-0/{places[k]}" if find else f"{name}-{k}" for k in order.worker_indices
+        ]
+    servers = [config for config in plan.configs if placement_for(config).places]
+    num_local = sum(not placement_for(config).places for config in configs)
+    envs = EnvTable(configs, env_ids, num_local, [f"{config.name}-0" for config in servers])
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)

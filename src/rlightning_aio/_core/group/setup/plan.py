@@ -57,7 +57,7 @@ def plan_group(
         if place.check:
             load(place.check)(config)
         host_class(config)
-        if place.max_members and own[0] not in (None, default_env_preprocess_fn):
+        if place.places and own[0] not in (None, default_env_preprocess_fn):
             warnings.warn(
                 f"entry {config.name!r}: preprocess_fn is ignored for an {config.backend}; it "
                 "runs at the client",

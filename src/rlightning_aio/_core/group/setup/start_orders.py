@@ -11,7 +11,7 @@ from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, placement_
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of
-from rlightning_aio.registry import ENVS
+from rlightning_aio.registry import ENVS, load
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,7 +48,8 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
         )
         for host_id, (config, share) in enumerate(shares)
     ]
-    return orders + [_order_of_members(c) for c in plan.configs if placement_for(c).max_members]
+    places = [c for c in plan.configs if placement_for(c).places]
+    return orders + [order for config in places for order in _orders_of_places(config)]
 
 
 def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
@@ -56,7 +57,7 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
     local = [
         (config, fns)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
-        if not placement_for(config).max_members
+        if not placement_for(config).places
     ]
     counts = nums_hosts([config for config, _ in local], num_cores)
     return [
@@ -66,10 +67,10 @@ def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
     ]
 
 
-def _order_of_members(config: EnvConfig) -> StartOrder:
-    """The order of a host whose envs join and leave."""
-    count = placement_for(config).max_members
-    return StartOrder(config, None, tuple(range(count)), (None,) * count, spins=False)
+def _orders_of_places(config: EnvConfig) -> list[StartOrder]:
+    """The order of each place of an env_server."""
+    count = len(load(placement_for(config).places)(config))
+    return [StartOrder(config, None, (k,), (None,), spins=False) for k in range(count)]
 
 
 def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:

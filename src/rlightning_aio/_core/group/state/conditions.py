@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BESIDE_ROWS",
+    "CLIENTS",
     "CLOSED",
     "DEATH",
     "FAULT",
@@ -46,7 +47,9 @@ BESIDE_ROWS: Final = 1 << 4
 """A result that is ready is not, or not only, what its row holds."""
 FAULT: Final = 1 << 5
 """An error waits for the collector."""
-OF_HOSTS: Final = ~(UNLIKE_ENVS | BESIDE_ROWS)
+CLIENTS: Final = 1 << 7
+"""A client is in session. A place that is empty sets nothing."""
+OF_HOSTS: Final = ~(UNLIKE_ENVS | BESIDE_ROWS | CLIENTS)
 """All that say something of hosts: while one is set, a waiting call looks at them at each turn."""
 
 

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Killable, Membership
+from rlightning_aio._core.hosts.base import Killable, SelfStarting
 from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
+from rlightning_aio.errors import WorkerDied
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
         ErrorText,
     )
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.errors import EnvFault, WorkerDied
+    from rlightning_aio.errors import EnvFault
     from rlightning_aio.outcomes import Loss
 
 __all__ = ["HostLoss", "HostRecord", "Stage", "last_lines"]
@@ -76,7 +77,7 @@ class HostLoss:
     death: Death
     replaced: bool
     resets: bool
-    kind: type[WorkerDied]
+    kind: type[EnvFault]
     what: str
     last: str
     then: str
@@ -89,16 +90,16 @@ class HostLoss:
         """All that is known of it, in one line."""
         return self._message(self.owed)
 
-    def error(self, owed: NDArray[np.intp]) -> WorkerDied:
+    def error(self, owed: NDArray[np.intp]) -> EnvFault:
         """The error of requests that were in flight, with the last lines of the worker's stderr."""
         return self._error(self._message(owed), owed)
 
-    def refusal(self, asked: NDArray[np.intp]) -> WorkerDied:
+    def refusal(self, asked: NDArray[np.intp]) -> EnvFault:
         """The error for new requests to `asked`, slots of a worker that is not replaced."""
         names = ", ".join(self._ids(asked))
         return self._error(f"{self.message}; nothing was sent to {names}", asked)
 
-    def silent(self, lost: NDArray[np.intp]) -> WorkerDied:
+    def silent(self, lost: NDArray[np.intp]) -> EnvFault:
         """The error for `lost`, slots that had replied, but whose states are gone."""
         names = ", ".join(self._ids(lost))
         return self._error(f"{self.message}; lost with it: {names}", lost)
@@ -107,11 +108,12 @@ class HostLoss:
         names = ", ".join(self._ids(owed)) or "none"
         return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.then}"
 
-    def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
+    def _error(self, message: str, slots: NDArray[np.intp]) -> EnvFault:
         tail = self.death.stderr_tail
         error = self.kind(message + last_lines(tail), env_id=self.env_id)
-        error.exit_code, error.stderr_tail = self.death.exit_code, tail
-        error.env_ids = tuple(self._ids(slots))
+        if isinstance(error, WorkerDied):
+            error.exit_code, error.stderr_tail = self.death.exit_code, tail
+            error.env_ids = tuple(self._ids(slots))
         error.outcome = self.why.outcome(self.env_id)
         return error
 
@@ -142,7 +144,9 @@ class HostRecord:
         rebuild_error: the error of its replacement while rebuilding the envs.
         gone: by slot, the errors of envs that are not replaced though their host goes on.
         last_loss: its last death.
-        killable: the host, if it can be killed; membership: if envs join and leave it.
+        killable: the host, if it can be killed; place: if its worker starts itself.
+        was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
+            user may set it in motion again.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
@@ -174,7 +178,9 @@ class HostRecord:
     gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     last_loss: HostLoss | None = None
     killable: Killable | None = field(init=False)
-    membership: Membership | None = field(init=False)
+    place: SelfStarting | None = field(init=False)
+    was_shown: bool = False
+    needs_reset: bool = False
     limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
     restart_policy: RestartPolicy = field(init=False)
@@ -185,7 +191,7 @@ class HostRecord:
 
     def __post_init__(self) -> None:
         self.killable = self.host if isinstance(self.host, Killable) else None
-        self.membership = self.host if isinstance(self.host, Membership) else None
+        self.place = self.host if isinstance(self.host, SelfStarting) else None
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
         self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")

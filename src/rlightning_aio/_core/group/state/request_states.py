@@ -35,16 +35,13 @@ class Event(Enum):
 
     SENT = auto()
     SENT_FOR_CALL = auto()
-    JOINED = auto()
-    """A result came without a request: an env joined."""
-    CLAIMED = auto()
-    """A call takes a first result that waited for the collector."""
     DROPPED = auto()
-    """A call asks for more than that first result, or nobody wants what it has led to."""
+    """Nobody wants what it has led to."""
     RESULT = auto()
     VALUE = auto()
     FAULT = auto()
-    WITHDRAWN = auto()
+    TAKEN_BACK = auto()
+    """It was held for a client, and its caller wants no reply."""
     ABORTED = auto()
     """Its caller wants no reply."""
     ASKED_AGAIN = auto()
@@ -66,14 +63,13 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     # An idle slot has no owner, which the table writes as the collector.
     (_IDLE, _C, Event.SENT): (_BUSY, _C),
     (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
-    (_IDLE, _C, Event.JOINED): (_READY, _C),
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),
-    (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
+    (_BUSY, _C, Event.TAKEN_BACK): (_IDLE, _C),
+    (_BUSY, _T, Event.TAKEN_BACK): (_IDLE, _C),
     (_BUSY, _C, Event.ABORTED): (_BUSY, _N),
     (_BUSY, _C, Event.ASKED_AGAIN): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
-    (_READY, _C, Event.CLAIMED): (_READY, _T),
     (_READY, _C, Event.DROPPED): (_IDLE, _C),
     (_SPENT, _C, Event.FREED): (_IDLE, _C),
     (_BUSY, _T, Event.RESULT): (_READY, _T),

@@ -36,7 +36,7 @@ __all__ = ["CollectorQueue", "Requests", "Ticket", "Tickets"]
 
 # Plain ints: NumPy takes several times as long over members of an enum.
 _IDLE_CODE, _BUSY_CODE, _READY_CODE, _SPENT_CODE = map(int, State)
-_RESET, _JOIN = int(Operation.RESET), int(Operation.JOIN)
+_RESET = int(Operation.RESET)
 
 
 class Ticket(msgspec.Struct):
@@ -123,6 +123,12 @@ class Tickets:
         if owner in self.parked:
             self.replied.append(owner)
         return ticket
+
+    def forget(self, owner: int, slots: NDArray[np.intp]) -> None:
+        """Take requests that are over without an outcome out of the ticket of a call."""
+        ticket = self.waiting[owner]
+        ticket.remaining -= len(slots)
+        ticket.slots = ticket.slots[~np.isin(ticket.slots, slots)]
 
     def method(self, owner: int) -> str:
         """Return the method that the call `owner` calls, or an empty string."""
@@ -222,6 +228,10 @@ class Requests:
         """Return the first of `slots` that is not idle, or None."""
         states = self.state[slots]
         return int(slots[np.flatnonzero(states)[0]]) if np.count_nonzero(states) else None
+
+    def busy_since(self, slot: int) -> float | None:
+        """Return when the request was sent that a slot has not answered; None if it has."""
+        return self.sent_ns.item(slot) / 1e9 if self.state[slot] == _BUSY_CODE else None
 
     def owed(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the slots of `slots` whose replies are outstanding, the oldest request first."""
@@ -389,16 +399,6 @@ class Requests:
         self.unwanted.update(each)
         self.anything_ended = True
 
-    def join(self, slot: int, now: float) -> None:
-        """Record a result that lies in its row without a request; the slot is idle."""
-        slots = self.alone(slot)
-        self.numbering.renew(slots, _JOIN)
-        self.sent_ns[slot] = int(now * 1e9)
-        self.state[slot] = _READY_CODE
-        self.collector.ready.append(slots)
-        self.collector.num_ready += 1
-        self.anything_ended = True
-
     def deliver(self, slots: NDArray[np.intp]) -> None:
         """Deliver the results of `slots`, which are no longer in flight, to their owners."""
         if not len(slots):
@@ -457,10 +457,11 @@ class Requests:
             self.collector.num_awaited -= len(slots)
             self.collector.keep(slots, fault)
 
-    def withdraw(self, slot: int) -> None:
-        """End a request of the collector without a result."""
-        self._forget(self.alone(slot))
-        self.collector.num_awaited -= 1
+    def take_back(self, slots: NDArray[np.intp]) -> None:
+        """End requests of a call that no longer waits, or of the collector: none was sent."""
+        self.collector.num_awaited -= int(np.count_nonzero(self.owner[slots] == COLLECTOR))
+        self._forget(slots)
+        self.anything_ended = True
 
     def _forget(self, slots: NDArray[np.intp]) -> None:
         self.state[slots] = _IDLE_CODE
@@ -471,19 +472,6 @@ class Requests:
     def hand_out(self, slots: NDArray[np.intp]) -> None:
         """Record that results were returned: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
-
-    def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which of `slots` have a first result that has not been collected."""
-        ready = (self.state[slots] == _READY_CODE) & (self.owner[slots] == COLLECTOR)
-        return ready & (self.numbering.ops(slots) == _JOIN)
-
-    def claim(self, slots: NDArray[np.intp], ticket: Ticket) -> None:
-        """Give results of the collector to a call."""
-        self.collector.remove(slots)
-        self.owner[slots] = ticket.owner
-        ticket.remaining -= len(slots)
-        if ticket.apart:
-            ticket.ended.append(slots)
 
     def drop(self, slots: NDArray[np.intp]) -> None:
         """Drop results of the collector."""

@@ -1,7 +1,8 @@
 """`SlabLayout`: the slab and the row of each env.
 
-Local envs get their rows together, after all are built. The first env that joins a host brings a
-slab with rows for all that may.
+Local envs get their rows together, after all are built. The first client of an env_server brings a
+slab with rows for all of its places. Until then these have no row: row 0 of the first slab, which
+is the default, belongs to another env.
 """
 
 from __future__ import annotations
@@ -67,6 +68,7 @@ class SlabLayout:
         slabs: all slabs.
         slab, row: the index of the slab of each slot, and its row there.
         row_is_slot: the row of every slot is the slot itself, so `row` isn't needed.
+        num_in_first: the local envs, if all have their rows in the first slab; else 0.
     """
 
     def __init__(self, size: int) -> None:
@@ -74,6 +76,7 @@ class SlabLayout:
         self.slab = np.zeros(size, np.intp)
         self.row = np.zeros(size, np.intp)
         self.row_is_slot = False
+        self.num_in_first = 0
         # Offset in the arena, and number of rows, of each slab there.
         self._parts: list[tuple[int, int]] = []
 
@@ -92,6 +95,7 @@ class SlabLayout:
             offset = arena.append(size)
             self._parts.append((offset, rows))
             self.slabs.append(Slab(layout, arena.map(offset, size), rows))
+        self.num_in_first = len(started) if len(self.slabs) == 1 else 0
         self._note_rows()
 
     def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:
@@ -101,7 +105,7 @@ class SlabLayout:
         return AttachOrder(tuple(self._parts), rows)
 
     def add(self, slab: Slab, first_slot: int) -> None:
-        """Add the slab of a host that envs join, with one row for each of its slots in order."""
+        """Add the slab of an env_server, with one row for each of its places in order."""
         slots = slice(first_slot, first_slot + slab.rows)
         self.slab[slots] = len(self.slabs)
         self.row[slots] = np.arange(slab.rows)

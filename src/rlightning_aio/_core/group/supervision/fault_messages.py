@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
 from rlightning_aio._core.hosts.limits import hung
-from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvHung, StartFailed, WorkerDied
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, slot_of
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.hosts.messages import Death, ErrorText
+    from rlightning_aio.errors import EnvFault
 
 __all__ = [
     "CrashLog",
@@ -144,6 +145,8 @@ def host_loss(
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
     last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
     what = f"the worker of {envs.describe(slot)} {death.cause}"
+    if record.place is not None:
+        what = f"the client of {envs.describe(slot)} was lost ({death.cause})"
     if record.culprit is None and record.awaits_several:
         last = "no env's code was running"
     elif record.is_hung:
@@ -157,7 +160,7 @@ def host_loss(
         death=death,
         replaced=replaced,
         resets=not record.is_hardware,
-        kind=EnvHung if record.is_hung else WorkerDied,
+        kind=_kind_of(record),
         what=what,
         last=last,
         then=then,
@@ -165,6 +168,12 @@ def host_loss(
         env_id=envs.env_ids[slot],
         why=_why(envs, requests, record, death),
     )
+
+
+def _kind_of(record: HostRecord) -> type[EnvFault]:
+    if record.is_hung:
+        return EnvHung
+    return WorkerDied if record.place is None else EnvAway
 
 
 def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -> Loss:
@@ -176,6 +185,8 @@ def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -
     if record.is_hung:
         op = 0 if record.culprit is None else requests.numbering.op(record.culprit)
         why = hung(cause, op, at_fault)
+    elif record.place is not None:
+        return Loss(cause, "env_away", "infrastructure")
     elif death.refused:
         return Loss(cause, "not_started", "infrastructure", at_fault)
     else:

@@ -94,7 +94,7 @@ class Shutdown:
         """Release this process's copies after a fork, without affecting the parent's group."""
         self._tables.lifetime.end()
         for record in self._tables.records:
-            if record.killable is not None:
+            if record.killable is not None and record.place is None:
                 record.host.release()
         for shared in self._tables.resources.values():
             shared.disown()

@@ -33,13 +33,14 @@ from rlightning_aio._core.group.supervision.fault_messages import (
 )
 from rlightning_aio._core.group.supervision.hang_detector import HangDetector, read_news
 from rlightning_aio._core.group.supervision.hint import Hint
-from rlightning_aio._core.group.supervision.members import Members
 from rlightning_aio._core.group.supervision.overdue import Overdue
+from rlightning_aio._core.group.supervision.places import Places
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
 from rlightning_aio._core.hosts.limits import restart_pause
 from rlightning_aio._core.hosts.messages import (
     Attached,
+    AttachOrder,
     Built,
     Closed,
     Death,
@@ -60,6 +61,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostLoss
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.messages import Taken
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
@@ -80,11 +82,11 @@ class Supervisor:
 
     Attributes:
         hosts: in the order of their slots; records: of them.
-        members: the envs that join and leave.
+        places: the hosts whose workers start themselves.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hint: on settings; crash_log: of
             restarts; losses: of single envs; overdue: names envs that owe a result for long.
-        metas: one for each local env, and for each host that envs join; empty before the start.
+        metas: one for each env; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
             step yet.
         close_errors: env id and error of each env whose `close` raised.
@@ -92,6 +94,7 @@ class Supervisor:
         due: time by which a call that waits must call it, though nothing has happened. It moves
             only once it has passed.
         patient: what a call waits for that has no other time to keep: until `due`.
+        clock: monotonic seconds.
     """
 
     def __init__(self, tables: Tables) -> None:
@@ -107,8 +110,8 @@ class Supervisor:
         self._envs = tables.envs
         self._requests = tables.requests
         self._lifetime = tables.lifetime
-        self._clock = tables.clock
-        self.members = Members(tables)
+        self.clock = tables.clock
+        self.places = Places(tables)
         self.detector = HangDetector(tables)
         self.shutdown = Shutdown(tables)
         self.workers = Workers(tables)
@@ -126,8 +129,8 @@ class Supervisor:
         record = HostRecord(host, config)
         self.records.append(record)
         self.detector.add(record)
-        if record.membership is not None:
-            self.members.add(record.membership)
+        if record.place is not None:
+            self.places.add(record)
 
     # -- start --------------------------------------------------------------------
 
@@ -144,10 +147,14 @@ class Supervisor:
             yield from self._until(Stage.BUILT)
             self._lay_out_rows()
             for record in self.records:
+                if record.place is not None:
+                    self.places.leave(record)
+                    record.host.attach(AttachOrder((), ()))  # From now on somebody may dial in.
+                    continue
                 assert record.order is not None
                 record.stage = Stage.ATTACHING
                 record.host.attach(record.order)
-                record.give_time(self._clock())
+                record.give_time(self.clock())
             yield from self._until(Stage.UP)
         except BaseException:
             yield from self.shutdown.close(self._now)
@@ -155,11 +162,7 @@ class Supervisor:
             self._start_fault = None
             raise
         self._lifetime.begin()
-        self.metas += [
-            EnvMeta(env_id=server_id, observation_space=None, action_space=None)
-            for server_id in self.members.server_ids
-        ]
-        _log.info("started within %.1f s: %s", self._clock() - now, self.workers.summary())
+        _log.info("started within %.1f s: %s", self.clock() - now, self.workers.summary())
         return self.metas
 
     def _launch_first(self, record: HostRecord) -> None:
@@ -174,7 +177,7 @@ class Supervisor:
         record.stage = stage
         record.late = False
         record.host.start()
-        record.give_time(self._clock())
+        record.give_time(self.clock())
 
     def _until(self, stage: Stage) -> Procedure[None]:
         # Hosts in this process have posted completions already.
@@ -195,11 +198,11 @@ class Supervisor:
                 continue
             if read_news(record) or record.note_traffic():
                 if not record.late:
-                    record.give_time(self._clock())
+                    record.give_time(self.clock())
             elif not record.late:
                 record.late = True
                 self.detector.kill(record, dump=True)
-                record.start_by = self._clock() + _DUMP_SECONDS  # The death brings its stacks.
+                record.start_by = self.clock() + _DUMP_SECONDS  # The death brings its stacks.
             else:
                 record.start_by = None  # A host that can't be killed gets no second limit.
                 if not self._lifetime.open:
@@ -214,12 +217,23 @@ class Supervisor:
         self.metas = [env.meta for env in started]
         if not self._tables.mixed_actions:
             check_actions(self.metas)
+        for slot in range(self._envs.num_local, len(self._envs)):
+            config, env_id = self._envs.configs[slot], self._envs.env_ids[slot]
+            self.metas.append(
+                EnvMeta(
+                    env_id=env_id,
+                    observation_space=None,
+                    action_space=None,
+                    num_envs=config.num_envs,
+                    max_episode_steps=config.max_episode_steps,
+                )
+            )
         layout = self._tables.layout
         layout.lay_out(started, self._tables.arena)
         self._envs.note_started(started)
         for record in self.records:
-            count = len(record.started)
-            record.order = layout.order_for(record.slots.start, count)
+            if record.place is None:
+                record.order = layout.order_for(record.slots.start, len(record.started))
 
     def handle(self, completion: Lifecycle) -> None:
         """Apply a completion about the life of a host; `handle_exit` applies deaths."""
@@ -303,7 +317,10 @@ class Supervisor:
         """Pass requests to a host, or hold them until its replacement is up."""
         record = self.records[host_id]
         if record.is_down:
-            record.held.append((entries, arguments))
+            if record.place is not None:
+                self.places.hold(record, entries, arguments)
+            else:
+                record.held.append((entries, arguments))
         else:
             record.host.submit(entries, arguments)
 
@@ -316,8 +333,6 @@ class Supervisor:
             times += self.detector.expiries()
         if self.any_deaths:
             times += [due for r in self.records for due in (r.start_by, r.restart_at)]
-        if self.members.possible:
-            times.append(self.members.next_deadline())
         return min((time for time in times if time is not None), default=None)
 
     def watch(self, now: float) -> None:
@@ -331,7 +346,7 @@ class Supervisor:
         self.patient.until = None if self.due == math.inf else self.due
 
     def check(self, now: float) -> None:
-        """Restart hosts that are due, and find silent members and workers that hang."""
+        """Restart hosts that are due, and find workers that hang."""
         self._now = now
         if not self._lifetime.open:
             raise GroupClosed("the group was closed while this call was waiting")
@@ -340,8 +355,6 @@ class Supervisor:
             self._check_start_times()
             for record in self.records:
                 self._restart(record, now)
-        if self.members.possible:
-            self.members.tick(now)
         if now >= self.detector.due or self.detector.any_ending:
             self.detector.check(now)
         if now >= self.overdue.due:
@@ -367,6 +380,8 @@ class Supervisor:
         if death.refused:
             record.restarts -= 1  # It has not started.
         owed = self._requests.owed(np.array(record.slots, np.intp))
+        if record.place is not None:
+            return self._lose_client(record, death, owed)
         was_up = record.stage is Stage.UP
         loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None
@@ -376,15 +391,54 @@ class Supervisor:
             self._update_any_deaths()
             return loss
         record.stage = Stage.DOWN
-        record.restart_at = self._clock() + restart_pause(record.deaths[record.culprit])
+        record.restart_at = self.clock() + restart_pause(record.deaths[record.culprit])
         if was_up:
             return loss
         self.replace(record.host.host_id)
         return None
 
+    def _lose_client(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
+        """Decide what the loss of a client means: whoever takes the place next replaces it."""
+        loss = self._judged(record, death, owed)
+        # After too many losses in a row the error is raised, and the next request waits anew.
+        loss = record.last_loss = replace(loss, replaced=True, resets=loss.resets and loss.replaced)
+        # What has shown nothing has lost nothing.
+        record.needs_reset = record.needs_reset or (record.was_shown and record.is_hardware)
+        self.places.leave(record)
+        self._update_any_deaths()
+        return loss
+
+    def take(self, taken: Taken) -> list[tuple[NDArray[np.int64], Sequence[Any] | None]]:
+        """Note that a client has taken a place; return the request that was held for it."""
+        record = self.records[taken.host_id]
+        slot = record.slots.start
+        record.restarts += record.was_shown
+        record.deaths = {slot: count for slot, count in record.deaths.items() if count}
+        self.places.take(record, taken)
+        meta = self.metas[slot]
+        self.metas[slot] = taken.meta.model_copy(
+            update={"max_episode_steps": self._envs.step_limits.item(slot) or None}
+        )
+        if meta.action_space is None:  # The first client decides for all places of its entry.
+            for other in range(self._envs.num_local, len(self._envs)):
+                if self._envs.configs[other] is self._envs.configs[slot] and other != slot:
+                    self.metas[other] = self.metas[slot].model_copy(
+                        update={
+                            "env_id": self._envs.env_ids[other],
+                            "max_episode_steps": self._envs.step_limits.item(other) or None,
+                        }
+                    )
+        self._tables.observed.note_fate("up", taken.host_id, -1, "")
+        self._update_any_deaths()
+        return self.places.release(record)
+
+    def objection(self, meta: EnvMeta) -> str | None:
+        """Return the reason why the env of a client doesn't fit the group, or None."""
+        return self.places.objection(meta, self.metas)
+
     def replace(self, host_id: int) -> None:
         """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
-        self._restart(self.records[host_id], self._clock())
+        self._restart(self.records[host_id], self.clock())
 
     def _restart(self, record: HostRecord, now: float) -> None:
         if record.restart_at is None or record.restart_at > now:
@@ -400,7 +454,7 @@ class Supervisor:
         record.gone.clear()
         assert record.order is not None
         record.host.attach(record.order)
-        record.give_time(self._clock())
+        record.give_time(self.clock())
 
     def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Count a death, decide if the host is replaced, log that, and return what it means."""
@@ -408,13 +462,16 @@ class Supervisor:
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
             record.culprit = culprit_of(record, death.requests, requests, owed)
-        is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
+        # Else the caller's wish, or the client's right, which counts for nothing.
+        is_fault = record.aborted_slot is None and not death.in_order
         deaths = record.deaths.get(record.culprit, 0) + is_fault
         record.deaths[record.culprit] = deaths
         self._note_deaths(True)
         replaced, then = True, "it is replaced"
         if is_fault:
             replaced, then = record.restart_policy.count(deaths)
+        if record.place is not None:
+            then = then if not replaced else "its place waits for a client"
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
@@ -438,7 +495,12 @@ class Supervisor:
 
     def _update_any_deaths(self) -> None:
         self._note_deaths(
-            any(record.deaths for record in self.records if record.stage is not Stage.GIVEN_UP)
+            any(
+                record.deaths
+                for record in self.records
+                if record.stage is not Stage.GIVEN_UP
+                and not (record.place is not None and record.stage is Stage.DOWN)
+            )
         )
 
     def _note_deaths(self, any_deaths: bool) -> None:

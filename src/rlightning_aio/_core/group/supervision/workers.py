@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio._core.group.state.host_record import Stage
-from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,13 +44,15 @@ class Workers:
         env_ids, requests = self._envs.env_ids, self._tables.requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
+        is_empty = record.place is not None and record.stage is Stage.DOWN
         lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.gone)
         return {
             "entry": record.config.name,
-            "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],
-            "given_up": [env_id for slot in lost if (env_id := env_ids[slot])],
+            "env_ids": [env_ids[slot] for slot in slots],
+            "given_up": [env_ids[slot] for slot in lost],
             "pid": getattr(record.host, "pid", None),
-            "state": _STATES.get(record.stage, "starting"),
+            "client": None if record.place is None else record.place.client or None,
+            "state": "empty" if is_empty else _STATES.get(record.stage, "starting"),
             "owed": [env_ids[slot] for slot in busy],
             "owed_seconds": (now_ns - int(requests.sent_ns[busy[0]])) / 1e9 if len(busy) else 0.0,
             "restarts": record.restarts,
@@ -88,8 +89,8 @@ def _listed(names: Sequence[str]) -> str:
 
 def _entry(records: Sequence[HostRecord]) -> str:
     config = records[0].config
-    if placement_of(config.backend, config.placement).max_members:
-        return config.backend
+    if records[0].place is not None:
+        return f"{len(records)} place{'' if len(records) == 1 else 's'} for clients"
     envs = sum(len(record.slots) for record in records)
     # Only its spaces say so of an env that a callable has made.
     each = [env.meta.num_envs for r in records for env in r.started] or [config.num_envs] * envs

@@ -38,6 +38,7 @@ class Authenticator:
 
     def __init__(self, keys: Path | None) -> None:
         self._keys = None if keys is None else read_server_keys(keys)
+        self._listed = None if self._keys is None else ListedKeys(self._keys.clients)
         self._zap: zmq.auth.Authenticator
 
     @property
@@ -52,9 +53,15 @@ class Authenticator:
         router.set_string(zmq.ZAP_DOMAIN, _DOMAIN)
         router.set(zmq.ZAP_ENFORCE_DOMAIN, 1)
         if self._keys is not None:
-            self._zap.configure_curve_callback(_DOMAIN, ListedKeys(self._keys.clients))
+            self._zap.configure_curve_callback(_DOMAIN, self._listed)
             router.set(zmq.CURVE_SERVER, 1)
             router.set(zmq.CURVE_SECRETKEY, self._keys.secret)
+
+    def names_of(self, frame: zmq.Frame) -> set[str] | None:
+        """Return the names that the key of a message's sender was made for; None without keys."""
+        if self._listed is None:
+            return None
+        return self._listed.names(cast("str", frame.get("User-Id")).encode())
 
     def answer(self) -> None:
         """Answer all questions that have come."""

@@ -16,7 +16,12 @@ from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descrip
 from rlightning_aio._core.hosts.env_server.authenticator import Authenticator
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.net.texts import LOG
-from rlightning_aio.protocol.net.wire import HANDSHAKE_SECONDS, MAX_FRAME_BYTES, ping_ms
+from rlightning_aio.protocol.net.wire import (
+    DEFAULT_HEARTBEAT,
+    HANDSHAKE_SECONDS,
+    MAX_FRAME_BYTES,
+    ping_ms,
+)
 from rlightning_aio.remote.zmq_messages import (
     is_readable,
     next_frame,
@@ -112,7 +117,7 @@ class Listener:
     def _listen(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         settings = self._settings
         router = self._router = context.socket(zmq.ROUTER)
-        interval, patience = ping_ms(settings.heartbeat)
+        interval, patience, _ = ping_ms(settings.heartbeat or DEFAULT_HEARTBEAT)
         # Messages to a closed connection must fail, not vanish.
         router.set(zmq.ROUTER_MANDATORY, 1)
         router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
@@ -157,10 +162,6 @@ class Listener:
         """Return True if `pump` has something to do. Asking may clear the descriptor."""
         return self._is_woken or is_readable(self._router)
 
-    def deadline(self) -> float | None:
-        """Return the time at which `pump` is due even without a message; None if never."""
-        return self._sessions.deadline()
-
     def _call_back(self) -> None:
         """Make the driver pump once more, though no change will wake it."""
         if not self._is_woken:
@@ -169,7 +170,7 @@ class Listener:
 
     # -- messages -------------------------------------------------------------------
 
-    def pump(self, now: float) -> None:
+    def pump(self) -> None:
         """Read all messages and send all that wait; never blocks."""
         if self._is_woken:
             self._is_woken = False
@@ -189,7 +190,6 @@ class Listener:
             gone, self._gone = self._gone, []
             for route in gone:
                 self._sessions.disconnected(route)
-        self._sessions.tick(now)
         self._send()
 
     def _read_events(self) -> None:
@@ -226,7 +226,7 @@ class Listener:
         if self._sessions.holds(route):
             self._sessions.receive(route, parts)
         elif self._is_open(frame):
-            self._sessions.receive(route, parts)
+            self._sessions.receive(route, parts, self._authenticator.names_of(frame))
             if self._sessions.holds(route):
                 self._open[frame.get(zmq.SRCFD)] = route
         return True
@@ -239,10 +239,8 @@ class Listener:
         return descriptor in self._open and self._open[descriptor] in {None, frame.bytes}
 
     def flush(self) -> None:
-        """Send new requests, and make sure that results wake the driver."""
+        """Send new requests."""
         self._send()
-        if self._sessions.has_results:
-            self._call_back()
 
     def _send(self) -> None:
         outbox = self._sessions.outbox
@@ -257,6 +255,7 @@ class Listener:
                 if error.errno not in {zmq.EHOSTUNREACH, zmq.EAGAIN}:
                     raise
                 self._sessions.disconnected(route)
+                self._call_back()  # The driver is to learn of it.
         # Sending reads ZMQ's signals, so the descriptor may not report waiting messages.
         if is_readable(self._router):
             self._call_back()

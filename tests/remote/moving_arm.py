@@ -1,0 +1,69 @@
+"""``moving_arm.py ADDRESS NAME LOG``: a client whose env moves something real.
+
+It writes a line into the file LOG before each motion. While a file LOG.hold exists, a motion goes
+on. It ends with the program that started it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.types import EnvRet
+
+if TYPE_CHECKING:
+    from rlightning_aio.types import PolicyResponse
+
+
+class Arm(BaseEnv):
+    """Each reset and each step is a motion."""
+
+    def __init__(self, log: Path) -> None:
+        super().__init__(EnvConfig(name="arm", backend="arm", task="-"))
+        self._log = log
+        self._hold = log.with_suffix(".hold")
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def _move(self, what: str) -> EnvRet:
+        with self._log.open("a") as file:
+            file.write(f"{what}\n")
+        while self._hold.exists():
+            time.sleep(0.01)
+        return EnvRet(env_id=self.env_id, observation=np.zeros(2, np.float32))
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> EnvRet:
+        del options
+        return self._move(f"reset {seed}")
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        del policy_resp
+        return self._move("step")
+
+
+def end_with_parent() -> None:
+    parent = os.getppid()
+    while os.getppid() == parent:
+        time.sleep(0.1)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    address, name, log = sys.argv[1:]
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    with RemoteEnvClient(Arm(Path(log)), address, name=name, hardware=True) as client:
+        client.run()

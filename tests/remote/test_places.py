@@ -1,0 +1,278 @@
+"""A client is a worker that starts itself: places, who takes them, and what a loss means."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from kit.counting import ClientThread, CountingEnv, look
+from patience import HANG
+from remote.faulty_proxy import Faults, FaultyProxy
+
+from rlightning_aio import EnvAway, ResetNeeded, sync
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_TESTS = Path(__file__).parents[1]
+
+
+def entry(**env_kwargs: Any) -> dict[str, Any]:
+    return {
+        "name": "robots",
+        "backend": "env_server",
+        "env_kwargs": {"connect_timeout": HANG, **env_kwargs},
+    }
+
+
+class ArmProcess:
+    """An arm in a process of its own, which counts its motions."""
+
+    def __init__(self, address: str, log: Path, name: str = "arm") -> None:
+        self._log = log
+        self._hold = log.with_suffix(".hold")
+        self.process = subprocess.Popen(
+            [sys.executable, str(_TESTS / "remote" / "moving_arm.py"), address, name, str(log)],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_TESTS), *sys.path])},
+            stderr=subprocess.DEVNULL,
+        )
+
+    def motions(self) -> list[str]:
+        return self._log.read_text().splitlines() if self._log.exists() else []
+
+    def hold(self) -> None:
+        """Let the next motion go on until `let_go`."""
+        self._hold.touch()
+
+    def let_go(self) -> None:
+        self._hold.unlink(missing_ok=True)
+
+    def end(self) -> None:
+        self.let_go()
+        self.process.kill()
+        self.process.wait()
+
+
+@contextlib.contextmanager
+def arms() -> Iterator[list[ArmProcess]]:
+    started: list[ArmProcess] = []
+    try:
+        yield started
+    finally:
+        for arm in started:
+            arm.end()
+
+
+def actions(batch: Any) -> Any:
+    return batch.respond(action=np.zeros((len(batch), 2), np.float32))
+
+
+def wait_for(group: Any, condition: Any) -> None:
+    """Let the group's sockets work until something holds."""
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < HANG
+        look(group)
+
+
+@pytest.mark.parametrize("operation", ["step", "reset"])
+@pytest.mark.parametrize("fault", ["killed", "stopped", "cut off"])
+def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_path: Path) -> None:
+    """Whatever is lost meanwhile, and whoever dials in."""
+    with sync.build_env_group(entry()) as group, arms() as started:
+        address = group["robots-0"].address
+        proxy = FaultyProxy(address, Faults())
+        with proxy:
+            arm = ArmProcess(proxy.address, tmp_path / "first")
+            started.append(arm)
+            wait_for(group, lambda: group["robots-0"].clients)
+            for _ in range(50):
+                look(group)
+            assert arm.motions() == []
+            batch, _ = group.reset(seed=7)
+            assert arm.motions() == ["reset 7"]
+            batch, _ = group.step(actions(batch))
+            arm.hold()
+            if operation == "step":
+                group.step_async(actions(batch))
+            else:
+                group.reset_async(seed=8)
+            wait_for(group, lambda: len(arm.motions()) == 3)
+            began = time.monotonic()
+            if fault == "killed":
+                arm.process.kill()
+            elif fault == "stopped":
+                arm.process.send_signal(signal.SIGSTOP)
+            else:
+                for pair in proxy._pairs:
+                    pair.silent = True
+            with pytest.raises(EnvAway):
+                group.collect_async(deadline=HANG)
+            assert time.monotonic() - began < 1.0 + 2.0
+            arm.end()
+            other = ArmProcess(address, tmp_path / "second")
+            started.append(other)
+            wait_for(group, lambda: group["robots-0"].clients)
+            for _ in range(5):
+                with pytest.raises(EnvAway, match="reset it to go on"):
+                    group.step(actions(batch))
+                with pytest.raises(EnvAway), group.auto_reset(1):
+                    group.step_async(actions(batch))
+                look(group)
+            assert other.motions() == []
+            batch, _ = group.reset(seed=9)
+            assert other.motions() == ["reset 9"]
+            assert batch.restarted.tolist() == [True]
+            group.step(actions(batch))
+
+
+def test_a_held_reset_that_is_taken_back_moves_nothing(tmp_path: Path) -> None:
+    """By an abort, or because the call was interrupted."""
+    with sync.build_env_group(entry()) as group, arms() as started:
+        address = group["robots-0"].address
+        group.reset_async(seed=1)
+        assert group.pending == ["robots-0/0"]
+        group.abort()
+        assert group.pending == []
+
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        before = signal.signal(signal.SIGALRM, interrupt)
+        try:
+            for env_ids in (None, ["robots-0/0"]):
+                signal.setitimer(signal.ITIMER_REAL, 0.3)
+                with pytest.raises(KeyboardInterrupt):
+                    group.reset(seed=2, env_ids=env_ids)
+                assert group.pending == []
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        arm = ArmProcess(address, tmp_path / "arm")
+        started.append(arm)
+        wait_for(group, lambda: group["robots-0"].clients)
+        for _ in range(50):
+            look(group)
+        assert arm.motions() == []
+        group.reset(seed=3)
+        assert arm.motions() == ["reset 3"]
+
+
+def mixed(**env_kwargs: Any) -> Any:
+    local = {
+        "name": "local",
+        "backend": "gymnasium",
+        "task": "Pendulum-v1",
+        "num_workers": 4,
+    }
+    return sync.build_env_group([local, entry(**env_kwargs)], mixed_actions=True)
+
+
+@pytest.mark.parametrize("when", ["idle", "in flight", "uncollected"])
+def test_a_place_changes_hands_in_mid_run(when: str) -> None:
+    """A response to a lost client never reaches the next one."""
+    with mixed(clients=2) as group:
+        address = group["robots-0"].address
+        ids = ["robots-0/0", "robots-0/1"]
+        env = CountingEnv(1)
+        gone = ClientThread(address, "gone", env)
+
+        def leave() -> None:
+            env.finished = True
+            if when == "in flight":
+                gone.client._hang_up()
+
+        env.on_step, env.finished = leave, when == "idle"
+        wait_for(group, lambda: len(group["robots-0"].clients) == 1)
+        stays = ClientThread(address, "stays", CountingEnv(2))
+        batch, _ = group.reset(seed=5)
+        assert batch.ids()[4:] == ids
+        assert batch.take([4, 5]).observation.tolist() == [[1, 9, 0], [2, 10, 0]]
+        index = batch.index.tolist()
+        rows = batch.take([4, 5])
+        if when != "idle":
+            group.step_async(actions(rows))
+        wait_for(group, lambda: len(group["robots-0"].clients) == 1)
+        comes = ClientThread(address, "comes", CountingEnv(3))
+        if when == "idle":
+            group.step_async(actions(rows))
+        results: dict[str, Any] = {}
+        while len(results) < 2:
+            found, _ = group.collect_async(deadline=HANG)
+            for k, env_id in enumerate(found.ids()):
+                results[env_id] = found.take([k])
+        if when == "uncollected":
+            assert results[ids[0]].observation.tolist() == [[1, 9, 1]]
+            group.step_async(actions(results[ids[0]]))
+            results[ids[0]], _ = group.collect_async(deadline=HANG)
+        marked = results[ids[0]]
+        assert marked.restarted.tolist() == marked.is_reset.tolist() == [True]
+        assert marked.observation.tolist() == [[3, -1, 0]]
+        assert "client_lost" in marked.infos
+        assert comes.env.steps == 0
+        assert comes.env.resets == 1
+        assert marked.index.tolist() == index[4:5]
+        group.close()
+        for client in (stays, comes, gone):
+            client.join()
+
+
+def test_an_empty_place_delays_nobody() -> None:
+    """Its requests are pending; a call that waits for it alone gets an error."""
+    with mixed(clients=1, connect_timeout=0.5) as group:
+        local = group.env_ids[:4]
+        with pytest.raises(EnvAway, match=r"robots-0/0 within 0.5 s.*has no client"):
+            group.reset()
+        batch, _ = group.reset(seed=0, env_ids=local)
+        group.reset_async(env_ids=["robots-0/0"])
+        began = time.monotonic()
+        while time.monotonic() - began < 1.5:
+            group.step_async(batch.respond(action=np.zeros((4, 1), np.float32)))
+            done, _ = group.collect_async(min_results=4)
+            assert sorted(done.ids()) == sorted(local)
+            batch = done
+        assert group.pending == ["robots-0/0"]
+        time.sleep(1.0)  # A learner's pause costs nothing.
+        group.step_async(batch.respond(action=np.zeros((4, 1), np.float32)))
+        done, _ = group.collect_async(min_results=4)
+        began = time.monotonic()
+        with pytest.raises(EnvAway):
+            group.collect_async(wait_all=True)
+        assert time.monotonic() - began >= 0.5
+        assert group.pending == []
+        with pytest.raises(ResetNeeded):
+            group.step_async(sync_batch(["robots-0/0"]))
+
+
+def sync_batch(env_ids: list[str]) -> Any:
+    from rlightning_aio import BatchedData, PolicyResponse
+
+    return BatchedData(
+        env_ids, [PolicyResponse(one, action=np.zeros(2, np.float32)) for one in env_ids]
+    )
+
+
+def test_seeds_and_index_go_by_place() -> None:
+    """In every order of dialling, equal to local envs."""
+    for order in ((0, 1), (1, 0)):
+        with mixed(clients=["a", "b"]) as group:
+            address = group["robots-0"].address
+            names = ["a", "b"]
+            clients = []
+            for k in order:
+                clients.append(ClientThread(address, names[k], CountingEnv(k)))
+                count = len(clients)
+                wait_for(group, lambda count=count: len(group["robots-0"].clients) == count)
+            batch, _ = group.reset(seed=100)
+            assert batch.ids()[4:] == ["robots-0/a", "robots-0/b"]
+            assert batch.take([4, 5]).observation.tolist() == [[0, 104, 0], [1, 105, 0]]
+            group.close()
+            for client in clients:
+                client.join()
