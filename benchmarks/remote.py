@@ -80,7 +80,7 @@ class _Clients(Contender):
 
     def setup(self) -> None:
         self._keys = tempfile.TemporaryDirectory()
-        make_keys(self._keys.name, ["client"])
+        make_keys(self._keys.name, [f"c{k}" for k in range(self.num_clients)])
         self._processes: list[Any] = []
         self.listen()
 
@@ -90,7 +90,7 @@ class _Clients(Contender):
     def dial(self, target: Any, port: int) -> None:
         context = mp.get_context("spawn")
         for k in range(self.num_clients):
-            args = (port, self.keys("client"), f"c{k}")
+            args = (port, self.keys(f"c{k}"), f"c{k}")
             self._processes.append(context.Process(target=target, args=args))
             self._processes[-1].start()
 

@@ -8,13 +8,14 @@ from rlightning_aio.attempts.players import Players
 
 
 class Group:
-    """A group whose only worker is given up, and whose server waits for its first client."""
+    """A group whose only worker is given up, and a server with an empty place."""
 
     metas = ()
 
     def get_workers(self) -> list[dict[str, Any]]:
-        gone = {"entry": "a", "env_ids": ["a-0"], "given_up": ["a-0"]}
-        return [gone, {"entry": "robots", "env_ids": [], "given_up": []}]
+        gone = {"entry": "a", "env_ids": ["a-0"], "given_up": ["a-0"], "state": "given up"}
+        place = {"entry": "robots", "env_ids": ["robots-0/0"], "given_up": [], "state": "empty"}
+        return [gone, place]
 
 
 def test_clients_may_come_whatever_other_envs_are_gone() -> None:

@@ -71,7 +71,7 @@ def test_what_is_out_of_band_stays_pickled() -> None:
     assert isinstance(arrived, Result)
     assert isinstance(arrived.out_of_band, bytes)
     assert pickle.loads(arrived.out_of_band) == {"info": {"a": 1}}
-    assert (arrived.host_id, arrived.entry, arrived.is_loss) == (5, STEP, False)
+    assert (arrived.host_id, arrived.entry) == (5, STEP)
 
 
 @pytest.mark.parametrize(

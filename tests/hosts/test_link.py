@@ -104,7 +104,7 @@ class Scene:
             num_hosts=1,
             configs=[CONFIG],
             objection=lambda meta: None,
-            is_idle=lambda slot: True,
+            busy_since=lambda slot: None,
             resources={(ForkServerHandle, *_surroundings(CONFIG)): self.fork_server},
         )
         order = StartOrder(CONFIG, None, (0, 1), (None, None), spins=False)

@@ -210,7 +210,7 @@ def test_an_actor_has_the_time_limits_of_all_its_steps(seconds: list[int], end: 
 def test_clients_of_an_env_server_are_simulated() -> None:
     def world(seed: int) -> World:
         world = World(seed, Faults(cuts=0.05))
-        kwargs = {"heartbeat": 1.0, "min_clients": 2, "connect_timeout": 900.0}
+        kwargs = {"heartbeat": 1.0, "clients": ["c0", "c1"], "connect_timeout": 900.0}
         entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
         with world, sync.build_env_group(entry) as group:
             for k in range(2):

@@ -97,10 +97,12 @@ class Steps:
         self._waiting = waiting
         self._intake = waiting.intake
         self._sums = tables.sums
+        self._has_places = False
 
     def begin(self) -> None:
         """Note what kind of envs were started."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
+        self._has_places = envs.num_local < len(envs)
         # Places are empty as yet; `_asks_a_place` finds requests to them.
         local = [host for host in hosts if host.first_slot < envs.num_local]
         is_inline = len(local) == 1 and isinstance(local[0], Executing)
@@ -228,7 +230,7 @@ class Steps:
         slots, columns = answer
         if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
             return self._write_any(batch, now)
-        if self._asks_a_place(slots):
+        if self._has_places and self._asks_a_place(slots):
             return self._write_any(batch, now)
         slab = self._layout.slabs[0]
         rows: Rows = self._all_rows if slots is self._envs.local else slots
@@ -273,7 +275,7 @@ class Steps:
         requests = self._requests
         owner = COLLECTOR if ticket is None else ticket.owner
         is_ordinary = requests.in_rings and len(slots) > 0 and not self._conditions.unusual
-        if is_ordinary and not self._asks_a_place(slots):
+        if is_ordinary and not (self._has_places and self._asks_a_place(slots)):
             for ring in requests.publish(slots, self._episodes.due[slots], owner, now):
                 ring.wake()
             return
@@ -294,8 +296,7 @@ class Steps:
 
     def _asks_a_place(self, slots: NDArray[np.intp]) -> bool:
         """Return True if any of `slots` belongs to a client, or will."""
-        num_local = self._envs.num_local
-        return num_local < len(self._envs) and int(slots.max()) >= num_local
+        return int(slots.max()) >= self._envs.num_local
 
     # -- hand out ---------------------------------------------------------------------
 

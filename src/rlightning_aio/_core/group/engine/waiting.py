@@ -134,10 +134,7 @@ class Waiting:
         """
         poller, supervisor, in_flight = self._poller, self._supervisor, self._requests.in_flight
         if supervisor.places.num_held or self._alone_since:
-            now, due = self._look_at_places()
-            if due is not None and due <= now:
-                return now
-            until = earliest(until, due)
+            until = earliest(until, self._look_at_places())
         self.wanted[wanted] = self.wanted.get(wanted, 0) + 1
         try:
             if poller.inline and poller.execute(1 if self._shares_thread else wanted, until):
@@ -154,9 +151,15 @@ class Waiting:
                     if is_due:
                         now = yield Wait(0.0)
                 else:
-                    now, is_due = yield from self._sleep(until)
+                    is_due = until is not None or supervisor.detector.any_ending
+                    is_due = is_due or self._conditions.unusual & OF_HOSTS != 0
+                    patient = supervisor.patient
+                    now = yield Wait(supervisor.next_check(until)) if is_due else patient
                     if may_spin:
                         poller.slept()
+                    if not is_due:
+                        supervisor.look_by = now + LOOK_SECONDS
+                        is_due = self._conditions.unusual & OF_HOSTS != 0
         finally:  # As `_want`, without a call.
             if (calls := self.wanted.pop(wanted)) > 1:
                 self.wanted[wanted] = calls - 1
@@ -166,21 +169,10 @@ class Waiting:
             self.check(now)
         return now
 
-    def _sleep(self, until: float | None) -> Procedure[tuple[float, bool]]:
-        """Wait for replies; return the time, and True if the hosts are to be checked."""
-        supervisor, conditions = self._supervisor, self._conditions
-        is_due = until is not None or supervisor.detector.any_ending
-        is_due = is_due or conditions.unusual & OF_HOSTS != 0
-        now = yield Wait(supervisor.next_check(until)) if is_due else supervisor.patient
-        if not is_due:
-            supervisor.look_by = now + LOOK_SECONDS
-            is_due = conditions.unusual & OF_HOSTS != 0
-        return now, is_due
-
-    def _look_at_places(self) -> tuple[float, float | None]:
+    def _look_at_places(self) -> float | None:
         """End the requests of calls that have waited for clients alone for too long.
 
-        Returns the time, and when to look again: no later, if a call has learned something.
+        Returns when to look again; that is now, if a call has learned something.
         """
         now, due = self._supervisor.clock(), None
         found = self._supervisor.places.held()
@@ -198,7 +190,7 @@ class Waiting:
                 due = now
             if expires < math.inf:
                 due = earliest(due, expires)
-        return now, due
+        return due
 
     def _since_alone(self, owner: int, records: Sequence[HostRecord], now: float) -> float | None:
         """Return since when a call waits for nothing but held requests; None if it doesn't."""
