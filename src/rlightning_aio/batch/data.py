@@ -575,5 +575,5 @@ def _check_rows(name: str, column: Any, count: int) -> None:
         found = f"is {column!r}" if rows is None else f"has {rows} rows"
         raise BadAction(
             f"column {name!r} {found} for a batch of {count}; give one row for "
-            "each result, in the batch's order"
+            "each result, in the batch's order: an array, or a list of plain values"
         )

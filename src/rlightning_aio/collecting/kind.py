@@ -16,7 +16,7 @@ from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.answers import answers_of
 from rlightning_aio.protocol.columns import gather, is_array
-from rlightning_aio.trees import mapped, zipped
+from rlightning_aio.trees import is_dict, is_tuple, mapped, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -103,7 +103,7 @@ class EnvKind:
         self.quota = quota
         self.num_steps = 0
         self.held: Part | None = None
-        self._acts_in_arrays = False
+        self._acts_in_arrays = self._acts_in_values = False
         self._action_space: gym.Space[Any] | None = None
         self.staging = Staging(quota, infos)
         self._taken = OWN_NAMES.union(infos)
@@ -129,6 +129,9 @@ class EnvKind:
             space = meta.action_space
             self._action_space = space
             self._acts_in_arrays = space is not None and is_array(space)
+            self._acts_in_values = space is not None and not (
+                self._acts_in_arrays or is_dict(space) or is_tuple(space)
+            )
             if meta.autoreset == "same_step":
                 self.staging.note_same_step(results.index[row])
 
@@ -167,7 +170,7 @@ class EnvKind:
         stored: dict[str, Any] = {**given}
         if self._acts_in_arrays and isinstance(given["action"], list):
             stored["action"] = np.asarray(cast("list[Any]", given["action"]))
-        columns = rows_of(stored, head)
+        columns = rows_of(stored, head, ("action",) if self._acts_in_values else ())
         columns["observation"] = part.results.observation
         self.staging.check(columns)
         return answers[0], columns

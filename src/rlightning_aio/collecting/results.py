@@ -165,7 +165,7 @@ def result_rows(batch: BatchedData) -> ResultRows:
     if isinstance(done, dict) or len(done.nonzero()[0]):  # Otherwise all flags are False.
         terminated, truncated = source.terminated, source.truncated
     columns = {"reward": source.reward, "terminated": terminated, "truncated": truncated}
-    outcome = rows_of({"observation": source.observation, **columns}, head)
+    outcome = rows_of({"observation": source.observation, **columns}, head, ("observation",))
     observation = outcome.pop("observation")
     index, done, is_reset = source.index, all_agents(done), is_reset.reshape(-1)
     return ResultRows(

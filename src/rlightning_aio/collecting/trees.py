@@ -7,6 +7,7 @@ Absent on purpose: torch. NumPy reads a CPU tensor without copying it.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -30,15 +31,16 @@ __all__ = [
 ]
 
 
-def as_column(name: str, value: Any) -> NDArray[Any]:
+def as_column(name: str, value: Any, *, keeps_values: bool = False) -> NDArray[Any]:
     """Convert a value for column `name` to an array; arrays and CPU tensors are not copied.
 
-    A list of Python values (strings, dicts, lists of any length) becomes an array of objects.
+    A list of Python values (strings, dicts, lists of any length) becomes an array of objects, and
+    so does any list if it `keeps_values`: its arrays may have another size the next time.
     """
     if isinstance(value, np.ndarray):
         return cast("NDArray[Any]", value)
     if isinstance(value, list):
-        return _listed(cast("list[Any]", value))
+        return _listed(cast("list[Any]", value), keeps_values=keeps_values)
     try:
         return np.asarray(value)
     except (TypeError, RuntimeError) as error:  # A tensor on a GPU, or with a gradient.
@@ -48,8 +50,9 @@ def as_column(name: str, value: Any) -> NDArray[Any]:
         ) from error
 
 
-def _listed(values: list[Any]) -> NDArray[Any]:
-    if not values or not isinstance(values[0], list | dict | tuple | str):
+def _listed(values: list[Any], *, keeps_values: bool) -> NDArray[Any]:
+    is_plain = keeps_values or (values and isinstance(values[0], list | dict | tuple | str))
+    if not is_plain:
         try:
             array = np.asarray(values)
         except ValueError:
@@ -66,12 +69,15 @@ def with_lists(tree: Tree) -> Tree:
     return mapped(lambda leaf: leaf.tolist() if leaf.dtype == object else leaf, tree)
 
 
-def rows_of(columns: Mapping[str, Any], head: tuple[int, ...]) -> dict[str, Tree]:
+def rows_of(
+    columns: Mapping[str, Any], head: tuple[int, ...], plain: Collection[str] = ()
+) -> dict[str, Tree]:
     """Reshape columns to one row for each sub-environment: ``[n, *shape]``.
 
     Args:
         columns: trees of ``[*head, *shape]`` by name.
         head: ``(n,)``, or ``(m, num_envs)``.
+        plain: names of those whose lists hold one value for each row, as it is.
 
     Raises:
         ValueError: the leading axes of a column are not `head`.
@@ -82,12 +88,13 @@ def rows_of(columns: Mapping[str, Any], head: tuple[int, ...]) -> dict[str, Tree
         if type(column) is np.ndarray and len(head) == 1 and column.shape[:1] == head:
             rows[name] = column
         else:
-            rows[name] = mapped(lambda leaf, name=name: _leaf_rows(name, leaf, head), column)
+            as_rows = partial(_leaf_rows, name, head, keeps_values=name in plain)
+            rows[name] = mapped(as_rows, column)
     return rows
 
 
-def _leaf_rows(name: str, value: Any, head: tuple[int, ...]) -> NDArray[Any]:
-    array = as_column(name, value)
+def _leaf_rows(name: str, head: tuple[int, ...], value: Any, *, keeps_values: bool) -> NDArray[Any]:
+    array = as_column(name, value, keeps_values=keeps_values)
     shape, depth = array.shape, len(head)
     if shape[:depth] != head:
         raise ValueError(
@@ -130,7 +137,8 @@ def check_alike(columns: Mapping[str, Tree], values: Mapping[str, Tree]) -> None
             raise ValueError(
                 f"column {name!r} has rows of another shape or dtype than before; envs that differ "
                 "are collected apart: give one policy for each config entry, as "
-                "{'entry name': policy, …}"
+                "{'entry name': policy, …}; a policy gives values of several sizes as lists, such "
+                "as array.tolist()"
             )
 
 

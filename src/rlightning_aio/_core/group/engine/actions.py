@@ -19,7 +19,7 @@ from rlightning_aio.batch.stacking import plain_numbers
 from rlightning_aio.errors import BadAction
 from rlightning_aio.protocol.columns import Leaf, Rows, out_of_range
 from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
-from rlightning_aio.trees import Tree, as_array, index
+from rlightning_aio.trees import Tree, as_array, index, is_tuple
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,8 +64,22 @@ def write_actions(
         rows = rows_in(layout, slots, envs.local)
         write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
     else:
+        if columns is not None and isinstance(columns.get("action"), tuple):
+            _check_tuple(slots, envs, layout)
         _write_one_by_one(batch, slots, envs, layout, beside)
     return None if beside is None else _steps_beside_rows(batch, slots, envs, beside)
+
+
+def _check_tuple(slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout) -> None:
+    """Refuse a tuple for envs whose actions have no parts: it would be taken for their columns."""
+    for slot in slots.tolist():
+        space = layout.slabs[layout.slab[slot]].layout.action_space
+        if not is_tuple(space):
+            raise BadAction(
+                f"a tuple of actions is one of columns, of a Tuple space, but the action space of "
+                f"{envs.describe(slot)} is {space}; give a list with one action for each result; "
+                "nothing was sent"
+            )
 
 
 def write_column(
