@@ -20,6 +20,8 @@ ROBOTS := .venv-robots
 # LeRobot needs Python 3.12, for which PyTorch comes with gigabytes of CUDA.
 LEROBOT := .venv-lerobot
 PYTHON_OF_LEROBOT ?= python3.12
+# Trainers of language models pin far more than they use of each other.
+TRAINERS := .venv-trainers
 # What other projects' own tests need, and where `make test-peers PEERS=folder` finds their sources.
 PEERS_VENV := .venv-peers
 PEERS ?= peers
@@ -75,7 +77,7 @@ test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of
 	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/attempts
 
 # What `make test-simulators` installs; `make -j3 environments` installs three at once.
-environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed $(OPENENV)/installed $(ROBOTS)/installed
+environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed $(OPENENV)/installed $(ROBOTS)/installed $(TRAINERS)/installed
 
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
@@ -86,6 +88,7 @@ test-simulators: environments ## the tests of every backend, on the real simulat
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
+	$(TRAINERS)/bin/python -m pytest -m simulators -rs tests/trainers
 	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_simulators_page.py tests/envs/test_rendering.py tests/policies/test_real_servers.py
 
 # With -rs, each test that is skipped says what it lacks.
@@ -163,7 +166,7 @@ bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib ## every benchmark th
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(LEROBOT) $(PEERS_VENV) $(NEWEST) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(TRAINERS) $(LEROBOT) $(PEERS_VENV) $(NEWEST) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
@@ -209,6 +212,11 @@ $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable . metaworld==3.0.0 'mujoco<3.17' 'gym-pusht<0.2' 'gym-aloha<0.2' \
 	    hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
 	$(PIP_INSTALL) --no-deps openpi-client==0.1.2
+	@touch $@
+
+$(TRAINERS)/installed: pyproject.toml constraints.txt requirements/test.txt requirements/trainers.txt | $(TRAINERS)/bin/python
+	$(PIP_INSTALL) --constraint constraints.txt --editable . --requirement requirements/test.txt --requirement requirements/trainers.txt
+	$(PIP_INSTALL) --no-deps tinker-cookbook==0.6.1
 	@touch $@
 
 $(LEROBOT)/bin/python: PYTHON := $(PYTHON_OF_LEROBOT)

@@ -1,0 +1,66 @@
+"""The programs of pages for trainers of language models, with the real trainer."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from run_python import output_of
+
+pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def program(page: str, module: str) -> str:
+    """The program of a page that imports a module."""
+    pytest.importorskip(module)
+    text = (DOCS / f"{page}.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    imports = rf"^(from|import) {module}\b"
+    (code,) = [block for block in blocks if re.search(imports, block, re.MULTILINE)]
+    return code
+
+
+def names_of(page: str, module: str) -> dict[str, Any]:
+    names: dict[str, Any] = {"__name__": "page"}
+    exec(compile(program(page, module), page, "exec"), names)  # Of this project.
+    return names
+
+
+def test_trl(tmp_path: Path) -> None:
+    """Half of the rollouts reach their sum; what the env says is masked."""
+    names = names_of("migrating", "trl")
+    from datasets import Dataset
+    from trainers.tiny import tiny_model, tokenizer, trainer_args
+
+    words = tokenizer()
+    asked: list[int] = []
+
+    async def generate(ids: list[int]) -> tuple[list[int], list[float]]:
+        asked.append(len(ids))
+        text = "x1y" if len(asked) % 2 else "xy"
+        return words.encode(text), [-1.0] * len(text)
+
+    trainer = names["train"](
+        generate,
+        words,
+        model=tiny_model(words),
+        args=trainer_args(tmp_path),
+        train_dataset=Dataset.from_list([{"prompt": f"Pay 1, {one}"} for one in "abcd"]),
+    )
+    first, second = [row for row in trainer.state.log_history if "loss" in row]
+    assert {*asked} == {8, 8 + 3 + 3, 8 + 2 + 3}
+    assert 0 < first["reward"] < 2
+    assert first["num_tokens"] < second["num_tokens"]
+    assert first["grad_norm"] > 0
+
+
+def test_a_grpo_update(tmp_path: Path) -> None:
+    """Its mean reward grows."""
+    file = tmp_path / "update.py"
+    file.write_text(program("attempts", "torch"))
+    first, last = map(float, output_of(file, folder=tmp_path, asyncio_debug=False).split())
+    assert last > first + 0.5
