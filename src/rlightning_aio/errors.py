@@ -111,7 +111,7 @@ class ResetNeeded(RLightningError):
 
 
 class GroupClosed(RLightningError, RuntimeError):
-    """The group was used after ``close``, or was closed while a call was waiting."""
+    """The group was used before ``init`` or after ``close``, or closed while a call was waiting."""
 
 
 class SnapshotError(RLightningError, ValueError):

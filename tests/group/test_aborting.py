@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,7 +146,7 @@ async def test_a_drain_returns_what_is_in_flight(start: Any, entry: Any) -> None
     group = await start(entry)
     await group.reset(seed=3)
     assert len((await group.drain())[0]) == 0
-    for deadline in (None, 200.0):
+    for deadline in (None, 200.0, 1e12, math.inf):
         group.step_async(steps(*reversed(IDS)))
         batch, flags = await group.drain(deadline)
         assert (batch.ids(), flags, group.pending) == (IDS, [False] * 4, [])

@@ -20,7 +20,6 @@ from group import sample_envs
 import rlightning_aio
 from rlightning_aio import BatchedData, GroupClosed, PolicyResponse, StartFailed, sync
 from rlightning_aio._core.hosts.process import spares
-from rlightning_aio.errors import RLightningError
 
 PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}
 
@@ -94,12 +93,16 @@ async def test_a_group_that_is_not_open_refuses_all_operations(place: Any, momen
         group.step_async(batch.respond(action=np.zeros((3, 2))))
         await group.close()
     before = moment == "before init"
-    error, said = (RLightningError, "init") if before else (GroupClosed, "build a new one")
+    error, said = GroupClosed, "init" if before else "build a new one"
     step = BatchedData(["probe-0"], [PolicyResponse("probe-0", [0, 0])])
     for request in (
         group.reset,
         lambda: group.step(step),
         group.collect_async,
+        group.drain,
+        group.abort,
+        group.snapshot,
+        lambda: group.restore(b""),
         group.offload,
         lambda: group["probe-0"].call("double", 1),
         lambda: group["probe-0"].get_attr("label"),
@@ -108,6 +111,9 @@ async def test_a_group_that_is_not_open_refuses_all_operations(place: Any, momen
             await request()
     for plain in (
         lambda: group.step_async(step),
+        group.reset_async,
+        lambda: group.pending,
+        lambda: group.metas,
         group.get_observation_spaces,
         group.get_action_spaces,
     ):

@@ -88,7 +88,7 @@ async def test_seeds_are_an_int_or_a_list(start: Any) -> None:
     assert await seeds(seed=(9, 8), env_ids=["probe-3", "probe-1"]) == [9, 8]
     assert await seeds(seed=np.array([5, 6, 7, 8])) == [5, 6, 7, 8]
     assert await seeds(seed={"probe-1": 3}) == [-1, 3, -1, -1]
-    assert await seeds(seed={"probe-1": 3, "probe-3": 0}, env_ids=["probe-3"]) == [0]
+    assert await seeds(seed={"probe-3": 0}, env_ids=["probe-3"]) == [0]
     with pytest.raises(UnknownEnv, match="'nobody'"):
         await group.reset(seed={"nobody": 1})
     with pytest.raises(ValueError, match="-2"):
@@ -565,3 +565,37 @@ async def test_steps_after_an_end_belong_to_no_episode(start: Any) -> None:
     assert (ends > 1).all()
     stats = group.get_env_stats()
     assert [stats[env_id]["episodes"] for env_id in batch.ids()] == [1, 1]
+
+
+@one_driver
+async def test_a_seed_of_an_env_that_is_not_reset_is_refused(start: Any) -> None:
+    """A misprint would leave a run without seeds."""
+    group = await start(ENTRY)
+    for reset in (group.reset, later(group.reset_async)):
+        with pytest.raises(ValueError, match="seeds for 'probe-1', which this call doesn't reset"):
+            await reset({"probe-0": 1, "probe-1": 2}, env_ids=["probe-0"])
+    batch, _ = await group.reset({"probe-1": 2}, env_ids=["probe-1"])
+    assert batch.env_ids() == ["probe-1"]
+
+
+def later(plain: Any) -> Any:
+    async def call(*args: Any, **kwargs: Any) -> Any:
+        return plain(*args, **kwargs)
+
+    return call
+
+
+@one_driver
+async def test_ids_are_a_sequence_of_str(start: Any) -> None:
+    """One str is one, too, of its characters."""
+    group = await start(ENTRY)
+    for call in (
+        group.reset,
+        later(group.reset_async),
+        group.abort,
+        group.snapshot,
+        lambda env_ids: group.call("double", 1, env_ids=env_ids),
+    ):
+        with pytest.raises(TypeError, match=r"sequence of ids: give \['probe-0'\]"):
+            await call(env_ids="probe-0")
+    assert not group.pending

@@ -279,6 +279,15 @@ def test_statistics_come_from_the_objects_in_the_lists_of_envs_and_servers() -> 
     assert env.calls == server.calls == ["get_env_stats(True)", "finish_rollout"]
 
 
+def test_envs_need_no_method_of_their_own_for_an_evaluation() -> None:
+    """Engines call it for whatever env is there."""
+    config = EnvConfig(name="pole", backend="mujoco", task="InvertedPendulum-v5", num_workers=2)
+    with contextlib.closing(build_env_group([config])) as group:
+        group.init()
+        group.apply_evaluate_cfg()
+        group.restore_evaluate_cfg()
+
+
 def test_a_group_calls_a_method_of_all_envs(
     group: EnvGroup, capsys: pytest.CaptureFixture[str]
 ) -> None:

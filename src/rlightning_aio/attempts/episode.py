@@ -36,7 +36,7 @@ class AttemptEpisode:
 
     def __init__(self, episode: EnvEpisode, spec: EpisodeSpec, index: int) -> None:
         self._episode = episode
-        self._over = ""  # Why it can't be stepped any more.
+        self._over = ""  # Why it can't be stepped.
         self.spec, self.index = spec, index
         self.rewards: list[float] = []
         self.columns: dict[str, list[Any]] = {}

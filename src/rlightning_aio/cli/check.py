@@ -97,7 +97,7 @@ def check(
     config: Config,
     overrides: Overrides = None,
     steps: Annotated[
-        int, typer.Option(min=0, help="Play so many steps with random actions, and look closely.")
+        int, typer.Option(min=0, help="Play this many steps with random actions, and look closely.")
     ] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -179,7 +179,7 @@ def _has_no_samples(space: Any) -> bool:
 
 
 async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
-    """Play so many steps, and look at rewards, at times, and at what episodes leave behind."""
+    """Play `steps` steps, and look at rewards, at times, and at what episodes leave behind."""
     (worker,) = group.get_workers()
     pid, samples, times = worker["pid"] or "self", list[dict[str, float]](), list[int]()
     rewards = bad = 0

@@ -205,7 +205,7 @@ def _sizes(configs: Sequence[EnvConfig]) -> str:
 
 
 def _shared_out(config: EnvConfig, count: int) -> EnvConfig:
-    """Return the entry with its envs in about so many workers."""
+    """Return the entry with its envs in about `count` workers."""
     backend = ENVS.described(config.backend)
     if backend is not None and not backend.cpu_bound:
         # A simulator that uses a device or its own threads needs a process for each env.

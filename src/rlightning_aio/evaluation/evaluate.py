@@ -162,7 +162,7 @@ def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
     with ensure_auto_reset(group), closing(play):
         try:
             return (yield from play.to_the_end())
-        except GeneratorExit:  # Nobody runs it any more.
+        except GeneratorExit:  # It is abandoned.
             raise
         except BaseException:  # Ctrl-C and a cancellation, too.
             yield from play.abandon()

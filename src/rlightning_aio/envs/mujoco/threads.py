@@ -236,7 +236,7 @@ class Simulations:
                 self._plan.noise = noise
 
     def limit(self, num_steps: int) -> None:
-        """Truncate episodes after so many steps."""
+        """Truncate episodes after some steps."""
         if self._plan is not None:
             self._plan.limit = num_steps
 

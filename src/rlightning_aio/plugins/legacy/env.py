@@ -126,6 +126,12 @@ class BaseEnv(abc.ABC):
     def reload(self) -> None:
         """Allocate the memory again."""
 
+    def apply_evaluate_cfg(self) -> None:
+        """Apply ``config.evaluate_cfg``, if this env knows it."""
+
+    def restore_evaluate_cfg(self) -> None:
+        """Undo `apply_evaluate_cfg`."""
+
     def finish_rollout(self) -> None:
         """Finish a rollout; `EnvGroup.get_env_stats` calls it."""
 

@@ -67,8 +67,10 @@ class GroupInterface(Facade):
             EnvBusy: one of `env_ids` has a reply outstanding, or appears twice; or another call
                 waits for an env. Nothing was sent.
             UnknownEnv: no env of this group has that id.
-            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options are no dict, or can't be sent to a worker or a client.
+            ValueError: a seed is not an int from 0 to 2**62 - 1, or of an env that is not reset, or
+                there isn't one for each env.
+            TypeError: the options are no dict, or can't be sent to a worker or a client; or
+                `env_ids` is one str.
             EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or no client has dialled in for
                 it; the others' results are in the error's ``results``.
             GroupClosed: the group was not initialised, or is closed.

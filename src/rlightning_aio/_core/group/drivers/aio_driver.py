@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.drivers.wait import (
+    LONGEST_SECONDS,
     Parked,
     Patient,
     forked_from,
@@ -263,7 +264,9 @@ class AioDriver:
         self.wake()
 
     async def _block(self, wait: Wait) -> None:
-        timeout = None if wait.until is None else wait.until - time.monotonic()
+        timeout = None
+        if wait.until is not None:
+            timeout = min(wait.until - time.monotonic(), LONGEST_SECONDS)
         if timeout is not None and timeout <= 0:
             await asyncio.sleep(0)
             return

@@ -14,7 +14,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple, cast
 
-from rlightning_aio._core.group.drivers.wait import TURN, forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import LONGEST_SECONDS, TURN, forked_from, this_process
 from rlightning_aio._core.hosts.descriptors import READABLE, WRITABLE, new_descriptor_set
 from rlightning_aio.errors import RLightningError
 
@@ -212,7 +212,8 @@ class SyncDriver:
 
     def _block(self, until: float | None) -> None:
         epoll = self._epoll
-        seconds = -1.0 if until is None else max(0.0, until - time.monotonic())
+        left = LONGEST_SECONDS if until is None else until - time.monotonic()
+        seconds = min(max(0.0, left), LONGEST_SECONDS)
         if epoll is None:
             if until:
                 self.interruptible(partial(time.sleep, seconds))

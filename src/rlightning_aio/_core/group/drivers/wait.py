@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sized
 
 __all__ = [
+    "LONGEST_SECONDS",
     "TURN",
     "GroupDriver",
     "Parked",
@@ -29,13 +30,15 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+LONGEST_SECONDS: Final = 1e5
 
 
 @dataclass(slots=True)
 class Wait:
     """A request to block until a source is readable, or until `until` (monotonic seconds).
 
-    If `until` has passed, the driver polls all sources once without blocking; an
+    It may end sooner, at the latest after `LONGEST_SECONDS`, as timers of a system can't hold every
+    float. If `until` has passed, the driver polls all sources once without blocking; an
     event loop may read what has just become readable only after that.
     """
 

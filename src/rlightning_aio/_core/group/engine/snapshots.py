@@ -55,6 +55,7 @@ class Snapshots:
         waiting: Waiting,
     ) -> None:
         self._envs = tables.envs
+        self._lifetime = tables.lifetime
         self._requests = tables.requests
         self._episodes = tables.episodes
         self._supervisor = supervisor
@@ -109,6 +110,7 @@ class Snapshots:
         self, now: float, data: bytes, env_ids: Sequence[str] | None, source: str | None
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         """Put envs into saved states, and wait for all of them; return the ticket and the slots."""
+        self._lifetime.check_open()
         snapshots = unpack(data)
         if source is None:
             slots = self._slots_for(snapshots, env_ids)
@@ -143,8 +145,8 @@ class Snapshots:
     ) -> NDArray[np.intp]:
         """Return the slots of `env_ids`, or else of all envs, if these are what was saved."""
         taken_of = [snapshot.env_id for snapshot in snapshots]
-        where = len(self._envs.all) if env_ids is None else len(env_ids)
-        if where != len(snapshots):
+        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        if (where := len(slots)) != len(snapshots):
             raise SnapshotError(
                 f"the snapshot is of {len(snapshots)} envs, but should go into {where}; "
                 "name as many in env_ids, in order; nothing was changed"
@@ -154,7 +156,7 @@ class Snapshots:
                 f"the snapshot is of {min(missing)!r}, and this group has no such env; name in "
                 "env_ids where each should go, in order; nothing was changed"
             )
-        return self._dispatch.distinct(taken_of if env_ids is None else env_ids)
+        return self._dispatch.distinct(taken_of) if env_ids is None else slots
 
     def _slots_like(self, source: str, env_ids: Sequence[str] | None) -> NDArray[np.intp]:
         """Return the slots of `env_ids`, or else of all envs of the entry of env `source`."""

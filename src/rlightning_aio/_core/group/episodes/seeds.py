@@ -26,13 +26,20 @@ def seeds_for(envs: EnvTable, seed: Seeds, slots: NDArray[np.intp]) -> NDArray[n
     From an int, sub-environment k of the group gets ``seed + k``.
 
     Raises:
-        ValueError: a seed is out of range, or there isn't one for each slot.
+        ValueError: a seed is out of range, or of an env that is not being reset, or there isn't one
+            for each slot.
     """
     if seed is None:
         return np.full(len(slots), NO_SEED)
     if isinstance(seed, Mapping):
         given = {envs.find_one(env_id): checked_seed(one) for env_id, one in seed.items()}
-        chosen = [given.get(slot, NO_SEED) for slot in slots.tolist()]
+        chosen = [given.pop(slot, NO_SEED) for slot in slots.tolist()]
+        if given:
+            names = ", ".join(repr(envs.env_ids[slot]) for slot in given)
+            raise ValueError(
+                f"there are seeds for {names}, which this call doesn't reset; leave them out, or "
+                "name these envs in env_ids, too"
+            )
     elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
         if len(seed) != len(slots):
             raise ValueError(f"{len(seed)} seeds for {len(slots)} envs; give one for each")

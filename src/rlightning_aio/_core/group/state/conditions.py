@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
 
-from rlightning_aio.errors import GroupClosed, RLightningError
+from rlightning_aio.errors import GroupClosed
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -94,11 +94,11 @@ class Lifetime:
         self._conditions.note(CLOSED, True)
 
     def check_open(self) -> None:
-        """Raise `RLightningError` before `init`, and `GroupClosed` after `close`."""
+        """Raise `GroupClosed` before `init` and after `close`."""
         if self.closed:
             raise GroupClosed("this group is closed; build a new one")
         if not self.open:
-            raise RLightningError(
+            raise GroupClosed(
                 "this group has not been initialised; call init() first, or use it in a with block"
             )
 

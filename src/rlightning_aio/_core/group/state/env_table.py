@@ -135,8 +135,11 @@ class EnvTable:
         """The slots of `env_ids`, in that order.
 
         Raises:
+            TypeError: they are one str.
             UnknownEnv: no env of this group has one of the ids.
         """
+        if isinstance(env_ids, str):
+            raise TypeError(f"env_ids is a sequence of ids: give [{env_ids!r}]")
         if len(env_ids) == len(self.all) and list(env_ids) == self.env_ids:
             return self.all
         slot_of = self._slot_of

@@ -365,7 +365,7 @@ class Requests:
         return slots
 
     def end(self, host_id: int, entry: int) -> int | None:
-        """End the request `entry`, and return its slot; None if nobody wants the reply any more."""
+        """End the request `entry`, and return its slot; None if its reply is unwanted."""
         slot = slot_of(entry)
         if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
             return None
