@@ -34,6 +34,7 @@ OutcomeKind: TypeAlias = Literal[
     "env_away",
     "not_started",
     "agent_raised",
+    "agent_stopped",
     "cancelled",
 ]
 """See `Outcome`."""
@@ -67,7 +68,8 @@ class Outcome:
         kind: ``terminated`` or ``truncated`` by the env or a step limit; any other is a failure:
             ``timed_out`` (the attempt's time was over), ``env_raised``, ``env_died``, ``env_hung``
             (it exceeded its time limit), ``env_away`` (a client or a server was lost),
-            ``not_started`` (a reset or a start failed), ``agent_raised``, ``cancelled``.
+            ``not_started`` (a reset or a start failed), ``agent_raised``, ``agent_stopped`` (it
+            returned before the end), ``cancelled``.
         blame: who can have caused it: ``policy``; ``env``; ``either`` of the two, where the request
             executed an action; ``infrastructure`` (machine, network, another env of the worker);
             ``caller``.

@@ -39,8 +39,9 @@ class Room(gym.Env[Any, Any]):
         if isinstance(action, str):
             self._do(action)
             action = 0.0
+        reward = action["reward"] if isinstance(action, dict) else float(action)
         self.steps += 1
-        return self._observed(), float(action), self.steps == 5, action == "cut", {}
+        return self._observed(), reward, self.steps == 5, action == "cut", {}
 
     def tool(self, number: int) -> int:
         """Something to call."""

@@ -229,7 +229,7 @@ async def test_what_an_agent_leaves_to_a_task_of_its_own_ends_with_the_attempt(w
         found = await played(group, tasks(3), agent, 1, Rules(retries=0))
         assert group.pending == []
         await asyncio.wait(left)
-    assert [attempt.outcome.kind for (attempt,) in found] == ["truncated"] * 3
+    assert [attempt.outcome.kind for (attempt,) in found] == ["agent_stopped"] * 3
     for task in left:
         assert task.cancelled() or isinstance(task.exception(), EpisodeLost)
 
@@ -351,13 +351,15 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
 async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
 
     async def agent(episode: AttemptEpisode) -> int:
-        return await episode.call("tool", 21)
+        answer = await episode.call("tool", 21)
+        episode.finish()
+        return answer
 
     async with rooms(place) as group:
         ((attempt,),) = await played(group, tasks(1), agent)
     assert attempt.result == 42
-    assert attempt.outcome.kind == "truncated"
-    assert "stopped" in attempt.outcome.cause
+    assert (attempt.outcome.kind, attempt.reward) == ("truncated", 0.0)
+    assert "finished" in attempt.outcome.cause
 
 
 @pytest.mark.parametrize("name", ["loop", "awaitable in workers", "workers"])
@@ -370,6 +372,7 @@ async def test_a_call_that_is_cut_off_does_not_keep_its_env(name: str) -> None:
             calls[episode.spec.seed].set()
             await episode.call("stall")
         await calls[episode.spec.seed].wait()
+        episode.finish()
 
     async with rooms(PLACES[name], 2) as group:
         playing = played(group, tasks(3), agent, 2, Rules(first=1))
@@ -432,6 +435,7 @@ async def test_clients_of_an_env_server_play() -> None:
     async def agent(episode: AttemptEpisode) -> str:
         for _ in range(3):
             await episode.step([0.0, 0.0])
+        episode.finish()
         playing.add(episode.env_id)
         return episode.env_id
 
@@ -464,6 +468,7 @@ async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
 
     async def agent(episode: AttemptEpisode) -> str:
         await episode.step([0.0, 0.0])
+        episode.finish()
         return episode.env_id
 
     server = {
@@ -489,6 +494,7 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
 
     async def agent(episode: AttemptEpisode) -> str:
         await episode.step([0.0, 0.0])
+        episode.finish()
         return episode.env_id
 
     server = {
@@ -509,24 +515,6 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
                     client = ClientThread(handle.address, "c0", CountingEnv(0))
     assert found == ["here-0"] * 6 + ["robots-0/c0"] * 8
     client.join()
-
-
-async def test_numbers_that_are_not_finite_are_in_the_file(tmp_path: Path) -> None:
-    """As null, which is read as NaN; a failure's reward is None."""
-    path = tmp_path / "attempts.jsonl"
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await episode.step(float("nan"))
-        await episode.step("blame" if episode.index else 1)
-
-    async with rooms(PLACES["loop"], num_workers=2) as group:
-        with ResultsFile(path) as results:
-            await played(group, tasks(1), agent, 2, results=results)
-    with ResultsFile(path) as results:
-        whole, failed = sorted(results.played, key=lambda attempt: attempt.index)
-    assert whole.reward is not None
-    assert math.isnan(whole.reward)
-    assert failed.reward is None
 
 
 async def test_it_continues_from_a_file(tmp_path: Path) -> None:
@@ -648,3 +636,91 @@ def test_a_last_info_without_a_verdict_has_none() -> None:
     masks = {"_final_info": np.array([True, False]), "_success": np.array([True, True])}
     assert success_of({**both, **masks, "success": np.array([False, True])}, 0) is None
     assert success_of({**both, **masks, "success": np.array([False, True])}, 1) == 1.0
+
+
+@pytest.mark.parametrize("reward", [None, math.nan, math.inf])
+async def test_no_reward_is_a_failure_of_the_env(place: dict[str, Any], reward: Any) -> None:
+    """It was the advantage of nobody in its group; now it is tried again like any failure."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(1)
+        if (episode.spec.seed, episode.index) not in tried:
+            tried.add((episode.spec.seed, episode.index))
+            with contextlib.suppress(rl.EnvRaised):
+                await episode.step({"reward": reward})
+        await earner(episode)
+
+    tried = set[tuple[Any, int]]()
+    async with rooms(place) as group:
+        (attempts,) = await played(group, tasks(1), agent, size=2)
+    assert attempts.rewards == [1.0] * 2
+    for attempt in attempts:
+        (failed,) = attempt.failures
+        assert (failed.kind, failed.blame) == ("env_raised", "env")
+        assert failed.cause.startswith("returned")
+
+
+@pytest.mark.parametrize("limit", [None, math.inf])
+async def test_a_step_after_the_end_raises(place: dict[str, Any], limit: float | None) -> None:
+    """Also inside `auto_reset`, where it would begin another episode."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await earner(episode)
+        with pytest.raises(rl.RLightningError, match="has ended after 5 steps"):
+            await episode.step(7)
+
+    async with rooms(place) as group:
+        with contextlib.nullcontext() if limit is None else group.auto_reset(limit):
+            (attempts,) = await played(group, tasks(3)[2:], agent, size=2)
+    assert attempts.rewards == [10.0] * 2
+
+
+async def test_columns_and_actions_are_copied() -> None:
+    """An agent may go on with the list that it has given away."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        tokens, ids, action = [0], np.zeros(2), {"reward": 1.0}
+        while not episode.is_over:
+            await episode.step(action, tokens=tokens, nested={"ids": [ids]})
+            tokens.append(len(tokens))
+            ids += 1
+            action["reward"] += 1
+
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent)
+    assert attempt.rewards == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert [one["reward"] for one in attempt.columns["action"]] == attempt.rewards
+    assert attempt.columns["tokens"] == [[*range(k + 1)] for k in range(5)]
+    assert [one["ids"][0][0] for one in attempt.columns["nested"]] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("steps", [0, 2])
+async def test_an_agent_that_returns_early_has_no_reward(place: dict[str, Any], steps: int) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(steps):
+            await episode.step(1)
+
+    async with rooms(place) as group:
+        ((attempt,),) = await played(group, tasks(1), agent)
+    assert (attempt.outcome.kind, attempt.outcome.blame) == ("agent_stopped", "caller")
+    assert (attempt.reward, attempt.length, attempt.failures) == (None, steps, ())
+
+
+@pytest.mark.parametrize(("reward", "steps"), [(None, 2), (7, 2), (-1.0, 5)])
+async def test_an_agent_finishes(reward: float | None, steps: int) -> None:
+    """With what it has earned, or with a reward of its own grading."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(steps):
+            await episode.step(1)
+        with pytest.raises(ValueError, match="finite number"):
+            episode.finish(math.nan)
+        episode.finish(reward)
+        assert episode.is_over
+        with pytest.raises(rl.RLightningError, match="has ended"):
+            await episode.step(1)
+
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent)
+    assert attempt.outcome.kind == ("terminated" if steps == 5 else "truncated")
+    assert attempt.reward == (2.0 if reward is None else reward)

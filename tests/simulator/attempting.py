@@ -95,7 +95,13 @@ class Attempts(InContext):
                 self.stubborn.add(asyncio.current_task())
                 await self._go_on(episode)
             raise
-        played.end = swallows or ("over" if episode.is_over else "stopped")
+        ends = Random(number).random() < 0.5 and not episode.is_over
+        if ends and not swallows:
+            episode.finish()
+        played.end = swallows or ("finished" if ends else "over" if episode.is_over else "stopped")
+        if played.end == "over":
+            with self.expected(RLightningError, "a step after the end"):
+                await episode.step(None)
         return number
 
     async def _go_on(self, episode: AttemptEpisode) -> None:
@@ -327,6 +333,8 @@ class Attempts(InContext):
             require(ended or cut, "over, and nothing has ended it")
             require(outcome.kind == kind, "another end", kind)
         elif played.end == "stopped":
+            require(outcome.kind == "agent_stopped", "another end", played.end)
+        elif played.end == "finished":
             require(outcome.kind == "truncated", "another end", played.end)
         elif played.end == "cancelled":
             own = ["cancelled"]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.batch.contents import summed_rewards
-from rlightning_aio.errors import BadAction, EnvFault, RLightningError
+from rlightning_aio.errors import BadAction, EnvFault, EnvRaised, RLightningError
 from rlightning_aio.outcomes import Outcome
 from rlightning_aio.trees import copied
 from rlightning_aio.types import PolicyResponse
@@ -29,6 +30,7 @@ class AttemptEpisode:
         columns: what `step` was given so far; see `Attempt`.
         seconds: spent in the env so far.
         fault: how the newest step or call has failed; None if it has not.
+        is_finished: by `finish`; `graded` is the reward that it was given.
         first: the observation after the reset.
     """
 
@@ -42,6 +44,8 @@ class AttemptEpisode:
         self.columns: dict[str, list[Any]] = {}
         self.seconds = 0.0
         self.fault: Outcome | None = None
+        self.is_finished = False
+        self.graded: float | None = None
 
     @property
     def env_id(self) -> str:
@@ -55,8 +59,26 @@ class AttemptEpisode:
 
     @property
     def is_over(self) -> bool:
-        """The newest result has ended the episode."""
-        return self._episode.is_over
+        """The newest result has ended the episode, or `finish` has."""
+        return self.is_finished or self._episode.is_over
+
+    def finish(self, reward: float | None = None) -> None:
+        """End the attempt here: as truncated, unless its env has ended it.
+
+        An agent that returns without it before the end is ``agent_stopped`` and has no reward.
+
+        Args:
+            reward: of the attempt, as the agent has graded it; None: what it has earned.
+
+        Raises:
+            ValueError: `reward` is not a finite number.
+            RLightningError: the attempt is over.
+        """
+        self._check_open()
+        if reward is not None and not _is_finite(reward):
+            raise ValueError(f"the reward of an attempt must be a finite number, not {reward!r}")
+        self.is_finished = True
+        self.graded = None if reward is None else float(reward)
 
     async def step(self, action: Any, **columns: Any) -> EnvRet | MultiAgentEnvRet:
         """Step the env, and wait for the result.
@@ -64,30 +86,52 @@ class AttemptEpisode:
         Args:
             action: of the env's action space.
             columns: anything to be kept with the action (``tokens``, ``log_prob``, …): see
-                `Attempt.columns`. The env gets it, too, as it does from a `PolicyResponse`.
+                `Attempt.columns`. The env gets it, too, as it does from a `PolicyResponse`. Lists,
+                dicts and arrays are copied, as the agent may go on to write into them.
 
         Raises:
+            EnvRaised: its reward is None or not a finite number; the attempt has failed.
             EpisodeLost: the env was replaced; the attempt has failed.
             EnvFault: the env has raised, or is gone.
             BadAction: the action doesn't fit; nothing was sent.
-            RLightningError: the attempt is over.
+            RLightningError: the attempt is over, as its episode is: look at `is_over`.
         """
         self._check_open()
+        if self.is_over:
+            raise RLightningError(
+                f"this attempt on env {self.env_id!r} has ended after {len(self.rewards)} steps; "
+                "an agent should look at `episode.is_over` before each step"
+            )
+        kept = copied({"action": action, **columns})
         result = await self._timed(
             self._episode.step(PolicyResponse(self.env_id, action, **columns))
         )
+        reward = float(summed_rewards(result.last_reward).sum())
+        if not math.isfinite(reward):
+            raise self._without_reward(reward)
         steps = len(self.rewards)
-        for name, value in {"action": action, **columns}.items():
+        for name, value in kept.items():
             column = self.columns.setdefault(name, [])
             column += [None] * (steps - len(column))
             column.append(value)
-        self.rewards.append(float(summed_rewards(result.last_reward).sum()))
+        self.rewards.append(reward)
         return result
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call a method of the env, such as a tool; see `EnvEpisode.call`."""
         self._check_open()
         return await self._timed(self._episode.call(name, *args, **kwargs))
+
+    def _without_reward(self, reward: float) -> EnvRaised:
+        what = "returned no reward" if math.isnan(reward) else f"returned the reward {reward}"
+        fault = EnvRaised(
+            f"env {self.env_id!r} {what} in step {len(self.rewards) + 1}: its step should return "
+            "a finite number; None and NaN are none",
+            env_id=self.env_id,
+        )
+        fault.outcome = self.fault = Outcome("env_raised", "env", what, self.env_id)
+        self._over = "has failed: its env has returned no reward"
+        return fault
 
     def _check_open(self) -> None:
         if self._over:
@@ -122,6 +166,16 @@ class AttemptInPlay(AttemptEpisode):
         self.fault = self._episode.lost  # Its worker may have died in the reset.
         self.first = copied(self.last.observation)  # Its env may change it, and its row will.
 
+    @property
+    def has_ended(self) -> bool:
+        """The env has ended the episode."""
+        return self._episode.is_over
+
+    @property
+    def earned(self) -> float:
+        """The reward: that of `finish`, or else the sum of `rewards`."""
+        return sum(self.rewards) if self.graded is None else self.graded
+
     async def leave(self) -> None:
         """End what is in flight; the env is idle after that."""
         await self._episode.__aexit__()
@@ -131,3 +185,10 @@ class AttemptInPlay(AttemptEpisode):
         self._over = why
         for column in self.columns.values():
             column.extend([None] * (len(self.rewards) - len(column)))
+
+
+def _is_finite(reward: Any) -> bool:
+    try:
+        return math.isfinite(reward)
+    except TypeError:
+        return False

@@ -175,10 +175,15 @@ class Try:
             return self._view.fault
         if self.error is not None:
             return self._raised(self.error)
-        last, is_over = self._view.last, self._view.is_over
-        terminated = is_over and bool(np.all(all_agents(last.last_terminated)))
-        cut = "its env or the step limit cut it" if is_over else "the agent stopped before its end"
-        return own_end(self.env_id, last.info, terminated=terminated, cut=cut)
+        last = self._view.last
+        if self._view.has_ended:
+            terminated = bool(np.all(all_agents(last.last_terminated)))
+            cut = "its env or the step limit cut it"
+            return own_end(self.env_id, last.info, terminated=terminated, cut=cut)
+        if self._view.is_finished:
+            return Outcome("truncated", "policy", "the agent finished it", self.env_id)
+        cause = "the agent returned before the end, without episode.finish()"
+        return Outcome("agent_stopped", "caller", cause, self.env_id)
 
     def _raised(self, error: BaseException) -> Outcome:
         """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
@@ -204,7 +209,7 @@ class Try:
             view.spec,
             view.index,
             replace(ended, seconds=spent),
-            reward=None if ended.is_failure else sum(view.rewards),
+            reward=None if ended.is_failure else view.earned,
             length=len(view.rewards),
             success_value=None if ended.is_failure else success_of(view.last.info),
             rewards=view.rewards,

@@ -292,6 +292,8 @@ class PolicyPlay:
         job = self._jobs.pop(place, None)
         if job is None:
             return
+        if not outcome.is_failure and np.isnan(self._reward[place]):
+            outcome = Outcome("env_raised", "env", "returned no reward", env_id)
         attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
         if not outcome.is_failure:
             attempt.reward, attempt.success_value = float(self._reward[place]), success
