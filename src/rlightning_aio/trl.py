@@ -58,7 +58,7 @@ def rollouts(
             trainer.train()
 
     Args:
-        group: of asynchronous kind; nobody else uses it.
+        group: an asynchronous one, for this alone.
         agent: a coroutine function, which gets an `AttemptEpisode`, and returns what TRL asks for
             of one rollout: lists ``prompt_ids`` and ``completion_ids``; ``logprobs`` if the trainer
             needs them, and ``env_mask`` (1 for tokens of the model, 0 for those of the env), of

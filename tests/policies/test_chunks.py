@@ -53,6 +53,37 @@ def test_no_action_is_left_over_after_a_lost_episode() -> None:
     assert found.failures["env_raised"] > 0
 
 
+class Averaged(Counting):
+    """The reward is 1 for the average of what was predicted for a step, of the last five chunks."""
+
+    def does(self, action: Any) -> float:
+        super().does(action)  # It sets the length, and may raise.
+        asked = np.arange(max(self.steps - 4, 0), self.steps + 1)
+        weights = np.exp(-0.5 * np.arange(len(asked)))
+        expected = [self.seed, *(np.stack([asked, self.steps - asked]) @ weights / weights.sum())]
+        return float(np.allclose(action, expected))
+
+
+@pytest.mark.parametrize("breaks", [False, True])
+def test_predictions_for_a_step_are_averaged(breaks: bool) -> None:
+    """Of one episode alone, the oldest with the largest weight."""
+    fields = {"task": Averaged, "env_kwargs": {"breaks": breaks}}
+    with group_of(**fields) as group, group.auto_reset(100):
+        check(evaluate(group, ActionChunks(chunks, temporal_ensemble=0.5), QUEUE))
+
+
+def test_only_floats_are_averaged_and_every_step_asks() -> None:
+    with pytest.raises(ValueError, match="no n_action_steps"):
+        ActionChunks(chunks, 3, temporal_ensemble=0.0)
+    whole = ActionChunks(lambda batch: chunks(batch).astype(int), temporal_ensemble=0.0)
+    with (
+        group_of(1) as group,
+        group.auto_reset(100),
+        pytest.raises(rl.BadAction, match="must be floats"),
+    ):
+        evaluate(group, whole, QUEUE)
+
+
 async def test_the_policy_may_be_a_coroutine_function() -> None:
     """It is awaited over an asynchronous group."""
 

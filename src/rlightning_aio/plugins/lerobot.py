@@ -38,9 +38,6 @@ class LeRobotPolicy:
             SmolVLA.
         preprocessor: as LeRobot's `make_pre_post_processors` returns it.
         postprocessor: likewise.
-
-    Raises:
-        ValueError: the policy averages its chunks over time, which only `select_action` does.
     """
 
     def __init__(
@@ -50,13 +47,13 @@ class LeRobotPolicy:
         postprocessor: Callable[[Any], Any],
     ) -> None:
         config = policy.config
-        if getattr(config, "temporal_ensemble_coeff", None) is not None:
-            raise ValueError("temporal_ensemble_coeff of the policy must be None")
+        decay = getattr(config, "temporal_ensemble_coeff", None)
         policy.eval()
         policy.reset()
         self._policy = policy
         self._preprocess, self._postprocess = preprocessor, postprocessor
-        self._chunks = ActionChunks(self._predict, int(config.n_action_steps))
+        steps = int(config.n_action_steps) if decay is None else None
+        self._chunks = ActionChunks(self._predict, steps, temporal_ensemble=decay)
         self._num_seen = int(config.n_obs_steps)
         self._seen: dict[str, deque[dict[str, Any]]] = {}
         """The last observations of each env, if the network gets several."""

@@ -1,4 +1,4 @@
-"""`ActionChunks`: plays chunks of actions open loop, each env its own.
+"""`ActionChunks`: plays chunks of actions, each env its own: open loop, or averaged.
 
 Rule: a chunk belongs to one episode of one env. What is left of it is dropped when the episode is
 over, also when it was lost with a worker.
@@ -13,7 +13,7 @@ import numpy as np
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.episodes import begins_of_envs
-from rlightning_aio.trees import as_array, index, mapped, stacked
+from rlightning_aio.trees import as_array, index, mapped, stacked, walked, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -36,27 +36,44 @@ class ActionChunks:
             (a dict or tuple of such arrays for Dict and Tuple spaces). It may be a coroutine
             function if the group is asynchronous.
         n_action_steps: number of actions to play of each chunk; None plays all.
+        temporal_ensemble: ask for a chunk at each step, and play the average of all that was
+            predicted for it since the episode began, with the weights ``exp(-temporal_ensemble *
+            k)``, k = 0 for the oldest one (ACT; 0.01 in its paper).
 
     Raises:
-        ValueError: `n_action_steps` is below 1, or an env has sub-environments.
-        BadAction: the policy did not return a chunk of so many actions for each result.
+        ValueError: `n_action_steps` is below 1, or not None beside `temporal_ensemble`, or an env
+            has sub-environments.
+        BadAction: the policy did not return a chunk of so many actions for each result, or those
+            that are averaged are not floats.
     """
 
     def __init__(
-        self, policy: Callable[[BatchedData], Any], n_action_steps: int | None = None
+        self,
+        policy: Callable[[BatchedData], Any],
+        n_action_steps: int | None = None,
+        *,
+        temporal_ensemble: float | None = None,
     ) -> None:
         if n_action_steps is not None and n_action_steps < 1:
             raise ValueError(f"n_action_steps must be at least 1, not {n_action_steps!r}")
-        self._policy, self._steps = policy, n_action_steps
-        self._left: dict[str, deque[Any]] = {}
-        """Actions that envs will play next."""
+        if None not in (n_action_steps, temporal_ensemble):
+            raise ValueError(
+                "with temporal_ensemble every step asks for a chunk: no n_action_steps"
+            )
+        self._policy, self._steps, self._decay = policy, n_action_steps, temporal_ensemble
+        self._left: dict[str, deque[tuple[Any, int]]] = {}
+        """Actions that envs will play next, and of how many each is the average."""
 
     def __call__(self, batch: BatchedData) -> Any:
         """Return the next action of each env, awaitable if the policy's answer is."""
         env_ids = batch.env_ids()
         for row in np.flatnonzero(begins_of_envs(batch)).tolist():
             self._left.pop(env_ids[row], None)
-        rows = [row for row, env_id in enumerate(env_ids) if not self._left.get(env_id)]
+        rows = [
+            row
+            for row, env_id in enumerate(env_ids)
+            if self._decay is not None or not self._left.get(env_id)
+        ]
         if not rows:
             return self._next(env_ids)
         asked = batch if len(rows) == len(env_ids) else batch.take(rows)
@@ -74,6 +91,8 @@ class ActionChunks:
         """Keep a chunk for each env."""
         lengths = set[int]()
         chunks = mapped(lambda leaf: _checked(leaf, len(env_ids), lengths), chunks)
+        if self._decay is not None and any(leaf.dtype.kind != "f" for _, leaf in walked(chunks)):
+            raise BadAction("temporal_ensemble averages actions, so they must be floats")
         horizon = min(lengths, default=0)
         if len(lengths) > 1 or not horizon:
             raise BadAction(f"the actions of a chunk are as many as {sorted(lengths)}")
@@ -84,10 +103,27 @@ class ActionChunks:
             )
         for row, env_id in enumerate(env_ids):
             chunk = index(chunks, row)
-            self._left[env_id] = deque(index(chunk, k) for k in range(self._steps or horizon))
+            actions = [index(chunk, k) for k in range(self._steps or horizon)]
+            before = self._left.get(env_id, ())
+            self._left[env_id] = deque(
+                map(self._averaged, actions, [*before, *[(None, 0)] * horizon])
+            )
+
+    def _averaged(self, action: Any, before: tuple[Any, int]) -> tuple[Any, int]:
+        """Add an action to the average of those that were predicted before for the same step."""
+        mean, count = before
+        if not count:
+            return action, 1
+        weights = np.exp(-(self._decay or 0.0) * np.arange(count + 1))
+        share = float(weights[-1] / weights.sum())
+
+        def moved(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+            return old + share * (new - old)
+
+        return zipped(moved, mean, action), count + 1
 
     def _next(self, env_ids: list[str]) -> Any:
-        return stacked([self._left[env_id].popleft() for env_id in env_ids])
+        return stacked([self._left[env_id].popleft()[0] for env_id in env_ids])
 
 
 def _checked(leaf: Any, count: int, lengths: set[int]) -> NDArray[Any]:
