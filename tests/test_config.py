@@ -18,6 +18,7 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from omegaconf import OmegaConf
 
+from rlightning_aio import build_env_group
 from rlightning_aio.config import (
     EnvConfig,
     check_installed,
@@ -735,3 +736,26 @@ def test_fields_that_belong_to_no_entry_are_refused(given: Any, fields: Any, sai
     """The message names the field."""
     with pytest.raises(ConfigError, match=said):
         parse_configs(given, fields)
+
+
+@pytest.mark.parametrize(
+    ("task", "backend"),
+    [
+        ("ale_py:ALE/Pong-v5", "gymnasium"),
+        ("my_envs:Walk-v0", "gymnasium"),
+        ("CartPole-v1", "gymnasium"),
+        ("my_envs:make", "callable"),
+        ("my.envs:Maker.make", "callable"),
+    ],
+)
+def test_a_registered_name_with_its_module_is_no_callable(task: str, backend: str) -> None:
+    """Versions and namespaces are in no name of Python."""
+    assert EnvConfig(name="a", task=task).backend == backend
+
+
+@pytest.mark.parametrize("kwarg", ["max_episode_steps", "num_envs"])
+@pytest.mark.parametrize("task", ["CartPole-v1", "HalfCheetah-v5"])
+def test_what_is_a_field_is_no_argument_of_the_env(task: str, kwarg: str) -> None:
+    """Gymnasium would say that it was given twice."""
+    with pytest.raises(ConfigError, match=f"env_kwargs: {kwarg}: is the field '{kwarg}'"):
+        build_env_group(EnvConfig(name="a", task=task, env_kwargs={kwarg: 5}))

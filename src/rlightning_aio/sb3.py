@@ -70,11 +70,13 @@ def make_vec_env(
         more: further arguments of Stable-Baselines3's function.
 
     Raises:
-        ValueError: `vec_env_cls` is another class.
+        ValueError: `vec_env_cls` is another class, or there is no env.
         TypeError: an argument is unknown.
         ConfigError: ``num_threads`` is wrong, another argument keeps the envs of the task
             separate, or there are fields for a `DummyVecEnv`.
     """
+    if n_envs < 1:
+        raise ValueError(f"n_envs must be at least 1, not {n_envs!r}")
     vec_envs = import_module("stable_baselines3.common.vec_env")
     dummy = vec_envs.DummyVecEnv
     if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, dummy):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 
+import rlightning_aio as rl
 from rlightning_aio import (
     BaseEnv,
     ConfigError,
@@ -216,3 +217,119 @@ def test_a_wrong_return_value_of_a_callable_fails_the_start(fields: Any, said: s
     """The message has the value and the requirement."""
     with pytest.raises((StartFailed, ConfigError), match=said):
         inline(**fields).init()
+
+
+class OldGym(gym.Env[Any, Any]):
+    """Has the interface of Gym, Gymnasium's predecessor."""
+
+    observation_space = gym.spaces.Discrete(3)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0
+
+    def step(self, action: Any) -> Any:
+        return 0, 0.0, False, {}
+
+
+class OldStep(OldGym):
+    """Its reset is Gymnasium's."""
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+
+class Wrong(OldStep):
+    """Unpacks in its own code."""
+
+    def step(self, action: Any) -> Any:
+        _, _ = (1, 2, 3)
+
+
+class OfCoroutines(gym.Env[Any, Any]):
+    observation_space = OldGym.observation_space
+    action_space = OldGym.action_space
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    async def step(self, action: Any) -> Any:
+        return 1, 0.0, False, False, {}
+
+
+def decorated(function: Any) -> Any:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return function(*args, **kwargs)
+
+    return call
+
+
+class Decorated:
+    """Nobody sees before a call that these are coroutine functions."""
+
+    observation_space = OldGym.observation_space
+    action_space = OldGym.action_space
+    reset = decorated(OfCoroutines.reset)
+    step = decorated(OfCoroutines.step)
+
+
+class OldDecorated(Decorated):
+    @decorated
+    async def step(self, action: Any) -> Any:
+        return 0, 0.0, False, {}
+
+
+class Plain(Decorated):
+    """Has neither Gymnasium's base class nor coroutine functions."""
+
+    reset = OldStep.reset
+    step = OldStep.step
+
+
+class DecoratedGym(OldGym):
+    reset = Decorated.reset
+    step = Decorated.step
+
+
+def old_registered() -> gym.Env[Any, Any]:
+    return gym.wrappers.TimeLimit(OldStep(), 9)
+
+
+async def stepped(task: Any, placement: str) -> Any:
+    async with rl.build_env_group(task, name="env", num_workers=1, placement=placement) as group:
+        batch, _ = await group.reset()
+        batch, _ = await group.step(batch.respond(action=[0]))
+        return batch.observation.tolist()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Never awaited.
+@pytest.mark.parametrize("placement", ["inline", "process"])
+@pytest.mark.parametrize(
+    ("task", "said"),
+    [
+        (OldGym, "non-iterable int object: .*reset .observation, info.*shimmy.GymV21"),
+        (OldStep, "expected 5, got 4.: a step returns .*shimmy.GymV21"),
+        (old_registered, "expected 5, got 4.: a step returns .*shimmy.GymV21"),
+        (DecoratedGym, "coroutine object: .*leave that base class out"),
+        (Plain, "must return a gymnasium.Env.*not Plain.*shimmy.GymV21"),
+    ],
+)
+async def test_an_old_interface_is_named(task: Any, said: str, placement: str) -> None:
+    """With the wrapper that converts it."""
+    with pytest.raises((EnvRaised, StartFailed), match=said):
+        await stepped(task, placement)
+
+
+async def test_an_error_of_the_envs_own_code_is_left_alone() -> None:
+    """It unpacks something else."""
+    with pytest.raises(ValueError, match=r"too many values to unpack \(expected 2\);"):
+        await stepped(Wrong, "process")
+
+
+@pytest.mark.parametrize("placement", ["loop", "process"])
+@pytest.mark.parametrize("task", [OfCoroutines, Decorated])
+async def test_what_reset_returns_says_that_an_env_is_awaitable(task: Any, placement: str) -> None:
+    """Whatever its base class is, and whatever decorates its methods."""
+    assert await stepped(task, placement) == [1]
+    with pytest.raises(TypeError, match=r"expected 5, got 4.: a step returns"):
+        await stepped(OldDecorated, placement)

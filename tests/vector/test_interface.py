@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.error import (
     AlreadyPendingCallError,
     ClosedEnvironmentError,
@@ -376,6 +377,18 @@ def test_callables_are_one_for_each_env() -> None:
             VectorEnv(*wrong)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match=r"env_fns\[1\] is a Plain, which is not callable"):
         VectorEnv([Plain, Plain()])  # type: ignore[list-item]
+
+
+def test_what_makes_no_vector_env_is_refused_with_what_to_do() -> None:
+    """Before anything starts."""
+    with pytest.raises(ValueError, match="a callable for each"):
+        VectorEnv([])
+    for task in ("CartPole-v1", "Acrobot-v1", "HalfCheetah-v5"):
+        for mode in (None, "sync", "async"):
+            with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
+                make_vec(task, 0, mode)
+    with pytest.raises(TypeError, match=r"use VectorEnv\(\[.*CartPoleEnv\] \* n\)"):
+        make_vec(CartPoleEnv, 2)  # pyright: ignore[reportArgumentType]
 
 
 def test_an_unknown_autoreset_mode_is_refused_with_the_known_ones() -> None:

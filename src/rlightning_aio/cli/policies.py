@@ -43,7 +43,7 @@ class PolicyRaised(RLightningError):
     """The user's policy raised an exception; the message has the traceback of its own code."""
 
 
-def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Policy | None]:
+def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Policy | None] | None:
     """Return the policy that ``module:name`` or the address of a policy server names.
 
     The working directory is on the path. The client of a server is closed by `stack`.
@@ -71,11 +71,14 @@ def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Po
             entry: None if policy is None else _called(f"{name}[{entry!r}]", policy)
             for entry, policy in named.items()
         }
-    return _called(name, found)
+    return None if found is None else _called(name, found)
 
 
 def _called(name: str, policy: Any) -> Policy:
     """Return a policy as a function of a batch."""
+    if isinstance(policy, type):
+        kind = policy.__name__
+        raise ConfigError(f"--policy {name!r}: is the class {kind}; name an instance of it")
     if callable(policy):
         return cast("Policy", policy)
     if hasattr(policy, "predict"):

@@ -8,7 +8,7 @@ import sys
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rlightning_aio.config.entry import MADE_BY_GYMNASIUM, EnvConfig, makers_of
 from rlightning_aio.config.problems import Problems
@@ -109,6 +109,21 @@ def _check_backend(config: EnvConfig) -> str | None:
     return ENVS.unknown(config.backend)
 
 
+def _check_env_kwargs(config: EnvConfig) -> str | None:
+    if config.backend not in MADE_BY_GYMNASIUM:
+        return None
+    for name, field in _GIVEN_BY_FIELDS.items():
+        if name in config.env_kwargs:
+            return f"{name}: is the field {field!r} of the entry; give it there"
+    return None
+
+
+_GIVEN_BY_FIELDS: Final = {
+    "max_episode_steps": "max_episode_steps", "id": "task", "num_envs": "num_envs",
+}  # fmt: skip
+"""Arguments of `gymnasium.make` and `make_vec`, by the fields that they are made of."""
+
+
 def _check_task(config: EnvConfig) -> str | None:
     task = config.task
     if isinstance(task, str):
@@ -154,6 +169,7 @@ _COMPARED_WITH = {
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,
+    "env_kwargs": _check_env_kwargs,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "on_env_error": _check_on_env_error,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 from pydantic import (
     BaseModel,
@@ -206,8 +206,12 @@ def makers_of(config: EnvConfig) -> tuple[Callable[..., Any], ...]:
     return () if isinstance(task, str) else (task,) * config.num_workers
 
 
+_NAMES_CALLABLE: Final = re.compile(r"[^:]*:[\w.]*|[^:]*:.*:.*|.*://.*")
+"""All with a colon, but not ``module:Name-v0``, a registered name whose module is imported."""
+
+
 def _backend_of(task: Any) -> str:
-    if not isinstance(task, str) or ":" in task:
+    if not isinstance(task, str) or _NAMES_CALLABLE.fullmatch(task):
         return CALLABLE
     import gymnasium  # noqa: PLC0415  # Workers are given their backend.
 

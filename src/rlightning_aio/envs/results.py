@@ -9,7 +9,8 @@ with a list mean the same everywhere.
 from __future__ import annotations
 
 from inspect import iscoroutinefunction
-from typing import TYPE_CHECKING, Any, cast
+from traceback import walk_tb
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -61,6 +62,36 @@ def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
         return lambda action, _extras: action
     preprocess = env._preprocess_fn  # pyright: ignore[reportPrivateUsage]
     return lambda action, extras: as_numpy(preprocess(PolicyResponse(env_id, action, **extras)))
+
+
+def explained(error: BaseException) -> BaseException:
+    """Return `error`, or one that says which values a reset and a step return, if an env has
+    returned others.
+    """
+    if not isinstance(error, TypeError | ValueError) or " unpack" not in str(error):
+        return error
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    # In the env's own code it is another error.
+    if not frame.f_globals.get("__name__", "").startswith(_UNPACKING):
+        return error
+    if "coroutine" in str(error):
+        words = (
+            "its step and reset are coroutine functions, as a gymnasium.Env has none: leave that "
+            "base class out"
+        )
+    else:
+        words = (
+            "a step returns (observation, reward, terminated, truncated, info), and a reset "
+            "(observation, info). If this env has Gym's old interface, put "
+            "shimmy.GymV21CompatibilityV0(env=env) around it"
+        )
+    found = TypeError(f"{error}: {words}")
+    found.__cause__ = error
+    return found
+
+
+_UNPACKING: Final = ("rlightning_aio.", "gymnasium.")
+"""Modules that take the results of envs apart."""
 
 
 def is_async_first(env: BaseEnv) -> bool:

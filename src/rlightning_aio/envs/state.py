@@ -14,7 +14,7 @@ import io
 import pickle
 import sys
 from dataclasses import dataclass
-from inspect import iscoroutinefunction
+from inspect import iscoroutinefunction, unwrap
 from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
@@ -210,7 +210,7 @@ def _is_layer(value: Any) -> bool:
         return True
     kind = cast("type[Any]", type(value))
     # An awaitable env without a base class.
-    if iscoroutinefunction(getattr(kind, "step", None)) and hasattr(value, "__dict__"):
+    if iscoroutinefunction(unwrap(getattr(kind, "step", len))) and hasattr(value, "__dict__"):
         return True
     # By name, so that PettingZoo isn't imported. `EzPickle` pickles constructor arguments only.
     return not isinstance(value, type) and any(

@@ -89,6 +89,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
         StartFailed: a callable raised, or didn't return an env.
         RuntimeError: the spaces don't match.
+        ValueError: `env_fns` is empty.
         TypeError: `env_fns` is no list of callables.
     """
 
@@ -111,6 +112,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self.single_observation_space: gym.Space[Any]
         self.single_action_space: gym.Space[Any]
         del shared_memory, context, daemon
+        if not env_fns:
+            raise ValueError("a vector env has at least one env: give a callable for each")
         if worker is not None:
             raise ValueError(
                 "worker: the workers of rlightning_aio can't be replaced; see EnvGroup"

@@ -19,7 +19,7 @@ from rlightning_aio.envs.mujoco.of_spec import OneOf
 from rlightning_aio.envs.mujoco.tasks import is_batched
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted, spec_of
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import is_mujocos
+from rlightning_aio.registry import is_mujocos, name_of
 from rlightning_aio.sharing import check_threads
 from rlightning_aio.vector.env import VectorEnv
 from rlightning_aio.vector.reset_arguments import checked_mode
@@ -87,8 +87,13 @@ def make_vec(
         ConfigError: ``num_threads`` is wrong, or given for a task that `envs.mujoco` supports with
             an argument that keeps its envs separate; or a field of a config entry is given with
             one of Gymnasium's modes.
-        ValueError: the mode is unknown.
+        ValueError: the mode is unknown, or there is no env.
+        TypeError: `id` is a class or a function.
     """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, not {num_envs!r}")
+    if callable(id):
+        raise TypeError(f"this is no registered task: use VectorEnv([{name_of(id)}] * n)")
     mode = None if vectorization_mode is None else VectorizeMode(vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
     around: list[Any] = [*wrappers]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from inspect import iscoroutinefunction
+from inspect import isawaitable, iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -46,14 +46,22 @@ def env_of_callable(
         made = make(**config.env_kwargs)
     if isinstance(made, BaseEnv):
         return _adopted(made, config, worker_index, preprocess_fn)
-    if isinstance(made, gym.Env | gym.vector.VectorEnv):
+    step: Any = getattr(made, "step", None)
+    is_async = iscoroutinefunction(step)
+    if isinstance(made, gym.Env | gym.vector.VectorEnv) and not is_async:
         return _GivenEnv(made, config, worker_index, preprocess_fn)
-    if iscoroutinefunction(getattr(made, "step", None)):
+    # A decorator may hide that it is a coroutine function: its first result says it.
+    if is_async or (callable(step) and config.placement != "inline"):
         return _AwaitableEnv(made, config, worker_index, preprocess_fn)
-    raise TypeError(
-        f"the callable of entry {config.name!r} must return a gymnasium.Env, a "
+    raise _no_env(config.name, made)
+
+
+def _no_env(entry: str, made: Any) -> TypeError:
+    return TypeError(
+        f"the callable of entry {entry!r} must return a gymnasium.Env, a "
         "gymnasium.vector.VectorEnv, a BaseEnv, or an object with their reset and step as "
-        f"`async def`, not {type(made).__name__}"
+        f"`async def`, not {type(made).__name__}; an env of Gym, Gymnasium's predecessor, needs "
+        "shimmy.GymV21CompatibilityV0(env=env) around it"
     )
 
 
@@ -107,7 +115,7 @@ class _GivenEnv(GymnasiumEnv):
 
 
 class _AwaitableEnv(FastPath, BaseEnv):
-    """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions.
+    """An object with Gymnasium's methods; its `reset` and `step` return awaitables.
 
     A space that it doesn't have is `Anything`.
     """
@@ -132,7 +140,10 @@ class _AwaitableEnv(FastPath, BaseEnv):
     async def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
-        observation, info = await self.env.reset(seed=seed, options=options)
+        first = self.env.reset(seed=seed, options=options)
+        if not isawaitable(first):
+            raise _no_env(self.config.name, self.env)
+        observation, info = await first
         return result_of(self.env_id, (observation, 0.0, False, False, info))
 
     async def step(self, policy_resp: PolicyResponse) -> EnvRet:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import ErrorText, Raised, Result, Value
+from rlightning_aio.envs.results import explained
 from rlightning_aio.protocol.entries import answers_with_value, op_of
 from rlightning_aio.protocol.pickling import dumped
 
@@ -75,7 +76,7 @@ def completion_of(
         except TypeError as misfit:
             error = misfit
     if error is not None:
-        text = ErrorText.of(error)
+        text = ErrorText.of(explained(error))
         runner.note_error(op_of(entry), text)
         return Raised(host_id, entry, text)
     if returns_value:

@@ -19,7 +19,7 @@ import numpy as np
 from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import fitted_tree, row_reader, row_writer
-from rlightning_aio.protocol.exchange import Row
+from rlightning_aio.protocol.exchange import Row, unpacked
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.trees import as_numpy, copied, holds_tensor
 
@@ -139,7 +139,7 @@ class RowWriter:
         self._write_times(busy_ns)
         if self.is_bypassed:
             self._sums.row_changed()
-        self._write_ends(*result[1:4])
+        self._write_ends(*unpacked(result)[1:4])
         return self._write_data(result, extra, is_fresh=self._hands_over)
 
     def write_reset(
