@@ -347,6 +347,23 @@ def test_one_env_of_a_host_can_be_lost(new_group: NewGroup) -> None:
     assert batch.restarted.tolist() == [True, True]
 
 
+def test_a_loss_that_is_read_before_the_last_answer_comes_after_it(new_group: NewGroup) -> None:
+    """Answers travel in a ring, and losses in frames."""
+    group = new_group(1)
+    run(group, group.core.reset(group.now, None, None, None))
+    why = Loss("ended while it was idle", "env_died", "env", "fake-0")
+    for is_lost in (False, True):
+        stepping = group.begin(group.steps.step(steps(0), group.now))
+        entry = group.core.requests.numbering.entry.item(0)
+        group.hosts[0].finish()
+        group.core.tables.completions.append(Lost(0, 0, why, answered=entry))
+        group.turn()
+        batch, _ = stepping.result()
+        assert batch.restarted.tolist() == batch.is_reset.tolist() == [is_lost]
+        assert group.core.episodes.why_lost(0) == why
+        assert group.core.supervisor.records[0].restarts == is_lost + 1
+
+
 @pytest.mark.parametrize("ordinary", [True, False])
 @pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot"])
 def test_requests_that_were_sent_in_part_disturb_no_other_call(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hosts.beside_others import steps
 from hosts.spanning import ADD, CRASH, HANG, OWN, RAISE
-from timelines import Seen
 
 import rlightning_aio as rl
 from rlightning_aio.errors import EnvRaised, EpisodeLost, WorkerDied
@@ -64,20 +63,15 @@ async def test_a_scope_is_left_after_an_error_and_after_a_hang(config: dict[str,
 
 
 async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
-    config: dict[str, Any], tmp_path: Path
+    config: dict[str, Any],
 ) -> None:
     """Its next step is answered by the first result of another, and a reset is a plain reset."""
     async with rl.build_env_group(config) as group:
         await group.reset(seed=5)
         batch, _ = await group.step(steps(e_0=CRASH, e_1=CRASH))
-        with group.trace(tmp_path / "run.json"):
+        batch, _ = await group.step(steps(e_0=ADD))
+        while not batch.restarted.any():  # It may answer until its background has ended.
             batch, _ = await group.step(steps(e_0=ADD))
-            while not batch.restarted.any():  # It may answer until its background has ended.
-                batch, _ = await group.step(steps(e_0=ADD))
-        marks = [(name, track) for name, _, track, _ in Seen(tmp_path / "run.json").marks]
-        names = [name for name, _ in marks]
-        assert marks.count(("rebuilt", "e-0")) == 1
-        assert not any("hung" in name for name in names)
         assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
         assert "ended while it was idle: hosts.spanning.Crash" in batch.info("worker_restarted")[0]
         assert (batch.info("seed"), batch.info("options")) == ([5], [None])

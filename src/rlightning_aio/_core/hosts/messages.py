@@ -255,6 +255,7 @@ class Lost(NamedTuple):
     Attributes:
         entry: of the request that it leaves without an answer; 0 if it was idle.
         message: what has happened to it, for an error.
+        answered: entry of the last request that it has answered; 0 if there was none.
     """
 
     host_id: int
@@ -262,6 +263,7 @@ class Lost(NamedTuple):
     why: Loss
     entry: int = 0
     message: str = ""
+    answered: int = 0
 
 
 class Withdrawn(NamedTuple):

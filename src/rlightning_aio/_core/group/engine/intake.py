@@ -31,7 +31,7 @@ from rlightning_aio._core.hosts.messages import (
 )
 from rlightning_aio.errors import EnvAway, env_raised
 from rlightning_aio.outcomes import Loss
-from rlightning_aio.protocol.entries import Operation, answers_with_value
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of
 from rlightning_aio.protocol.slab import AS_BEFORE
 
 if TYPE_CHECKING:
@@ -185,12 +185,18 @@ class Intake:
         """Carry out what the loss of one env means: as of a death, for it alone."""
         host_id, why = completion.host_id, completion.why
         slot = self._supervisor.records[host_id].slots[completion.env_index]
+        if completion.answered and self._requests.is_current(completion.answered):
+            # That answer was given before the loss, but travels in a ring, and not in a frame.
+            self._supervisor.hosts[host_id].poll()
+            self._completions.append(completion._replace(answered=0))
+            return
         wanted = completion.entry and self._requests.end(host_id, completion.entry) is not None
         if not wanted:
             if self._episodes.why_lost(slot) is None:  # Else that is known, as after an abort.
                 self._episodes.lose([slot], why)
-                is_stepped = self._requests.numbering.op(slot) == Operation.STEP
-                if self._requests.is_idle(slot) or not is_stepped:  # Else its step is lost, too.
+                entry = self._requests.numbering.entry.item(slot)
+                is_stepped = op_of(entry) == Operation.STEP and self._requests.is_current(entry)
+                if not is_stepped:  # Else its step is lost, too.
                     self._supervisor.losses.count_env(slot, why, completion.message)
             return
         self._episodes.lose([slot], why)

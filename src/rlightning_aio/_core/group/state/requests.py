@@ -364,10 +364,15 @@ class Requests:
         self.deliver(slots)
         return slots
 
+    def is_current(self, entry: int) -> bool:
+        """Return True if the request `entry` is the one in flight to its slot."""
+        slot = slot_of(entry)
+        return self.state.item(slot) == _BUSY_CODE and self.numbering.entry.item(slot) == entry
+
     def end(self, host_id: int, entry: int) -> int | None:
         """End the request `entry`, and return its slot; None if its reply is unwanted."""
         slot = slot_of(entry)
-        if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
+        if not self.is_current(entry):
             return None
         self.in_flight[host_id] -= 1
         if slot in self.unwanted:

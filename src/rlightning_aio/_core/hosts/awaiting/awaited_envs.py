@@ -68,6 +68,7 @@ class _EnvRecord:
         runner: of that env, or of the one before.
         entry: of the request that is being executed; 0 while there is none.
         arguments: of that request.
+        answered: entry of the last request that was answered.
         is_ending: the env before has left by itself, and has not closed yet.
         lost: why the env before is gone, and the same as a message; None if there was none.
         leaving: the task that puts the env before away.
@@ -81,6 +82,7 @@ class _EnvRecord:
         self.runner: Any = None
         self.entry = 0
         self.arguments: Any = None
+        self.answered = 0
         self.is_ending = False
         self.lost: tuple[Loss, str] | None = None
         self.leaving: asyncio.Task[None] | None = None
@@ -309,6 +311,7 @@ class AwaitedEnvs:
         if self._ending:
             return
         entry, record.entry, record.arguments = record.entry, 0, None
+        record.answered = entry
         self.num_busy -= 1
         if completion is None:
             self._done(entry)
@@ -370,7 +373,8 @@ class AwaitedEnvs:
         if self._ending:
             return
         self.num_busy -= entry != 0
-        self._post(Lost(self._host_id, record.index, why, entry, message))
+        answered = record.answered
+        self._post(Lost(self._host_id, record.index, why, entry, message, answered))
         self._begin_queued()
 
     def _on_broken(self, env: AwaitedEnv) -> None:
