@@ -35,7 +35,7 @@ PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-chec
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
-run: $(VENV)/installed ## three kinds of envs, by AsyncVectorEnv and here: how much faster on this machine
+run: $(VENV)/installed ## four kinds of envs, by Gymnasium and here: how much faster on this machine
 	@$(PY) benchmarks/demo.py
 
 # Tests that run programs take half of the time, so they have a target of their own.
@@ -162,7 +162,7 @@ dist: $(VENV)/installed-release ## the wheel and the sdist, into dist/
 	rm -rf dist
 	$(PY) -m build
 
-bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib ## every benchmark that has a table, with every peer (their packages are large)
+bench: $(VENV)/installed-bench ## every benchmark that has a table, with every peer (their packages are large)
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
@@ -195,12 +195,6 @@ $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(STAMPS) $(SIMULATORS)/installed: $(SOURCES)
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)' $(tools:%=--requirement requirements/%.txt) $(pages)
-	@touch $@
-
-# It pins versions that nobody else does, of which its vector environments need none. Where it
-# can't be installed, it is left out of the comparison.
-$(VENV)/installed-pufferlib: constraints.txt | $(VENV)/installed-bench
-	-$(PIP_INSTALL) --constraint constraints.txt --no-deps pufferlib-core
 	@touch $@
 
 $(OPENENV)/installed: | $(OPENENV)/bin/python

@@ -8,8 +8,8 @@
 Contenders take turns, each in a process of its own; a figure is the median of its rounds, and a
 multiple that of `AsyncVectorEnv` in the same round. *K of N* hands out K results or more at a time,
 whichever are ready first, while the other envs step. What this library runs in workers has time
-limits. `pip install . -r requirements/bench.txt` brings the peers, all but PufferLib, which `make
-bench` adds; those that are missing, or don't have the task, are left out, with the reason.
+limits. `pip install . -r requirements/bench.txt` brings the peers; those that are missing, or don't
+have the task, are left out, with the reason. `run_all.py` draws the README's picture from a report.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from contenders import (
     OursSb3,
     OursSync,
     OursVector,
-    PufferLib,
     Sb3Vector,
     TorchRL,
     TorchRLPool,
@@ -46,7 +45,6 @@ def question(work: Work, ready: int) -> Question:
     """Compare everybody at `work`; those that can hand out the first `ready` results."""
     name, some = name_of(work.task, work.num_envs), f"{ready} of {work.num_envs}"
     first, pool = f"rlightning_aio group, {some}", f"TorchRL AsyncEnvPool, {some}"
-    puffer = f"PufferLib, {some}"
     return Question(
         name=name,
         title=f"{work.task.rpartition(':')[2]}, {work.num_envs} envs",
@@ -66,8 +64,6 @@ def question(work: Work, ready: int) -> Question:
             EnvPool(f"EnvPool, {some}", work, ready),
             TorchRL("TorchRL ParallelEnv", work),
             TorchRLPool(pool, work, ready),
-            PufferLib("PufferLib, all", work),
-            PufferLib(puffer, work, ready),
         ],
         targets=[
             Target(MADE, DEFAULT, 1.0),
@@ -76,7 +72,6 @@ def question(work: Work, ready: int) -> Question:
             Target(VECTOR, ALL, 0.85),
             Target(OURS_SB3, SUBPROC, 1.0),
             Target(first, pool, 1.0),
-            Target(first, puffer, 1.0),
         ],
         reference=ASYNC,
         rounds=5,

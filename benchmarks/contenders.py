@@ -2,7 +2,7 @@
 
 Rule: all contenders get the same single env from `gymnasium.make`, step it with actions sampled
 beforehand, and reset finished episodes, each in its own way. They are measured by the results
-handed to the trainer; where an env is reset in place of a step (Gymnasium, EnvPool, PufferLib, this
+handed to the trainer; where an env is reset in place of a step (Gymnasium, EnvPool, this
 library), that result counts as well. Ours has time limits wherever there are workers.
 """
 
@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import multiprocessing as mp
 import os
-import signal
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -37,7 +36,7 @@ class Work:
         task: Gymnasium id; ``module:id`` imports the module first.
         num_envs: number of envs.
         step_timeout: this library's time limit; None for no limit.
-        envs_per_process: of groups and of PufferLib, where the library's own choice is not meant.
+        envs_per_process: of groups and of TorchRL, where the library's own choice is not meant.
     """
 
     task: str
@@ -400,70 +399,3 @@ class TorchRLPool(TorchRL):
         state["action"] = next(self._actions)[:count]
         self._envs.async_step_and_maybe_reset_send(state)
         return count
-
-
-def emulated(work: Work, buf: Any = None, seed: int = 0) -> Any:
-    """Make one env of `work`, as PufferLib has it.
-
-    Its wrapper for statistics keeps infos until an episode ends, as PufferLib's own recipes do;
-    without it each step's are pickled.
-    """
-    from pufferlib.emulation import GymnasiumPufferEnv
-    from pufferlib.pufferlib import EpisodeStats
-
-    return GymnasiumPufferEnv(env=EpisodeStats(work.make()), buf=buf, seed=seed)
-
-
-@dataclass
-class PufferLib(Stepped):
-    """`pufferlib.vector.Multiprocessing`: workers that spin, as many as there are cores.
-
-    Attributes:
-        batch_size: results it hands out at a time; all envs if 0.
-    """
-
-    batch_size: int = 0
-
-    packages = ("pufferlib",)
-
-    def setup(self) -> None:
-        from pufferlib import vector
-
-        self._envs = vector.make(
-            partial(emulated, self.work),
-            backend=vector.Multiprocessing,
-            num_envs=self.work.num_envs,
-            num_workers=self.work.num_envs // self.work.by_core(),
-            batch_size=self.batch_size or self.work.num_envs,
-            overwork=True,  # It refuses more workers than physical cores.
-            zero_copy=False,  # Results of the first ready workers.
-            sync_traj=False,
-        )
-        single = self.work.make()
-        self._actions = sampled(single.action_space, self.work.num_envs)
-        single.close()
-        self._envs.async_reset(0)
-
-    def step(self) -> int:
-        _, rewards, *_ = self._envs.recv()
-        self._envs.send(next(self._actions)[: len(rewards)])
-        return len(rewards)
-
-    def round(self, seconds: float) -> float:
-        # Its workers spin for another half second, at the expense of the next contender.
-        self._signal(signal.SIGCONT)
-        try:
-            return super().round(seconds)
-        finally:
-            self._signal(signal.SIGSTOP)
-
-    def _signal(self, number: int) -> None:
-        for process in self._envs.processes:
-            os.kill(process.pid, number)
-
-    def teardown(self) -> None:
-        super().teardown()
-        if self._envs is not None:
-            self._signal(signal.SIGCONT)
-            for process in self._envs.processes:
-                process.join()

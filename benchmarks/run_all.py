@@ -1,7 +1,7 @@
 """Run the benchmarks that have results, keep the reports, and renew what shows them.
 
 `tables.md` has the table of each, `README.md` the comparisons with their targets, and
-`docs/pictures/speed.svg` is drawn from three of them.
+`docs/pictures/speed.svg` is drawn from the first.
 
     python benchmarks/run_all.py                      # all of them, a quarter of an hour
     python benchmarks/run_all.py exchange remote
@@ -34,19 +34,14 @@ RUNS = {
     "Pong-v5-8": ["compare", "ale_py:ALE/Pong-v5", "8"],
     # Several times the 1.6 seconds of a full cycle of an env's times.
     "Uneven-v0-64": ["compare", *UNEVEN, "--seconds", "5"],
+    "own_envs": ["own_envs"],
     "exchange": ["exchange"],
     "awaitable": ["awaitable"],
     "remote": ["remote"],
 }
 """The name of each report, and the program with its arguments that writes it."""
-THEIRS = "Gymnasium AsyncVectorEnv"
-# Title, report, and our contender, which is compared with Gymnasium's.
-PANELS = (
-    ("32 x HalfCheetah-v5, make_vec", "HalfCheetah-v5-32", "rlightning_aio make_vec"),
-    ("64 x CartPole-v1, step", "CartPole-v1-64", "rlightning_aio group, all"),
-    ("64 envs of uneven speed, first ready", "Uneven-v0-64", "rlightning_aio group, 1 of 64"),
-)
-WIDTH, PANEL, TOP, LEFT, LONGEST = 720, 92, 44, 190, 400
+PICTURED = next(iter(RUNS))
+WIDTH, TOP, LEFT, LONGEST = 720, 44, 250, 370
 BAR, GAP = 22, 6
 OURS_COLOUR, THEIRS_COLOUR = "#3f51b5", "#b0b4c3"
 
@@ -108,33 +103,28 @@ def renew_pages() -> None:
 
 
 def drawn(results: Path) -> str:
-    """Return the picture as SVG: a pair of bars for each of `PANELS`, env steps per second."""
-    height = TOP + PANEL * len(PANELS)
+    """Return the picture as SVG: env steps per second of all in `PICTURED`, a bar for each."""
+    report = json.loads((results / f"{PICTURED}.json").read_text())
+    rates = {name: found["median"] for name, found in report["results"].items()}
+    height, machine = TOP + len(rates) * (BAR + GAP) + GAP, report["machine"]
     size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
+    title = f"{report['title']}: env steps per second, {machine['cores']} cores"
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">',
-        "<title>Env steps per second beside Gymnasium</title>",
+        f"<title>{escape(title)}</title>",
         f'<rect width="{WIDTH}" height="{height}" rx="8" fill="#ffffff"/>',
-        _text(16, 26, "Env steps per second on two cores", weight="bold"),
+        _text(16, 26, f"{title} ({machine['cpu']}), {machine['date']}", weight="bold"),
     ]
-    for number, (title, name, ours) in enumerate(PANELS):
-        medians = json.loads((results / f"{name}.json").read_text())["results"]
-        rates = medians[ours]["median"], medians[THEIRS]["median"]
-        top = TOP + number * PANEL
-        parts.append(_text(16, top + 16, f"{title}: {rates[0] / rates[1]:.1f} times as fast"))
-        for row, (label, rate) in enumerate(
-            zip(("rlightning_aio", "AsyncVectorEnv"), rates, strict=True)
-        ):
-            y = top + 26 + row * (BAR + GAP)
-            length = LONGEST * rate / max(rates)
-            colour = THEIRS_COLOUR if row else OURS_COLOUR
-            shape = f'x="{LEFT}" y="{y}" width="{length:.0f}" height="{BAR}" rx="3"'
-            parts += [
-                _text(LEFT - 10, y + 16, label, anchor="end"),
-                f'<rect {shape} fill="{colour}"/>',
-                # Three digits, as in the tables.
-                _text(LEFT + length + 8, y + 16, f"{float(f'{rate:.3g}'):,.0f}"),
-            ]
+    for row, name in enumerate(sorted(rates, key=lambda name: -rates[name])):
+        y, length = TOP + row * (BAR + GAP), LONGEST * rates[name] / max(rates.values())
+        colour = OURS_COLOUR if name.startswith("rlightning_aio") else THEIRS_COLOUR
+        shape = f'x="{LEFT}" y="{y}" width="{length:.0f}" height="{BAR}" rx="3"'
+        parts += [
+            _text(LEFT - 10, y + 16, name, anchor="end"),
+            f'<rect {shape} fill="{colour}"/>',
+            # Three digits, as in the tables.
+            _text(LEFT + length + 8, y + 16, f"{float(f'{rates[name]:.3g}'):,.0f}"),
+        ]
     return "\n".join([*parts, "</svg>", ""])
 
 

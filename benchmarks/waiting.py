@@ -51,11 +51,6 @@ class Awaiting(Waits):
         return IDLE, 1.0, False, False, {}
 
 
-class BriefAwaiting(Awaiting):
-    def latency(self) -> float:
-        return super().latency() / 10
-
-
 class BriefSleeping(Waits, gym.Env[Any, Any]):
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         del options

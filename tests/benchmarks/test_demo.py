@@ -17,18 +17,20 @@ ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "benchmarks" / "demo.py"
 
 
-LINES = ("MuJoCo in one batch", "plain Python in workers", "an env that waits")
+LINES = ("CartPole", "HalfCheetah, one batch", "own env of 200 µs", "own env that waits")
 
 
-def test_it_shows_three_lines_and_the_next_steps(tmp_path: Path) -> None:
-    """Each with the rate of both and what one is of the other."""
+def test_it_shows_four_lines_and_the_next_steps(tmp_path: Path) -> None:
+    """Each with the rates of all three, and how many times as fast ours is as each of theirs."""
     shown = output_of(DEMO, "--rounds", "1", "--seconds", "0.1", folder=tmp_path)
     for line in LINES:
-        found = re.search(rf"{line}\D* ([\d,]+) +([\d,]+) +([\d.]+)", shown)
+        found = re.search(rf"{line} +([\d,]+) +([\d,]+) +([\d,]+) +([\d.]+) and ([\d.]+)", shown)
         assert found, (line, shown)
-        theirs, ours, ratio = (float(number.replace(",", "")) for number in found.groups())
-        # Rates are shown with three digits.
-        assert abs(ratio - ours / theirs) <= 0.05 + 0.01 * ours / theirs
+        *theirs, ours, once, twice = (float(one.replace(",", "")) for one in found.groups())
+        for rate, ratio in zip(theirs, (once, twice), strict=True):
+            # Rates are shown with three digits.
+            assert abs(ratio - ours / rate) <= 0.05 + 0.01 * ours / rate
+    assert "CartPole is no faster" in shown
     for page in re.findall(r"(?:docs|examples)/\w+\.\w+", shown):
         assert (ROOT / page).exists(), page
 
@@ -47,7 +49,7 @@ def test_ctrl_c_ends_it_with_what_was_measured(tmp_path: Path) -> None:
     ) as process:
         os.close(theirs)
         shown = b""
-        while not re.search(rb"MuJoCo in one batch\D*[\d,]+ +[\d,]+ +[\d.]+", shown):
+        while not re.search(rb"CartPole\D*[\d,]+ +[\d,]+ +[\d,]+ +[\d.]+", shown):
             shown += os.read(terminal, 10_000)
         os.killpg(process.pid, signal.SIGINT)
         try:

@@ -22,7 +22,6 @@ PEERS = {
     "SB3": "stable_baselines3",
     "EnvPool": "envpool",
     "TorchRL": "torchrl",
-    "PufferLib": "pufferlib",
     "rlightning_aio": "rlightning_aio",
 }
 # By name of the report: a program, its arguments, and parts of the names of those that take part.
@@ -33,6 +32,7 @@ ASKED = {
         ["group"],
     ),
     "exchange": (["exchange"], ["sync", "bare exchange"]),
+    "own_envs": (["own_envs"], ["2 µs, 1 envs", "waits 5 ms, 4"]),
     "awaitable": (["awaitable"], ["loop, 1,000", "gather", "process"]),
     "remote": (["remote"], ["1 client"]),
 }
@@ -63,12 +63,12 @@ def test_each_script_measures_its_contenders(reports: dict[str, Any]) -> None:
     Each peer that is installed is compared, and only one that isn't is left out.
     """
     counts = {name: len(report["results"]) for name, report in reports.items()}
-    assert [counts[name] for name in ("uneven", "exchange", "awaitable", "remote")] == [2, 2, 3, 4]
+    assert [counts[name] for name in ("uneven", "exchange", "awaitable", "remote")] == [2, 3, 3, 4]
     assert reports["uneven"]["results"].keys() == {
         "rlightning_aio group, all", "rlightning_aio group, 1 of 4",
     }  # fmt: skip
     compared = reports["cheetah"]["results"]
-    assert counts["cheetah"] + len(reports["cheetah"]["skipped"]) == 16
+    assert counts["cheetah"] + len(reports["cheetah"]["skipped"]) == 14
     for name in reports["cheetah"]["skipped"]:
         assert not all(importlib.util.find_spec(module) for module in modules_of(name)), name
     for found in (*compared.values(), *reports["uneven"]["results"].values()):
@@ -77,8 +77,11 @@ def test_each_script_measures_its_contenders(reports: dict[str, Any]) -> None:
     assert reports["cheetah"]["step_timeout"] == 60
     for found in reports["awaitable"]["results"].values():
         assert found["trainer, µs/step"]["median"] > 0
-    for report in reports.values():
-        assert not report["skipped"] or report is reports["cheetah"]
+    for name in reports.keys() - {"cheetah", "own_envs"}:
+        assert not reports[name]["skipped"]
+    for found in reports["own_envs"]["results"].values():
+        assert found["named"] == "" or found["promised"] >= 1.5
+        assert found["best"] in found["medians"]
 
 
 def modules_of(contender: str) -> set[str]:
