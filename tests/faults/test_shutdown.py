@@ -27,6 +27,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio._core.group.supervision import shutdown
+from rlightning_aio._core.hosts import limits
 from rlightning_aio._core.hosts.process import fork_server
 from rlightning_aio.errors import GroupClosed
 from rlightning_aio.protocol.entries import Operation, op_of
@@ -42,8 +43,8 @@ SECONDS = 2.0
 
 def test_all_waits_in_the_library_take_less_than_two_seconds() -> None:
     """For envs that close, for the report of a kill, and for workers whose trainer is gone."""
-    assert shutdown._CLOSE_SECONDS + shutdown._KILL_SECONDS < SECONDS
-    assert max(shutdown._END_SECONDS, fork_server._GRACE_SECONDS) < SECONDS
+    assert limits._CLOSE_SECONDS + shutdown._KILL_SECONDS < SECONDS
+    assert max(shutdown._END_SECONDS, fork_server._CLOSE_SECONDS) < SECONDS
 
 
 SCRIPT = """

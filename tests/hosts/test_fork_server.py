@@ -117,7 +117,8 @@ def test_an_exit_is_reported_even_if_another_process_continues_to_write(
     pid = os.posix_spawn("/bin/false", ["false"], {})
     os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
     server: Any = object.__new__(fork_server._ForkServer)
-    server._poll = select.poll()
+    server._poll, server._left = select.poll(), set()
+    monkeypatch.setattr(fork_server, "kill_below", lambda *_, **__: None)  # It isn't one.
     server._trainer = type("Trainer", (), {"send": sent.append})
     channel = os.open(os.devnull, os.O_RDONLY)
     server._children = {pid: fork_server._Child(7, pid, [fork_server._Output(reader, 2)], channel)}

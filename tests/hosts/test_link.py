@@ -66,6 +66,8 @@ class EndsTheProgram:
 class StandIn(ForkServerHandle):
     """Starts nothing, and records orders."""
 
+    def note_used(self, host: Any, close_seconds: float) -> None: ...
+
     def __init__(self) -> None:
         self.orders: list[Fork] = []
         self.channels: list[socket.socket] = []
@@ -390,10 +392,10 @@ def test_a_start_forks_a_worker_and_sends_its_order(scene: Scene) -> None:
     place = order.place
     assert (place.host_id, place.num_hosts, place.first_slot, place.num_envs) == (0, 1, 0, 2)
     assert place.bell_offset == scene.bell_offset
-    scene.host.attach(AttachOrder((), ()))
+    scene.host.attach(AttachOrder((), (), 1.5))
     start, attach = scene.received()
     assert pickle.loads(start.payload).worker_indices == (0, 1)
-    assert pickle.loads(attach.payload) == AttachOrder((), ())
+    assert pickle.loads(attach.payload) == AttachOrder((), (), 1.5)
 
 
 def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) -> None:

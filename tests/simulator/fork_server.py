@@ -18,6 +18,7 @@ from simulator.processes import Killed, Living, Process
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import Attached
 from rlightning_aio._core.hosts.process.fork_messages import (
+    CloseLimit,
     Exited,
     Fork,
     Forked,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ForkServer"]
 
-_GRACE_SECONDS = 1.2
+_CLOSE_SECONDS = 1.2
 _DUMP_SECONDS = 0.3
 _LEAST_START_SECONDS = 5.0
 """Less time to start has no entry of a program."""
@@ -67,6 +68,7 @@ class ForkServer(Living):
         end.end.name = self.name
         self._trainer = MessageSocket(end)  # pyright: ignore[reportArgumentType]
         self._children: dict[int, tuple[_WorkerProcess, int]] = {}
+        self._close_seconds: dict[int, float] = {}
         self._is_ready = self._is_looking = False
         self.later(0.01 + world.start_delay(), self._begin)
 
@@ -139,6 +141,8 @@ class ForkServer(Living):
     def _obey(self, message: Any, descriptors: list[int]) -> None:
         if isinstance(message, Fork):
             self._fork(message.place, *descriptors)
+        elif isinstance(message, CloseLimit):
+            self._close_seconds[message.host_id] = message.seconds
         elif isinstance(message, Kill) and message.host_id in self._children:
             worker, _ = self._children[message.host_id]
             if message.dump:
@@ -173,12 +177,15 @@ class ForkServer(Living):
         for _, channel in self._children.values():
             self.world.sockets.by_number[channel].shutdown(0)
         self._trainer.close()
-        self._until_gone(self.world.now_ns + int(_GRACE_SECONDS * 1e9))
+        self._until_gone(self.world.now_ns)
 
-    def _until_gone(self, until_ns: int) -> None:
-        some_live = any(worker.alive for worker, _ in self._children.values())
-        if some_live and self.world.now_ns < until_ns:
-            self.later(0.01, partial(self._until_gone, until_ns))
+    def _until_gone(self, since_ns: int) -> None:
+        seconds = (self.world.now_ns - since_ns) / 1e9
+        for host_id, (worker, _) in self._children.items():
+            if worker.alive and seconds >= self._close_seconds.get(host_id, _CLOSE_SECONDS):
+                worker.end(-signal.SIGKILL)
+        if any(worker.alive for worker, _ in self._children.values()):
+            self.later(0.01, partial(self._until_gone, since_ns))
         else:
             self.end(0)
 

@@ -208,6 +208,7 @@ class World:
             (os, "sched_setaffinity", nothing),
             (sharing, "_time_limit", lambda _: None),
             (process_hosts, "processor_ns", nothing_known),
+            (spares, "kill_below", nothing_known),
             # Some steps are timed by the kernel, which has a clock of its own.
             (hint, "_ENOUGH_RESULTS", math.inf),
             # Each process has a heap of its own, so these would act on one that is small.

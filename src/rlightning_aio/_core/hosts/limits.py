@@ -10,7 +10,21 @@ from rlightning_aio.protocol.entries import Operation
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["RestartPolicy", "hung", "limits_of", "restart_pause"]
+__all__ = [
+    "AWAITED_CLOSE_SECONDS",
+    "RestartPolicy",
+    "close_seconds",
+    "hung",
+    "limits_of",
+    "restart_pause",
+]
+
+AWAITED_CLOSE_SECONDS: Final = 10.0
+"""How long awaitable envs may take to close, where their entry doesn't say."""
+_CLOSE_SECONDS: Final = 1.5
+_CANCEL_SECONDS: Final = 0.9
+"""What awaitable envs may take in addition: requests are cancelled before envs are closed, and
+their tasks after that."""
 
 _FIRST_SECONDS: Final = 0.1
 _LONGEST_SECONDS: Final = 5.0
@@ -20,6 +34,13 @@ def limits_of(config: EnvConfig) -> dict[int, float]:
     """The time limits of requests in seconds, by operation; one without a limit is absent."""
     limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
     return {int(op): limit for op, limit in limits.items() if limit is not None}
+
+
+def close_seconds(config: EnvConfig, *, awaits: bool) -> float:
+    """Return how long a host may take to close its envs, which are awaitable or not, and to end."""
+    if config.close_timeout is not None:
+        return config.close_timeout + _CANCEL_SECONDS
+    return AWAITED_CLOSE_SECONDS + _CANCEL_SECONDS if awaits else _CLOSE_SECONDS
 
 
 def restart_pause(losses: int) -> float:

@@ -108,10 +108,12 @@ class AttachOrder:
     Attributes:
         slabs: offset in the arena and number of rows of each slab of the group.
         rows: index of the slab, and the row in it, for each env.
+        close_seconds: how long the host may take to close, see `limits.close_seconds`.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
+    close_seconds: float
 
 
 @dataclass(frozen=True)

@@ -305,8 +305,8 @@ class GroupInterface(Facade):
         raise NotImplementedError
 
     def close(self) -> Any:
-        """Close all envs and end their workers, by force after a second and a half, or after the
-        ``close_timeout`` of their entry.
+        """Close all envs and end their workers, by force after the ``close_timeout`` of
+        their entry.
 
         Idempotent. Calls that wait get `GroupClosed`, and results that were not collected are
         gone. Cancelled, it ends the remaining workers by force. A warning names an env that

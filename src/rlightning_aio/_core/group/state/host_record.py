@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio._core.hosts.base import Killable, SelfStarting
-from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
+from rlightning_aio._core.hosts.limits import RestartPolicy, close_seconds, limits_of
 from rlightning_aio.errors import WorkerDied
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -199,6 +199,11 @@ class HostRecord:
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    @property
+    def close_seconds(self) -> float:
+        """Seconds that its worker may take to close its envs and to end."""
+        return close_seconds(self.config, awaits=any(env.is_awaitable for env in self.started))
 
     @property
     def is_worker_here(self) -> bool:

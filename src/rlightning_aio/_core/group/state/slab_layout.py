@@ -98,11 +98,11 @@ class SlabLayout:
         self.num_in_first = len(started) if len(self.slabs) == 1 else 0
         self._note_rows()
 
-    def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:
-        """The message that gives a host of local envs their rows."""
+    def order_for(self, first_slot: int, num_envs: int, close_seconds: float) -> AttachOrder:
+        """The message that gives a host of local envs their rows, and its time to close."""
         slots = range(first_slot, first_slot + num_envs)
         rows = tuple((int(self.slab[slot]), int(self.row[slot])) for slot in slots)
-        return AttachOrder(tuple(self._parts), rows)
+        return AttachOrder(tuple(self._parts), rows, close_seconds)
 
     def add(self, slab: Slab, first_slot: int) -> None:
         """Add the slab of an env_server, with one row for each of its places in order."""

@@ -20,11 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Shutdown"]
 
-_CLOSE_SECONDS: Final = 1.5
-"""Limit for envs to close before their worker is killed, where their entry has none."""
-_CANCEL_SECONDS: Final = 0.9
-"""What awaitable envs may take in addition to a limit of their entry: requests are cancelled before
-envs are closed, and their tasks after that."""
 _KILL_SECONDS: Final = 0.3
 """Limit for a kill to be reported."""
 _END_SECONDS: Final = 1.5
@@ -63,7 +58,7 @@ class Shutdown:
 
     def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
         """Wait for hosts that close; kill each when its time is up."""
-        by = {r.host.host_id: now + _seconds_for(r.config.close_timeout) for r in records}
+        by = {r.host.host_id: now + r.close_seconds for r in records}
         killed: set[int] = set()
         now = yield Wait(0.0)
         while still_open := [r for r in records if r.stage is not Stage.CLOSED]:
@@ -105,13 +100,10 @@ class Shutdown:
             return
         self._tables.lifetime.end()
         started = any(r.stage is not Stage.NEW for r in self._tables.records)
-        self._let_go(_END_SECONDS)
+        seconds = max((record.close_seconds for record in self._tables.records), default=0.0)
+        self._let_go(seconds + _KILL_SECONDS)
         if started:
             # The garbage collector calls this, so no caller's line would help.
             warnings.warn(
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
-
-
-def _seconds_for(close_timeout: float | None) -> float:
-    return _CLOSE_SECONDS if close_timeout is None else close_timeout + _CANCEL_SECONDS

@@ -233,7 +233,8 @@ class Supervisor:
         self._envs.note_started(started)
         for record in self.records:
             if record.place is None:
-                record.order = layout.order_for(record.slots.start, len(record.started))
+                count, seconds = len(record.started), record.close_seconds
+                record.order = layout.order_for(record.slots.start, count, seconds)
 
     def handle(self, completion: Lifecycle) -> None:
         """Apply a completion about the life of a host; `handle_exit` applies deaths."""

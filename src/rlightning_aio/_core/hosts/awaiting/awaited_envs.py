@@ -34,7 +34,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     time_collector,
     watched,
 )
-from rlightning_aio._core.hosts.limits import hung, limits_of
+from rlightning_aio._core.hosts.limits import AWAITED_CLOSE_SECONDS, hung, limits_of
 from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raised
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
@@ -50,10 +50,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
-__all__ = ["CLOSE_SECONDS", "AwaitedEnvs"]
+__all__ = ["AwaitedEnvs"]
 
-CLOSE_SECONDS: Final = 0.6
-"""How long envs may take to close, where their entry doesn't say."""
 _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
@@ -137,7 +135,7 @@ class AwaitedEnvs:
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
         config = order.config
-        self._close_seconds = config.close_timeout or CLOSE_SECONDS
+        self._close_seconds = config.close_timeout or AWAITED_CLOSE_SECONDS
         self._renews = config.on_env_error == "restart"
         self._limits = {
             op: TimeLimit(seconds, self._expire) for op, seconds in limits_of(config).items()

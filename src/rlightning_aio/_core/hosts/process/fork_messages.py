@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "REFUSED",
+    "CloseLimit",
     "Exited",
     "Fork",
     "Forked",
@@ -75,6 +76,14 @@ class Kill:
 
 
 @dataclass(frozen=True)
+class CloseLimit:
+    """Worker `host_id` may take so many seconds to close its envs and end, if the trainer ends."""
+
+    host_id: int
+    seconds: float
+
+
+@dataclass(frozen=True)
 class Exited:
     """Worker `host_id` exited, with a code (negative for a signal) and its last output."""
 
@@ -91,7 +100,7 @@ class NotForked:
     why: str
 
 
-Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited
+Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | CloseLimit | Exited
 
 REFUSED: Final = b"!"
 """First byte of the only packet of a fork server that can't import its code; a text follows."""

@@ -3,7 +3,8 @@
 One runs for each combination of interpreter and environment variables. It has imported the modules
 of the simulator, so a worker starts in milliseconds. It passes on what workers write to stdout and
 stderr, and keeps the end of each. When the trainer closes its end of the socket or dies, it shuts
-down the channels of all workers, and kills those that don't end soon.
+down the channels of all workers, and kills those that don't close in time. What a killed worker has
+started is killed with it.
 Rule: it has one thread when it forks. It builds no env.
 """
 
@@ -27,7 +28,10 @@ import traceback
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, cast
 
+from rlightning_aio._core.hosts.process import finalisers
+from rlightning_aio._core.hosts.process.descendants import adopt_orphans, children, kill_below
 from rlightning_aio._core.hosts.process.fork_messages import (
+    CloseLimit,
     Exited,
     Fork,
     Forked,
@@ -78,8 +82,8 @@ If that fails, the only packet is `REFUSED` and the reason.
 DUMP_SIGNAL: Final = getattr(signal, "SIGRTMIN", 0) + 7  # `bench` imports this on macOS, too.
 _TAIL_BYTES: Final = 8192
 _CHUNK_BYTES: Final = 1 << 16
-_GRACE_SECONDS: Final = 1.2
-"""Time for workers to notice that the trainer is gone, and to stop a robot."""
+_CLOSE_SECONDS: Final = 1.2
+"""Time for workers to close when the trainer is gone, where the trainer has said nothing yet."""
 _DUMP_SECONDS: Final = 0.3
 """Time for a worker to write its stacks."""
 _ERROR_CHARACTERS: Final = 60_000
@@ -98,6 +102,7 @@ class _Child:
     outputs: list[_Output]
     channel: int
     kill_at: float | None = None
+    close_seconds: float = _CLOSE_SECONDS
 
     def tail(self) -> str:
         """The end of what it wrote to stdout, and of what it wrote to stderr."""
@@ -154,6 +159,9 @@ class _ForkServer:
         self._trainer = trainer
         self._trainer_process = trainer_process
         self._children: dict[int, _Child] = {}
+        # What workers that have closed in order have left.
+        self._left: set[int] = set()
+        adopt_orphans()
         self._poll = select.poll()
         if trainer_process >= 0:
             self._poll.register(trainer_process, select.POLLIN)
@@ -216,6 +224,10 @@ class _ForkServer:
             self._fork(received.message, received.descriptors)
         elif isinstance(received.message, Kill):
             self._kill(received.message)
+        elif isinstance(received.message, CloseLimit):
+            for child in self._children.values():
+                if child.host_id == received.message.host_id:
+                    child.close_seconds = received.message.seconds
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
@@ -292,22 +304,36 @@ class _ForkServer:
         _pass_on(output.descriptor, data)
 
     def _handle_exits(self) -> None:
-        """Report the workers that exited."""
-        for pid in list(self._children):
-            ended, status = os.waitpid(pid, os.WNOHANG)
-            if not ended:
-                continue
-            child = self._children.pop(pid)
-            for output in child.outputs:
-                # Only what is in the pipe now: a process that it started may continue to write.
-                if unread := _unread(output.reader):
-                    self._drain(output, unread)
-                with contextlib.suppress(KeyError):
-                    self._poll.unregister(output.reader)
-                os.close(output.reader)
-            exit_code = os.waitstatus_to_exitcode(status)
-            self._trainer.send(Exited(child.host_id, exit_code, child.tail()))
-            os.close(child.channel)
+        """Report the workers that exited, and kill what those have started that were killed."""
+        exited: list[tuple[_Child, int]] = []
+        while True:
+            try:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+            except ChildProcessError:
+                break
+            if not pid:
+                break
+            child = self._children.pop(pid, None)
+            if child is not None:  # Others are what workers have left.
+                exited.append((child, os.waitstatus_to_exitcode(status)))
+        for child, code in exited:  # First, as it frees descriptors.
+            self._report(child, code)
+        if any(code for _, code in exited):
+            kill_below(os.getpid(), but={*self._children, *self._left})
+        elif exited:
+            # They ended as Python ends, which leaves alone what goes on in the background.
+            self._left = {*children().get(os.getpid(), [])} - self._children.keys()
+
+    def _report(self, child: _Child, exit_code: int) -> None:
+        for output in child.outputs:
+            # Only what is in the pipe now: a process that it started may continue to write.
+            if unread := _unread(output.reader):
+                self._drain(output, unread)
+            with contextlib.suppress(KeyError):
+                self._poll.unregister(output.reader)
+            os.close(output.reader)
+        self._trainer.send(Exited(child.host_id, exit_code, child.tail()))
+        os.close(child.channel)
 
     def _end_all(self) -> None:
         """Close the channels of all workers, then kill those that still run."""
@@ -322,11 +348,15 @@ class _ForkServer:
                 contextlib.suppress(OSError),
             ):
                 channel.shutdown(socket.SHUT_RDWR)
-        until = time.monotonic() + _GRACE_SECONDS
-        while self._children and time.monotonic() < until:
+        now = time.monotonic()
+        for child in self._children.values():
+            child.kill_at = now + child.close_seconds
+        while self._children and (until := self._next_due()) is not None:
             self._wait_for_children(until)
-        for pid in self._children:
-            os.kill(pid, signal.SIGKILL)
+            self._kill_due()
+        # The kernel ends those that can't be killed now.
+        if self._children:
+            kill_below(os.getpid(), but=self._left)
 
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
@@ -358,6 +388,8 @@ def _run_worker(
         cast("TextIOWrapper", sys.stdout).reconfigure(line_buffering=True)
         leave()
         die_with_parent()
+        adopt_orphans()
+        finalisers.drop_inherited()
         if os.getppid() != parent:
             os._exit(1)
         faulthandler.enable(all_threads=True)
@@ -367,6 +399,7 @@ def _run_worker(
 
         trainer = socket.socket(fileno=channel)
         worker.main(trainer, arena, order.place)
+        finalisers.run_all()
         code = 0
     except BaseException:
         traceback.print_exc()

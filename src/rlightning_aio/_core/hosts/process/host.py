@@ -21,6 +21,7 @@ from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
+    CloseLimit,
     Exited,
     Fork,
     Forked,
@@ -157,19 +158,21 @@ class ForkServerHandle:
             return
         if not self._ready:
             self._failure = f"it was killed while it was importing {self._imports}"
-            self._server.process.kill()  # It hangs in an import and reads no messages.
+            self._server.kill()  # It hangs in an import and reads no messages.
         else:
             self._send(self._server, Kill(host.host_id, dump))
 
-    def note_used(self) -> None:
-        """Note that the envs of all workers were built."""
+    def note_used(self, host: ProcessHost, close_seconds: float) -> None:
+        """Note that the envs of all workers were built, and how long those of `host` may close."""
         self._is_used = True
+        if self._server is not None:
+            self._send(self._server, CloseLimit(host.host_id, close_seconds))
 
     def destroy(self) -> None:
-        """Kill the fork server itself; the kernel then kills its workers."""
+        """Kill the fork server itself, with its workers."""
         if self._server is not None:
             self._failure = "it didn't react to any request, and was killed"
-            self._server.process.kill()
+            self._server.kill()
 
     @property
     def _imports(self) -> str:
@@ -331,7 +334,7 @@ class ProcessHost(Host):
         self._link.send(FrameKind.START, payload=self._start_payload)
 
     def attach(self, order: AttachOrder) -> None:
-        self._fork_server.note_used()
+        self._fork_server.note_used(self, order.close_seconds)
         if self._link is not None:
             self._link.send(FrameKind.ATTACH, payload=pickle.dumps(order))
 

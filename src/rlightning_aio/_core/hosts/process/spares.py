@@ -16,6 +16,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+from rlightning_aio._core.hosts.process.descendants import kill_below
+
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import MessageSocket
 
@@ -39,8 +41,14 @@ class RunningForkServer(NamedTuple):
         try:
             return self.process.wait(seconds)
         except subprocess.TimeoutExpired:
-            self.process.kill()  # The kernel then kills its workers.
+            self.kill()
             return self.process.wait()
+
+    def kill(self) -> None:
+        """Kill it with its workers, and with all that those have started."""
+        if self.process.poll() is None:
+            kill_below(self.process.pid)
+        self.process.kill()
 
     def disown(self) -> None:
         """Drop it in a process that was forked; the parent continues to use it."""

@@ -16,6 +16,7 @@ import socket
 import sys
 import time
 import traceback
+import weakref
 from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
@@ -273,9 +274,9 @@ class Worker:
         except BaseException as error:
             self._post(not_built(SENDER, order, len(self._runners), error))
             return
-        # These objects stay. Without them the garbage collector saves time and copied pages.
+        # Most of these objects stay. They are not frozen, or the last collection would have to look
+        # at all that the fork server has imported, whose pages the workers share.
         gc.collect()
-        gc.freeze()
         self._post(Built(SENDER, started))
 
     def _attach(self, frame: Frame) -> None:
@@ -388,5 +389,12 @@ def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
     rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
     rings = WorkerRings(rings_memory, place.num_envs, bell)
     worker = Worker(channel, arena, rings, place.first_slot, (bell_memory, rings_memory))
-    os.register_at_fork(after_in_child=worker.become_child)
+    # Not for ever: the env and what it holds are dropped with the worker.
+    known = weakref.ref(worker)
+
+    def in_child() -> None:
+        if (forked := known()) is not None:
+            forked.become_child()
+
+    os.register_at_fork(after_in_child=in_child)
     worker.serve()

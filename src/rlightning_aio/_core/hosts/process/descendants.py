@@ -1,0 +1,71 @@
+"""What a worker's envs have started (browsers, simulators, shells), found and killed with it.
+
+A process whose parent ends becomes a child of its nearest ancestor that adopts. Each worker adopts,
+so that all that its envs have started stays below it, also what begins a session of its own. The
+fork server adopts, too: of what it has as children, all but its workers comes from workers that
+ended.
+Rule: only the standard library, as the fork server imports this before it knows what is installed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+__all__ = ["adopt_orphans", "children", "kill_below"]
+
+_PR_SET_CHILD_SUBREAPER: Final = 36
+_MOST_ROUNDS: Final = 100
+"""Each kills all that was found, so a second one only meets what was started meanwhile."""
+
+
+def adopt_orphans() -> None:
+    """Become the parent of descendants whose parents end (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def children() -> dict[int, list[int]]:
+    """Return the children of each process of this system that has any and has not ended."""
+    found: dict[int, list[int]] = {}
+    try:
+        pids = [int(one.name) for one in Path("/proc").iterdir() if one.name.isdecimal()]
+    except OSError:  # There are no descriptors.
+        return found
+    for pid in pids:
+        try:
+            # The name in parentheses may contain anything.
+            text = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2]
+        except OSError:  # It has ended meanwhile.
+            continue
+        state, parent, *_ = text.split()
+        if state not in (b"Z", b"X"):
+            found.setdefault(int(parent), []).append(pid)
+    return found
+
+
+def kill_below(process: int, but: Collection[int] = ()) -> None:
+    """Kill all descendants of a process, except children in `but` and what is below those.
+
+    Whatever is started meanwhile is found in another round, for its parent dies before it or is
+    found with it.
+    """
+    killed: set[int] = set()
+    for _ in range(_MOST_ROUNDS):
+        of = children()
+        below = [pid for pid in of.get(process, []) if pid not in but]
+        for pid in below:
+            below += of.get(pid, [])
+        if killed.issuperset(below):
+            return
+        for pid in below:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        killed.update(below)

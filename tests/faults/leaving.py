@@ -1,0 +1,88 @@
+"""Envs that leave something to the end of their worker, and envs that start processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import tempfile
+import time
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ABORT, HANG, SLEEP = 0, 1, 2
+
+
+class Leaving(gym.Env[int, int]):
+    """It never closes what it has opened, and refers to itself.
+
+    Args:
+        folder: where its files are.
+    """
+
+    observation_space: Any = gym.spaces.Discrete(2)
+    action_space: Any = gym.spaces.Discrete(3)
+
+    def __init__(self, folder: Path) -> None:
+        self.itself = self
+        self.log = (folder / "log").open("w")
+        self.log.write("what it has to say")
+        self.scratch = tempfile.TemporaryDirectory(dir=folder)
+        self.daemon = multiprocessing.Process(target=time.sleep, args=(1e6,), daemon=True)
+        self.daemon.start()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        del seed, options
+        return 0, {"started": [self.daemon.pid]}
+
+    def step(self, action: int) -> Any:
+        del action
+        return 0, 0.0, False, False, {}
+
+
+class Starting(gym.Env[int, int]):
+    """It has started a browser, so to speak: in a session of its own, with a process below it, and
+    in the background of a shell that has ended.
+    """
+
+    observation_space: Any = gym.spaces.Discrete(2)
+    action_space: Any = gym.spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        script = "sleep 1000000 & echo $! $$; wait"
+        browser = subprocess.Popen(
+            ["sh", "-c", script], start_new_session=True, stdout=subprocess.PIPE
+        )
+        assert browser.stdout is not None
+        script = "setsid sleep 1000000 >/dev/null 2>&1 & echo $!"
+        shell = subprocess.run(["sh", "-c", script], stdout=subprocess.PIPE, check=True)
+        self.started = [int(pid) for pid in (browser.stdout.readline() + shell.stdout).split()]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        del seed, options
+        return 0, {"started": self.started}
+
+    def step(self, action: int) -> Any:
+        if action == ABORT:
+            os.abort()
+        while action == HANG:
+            time.sleep(1)
+        return 0, 0.0, False, False, {}
+
+
+class Awaitable:
+    """An env whose methods are coroutine functions."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self.env = env
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return self.env.reset(seed=seed, options=options)
+
+    async def step(self, action: int) -> Any:
+        return self.env.step(action)
