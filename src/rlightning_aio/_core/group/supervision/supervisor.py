@@ -149,7 +149,9 @@ class Supervisor:
             for record in self.records:
                 if record.place is not None:
                     self.places.leave(record)
-                    record.host.attach(AttachOrder((), ()))  # From now on somebody may dial in.
+                    record.host.attach(
+                        AttachOrder((), (), record.close_seconds)
+                    )  # From now on somebody may dial in.
                     continue
                 assert record.order is not None
                 record.stage = Stage.ATTACHING
