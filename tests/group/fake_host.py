@@ -17,7 +17,6 @@ import pytest
 from gymnasium import spaces
 from kit.checked import CheckedRequests
 
-from rlightning_aio._core.group.drivers.wait import Parked
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
 from rlightning_aio._core.group.episodes.episodes import Episodes
@@ -579,7 +578,7 @@ class FakeGroup:
     def wake(self) -> None:
         """See `hosts.base.Driver.wake`."""
         for running in self.running:
-            running.woken |= not running.is_parked
+            running.woken = True
 
     def host_of(self, slot: int) -> FakeHost:
         return next(h for h in self.hosts if h.first_slot <= slot < h.first_slot + h.num_envs)
@@ -603,7 +602,6 @@ class Running:
     def __init__(self, procedure: Procedure[Any]) -> None:
         self.procedure = procedure
         self.until: float | None = None
-        self.is_parked = False
         self.woken = False
         self.num_turns = 0
         self.done = False
@@ -621,16 +619,10 @@ class Running:
         try:
             wait = self.procedure.send(now)  # type: ignore[arg-type]
             self.until = wait.until
-            self.is_parked = isinstance(wait, Parked)
-            if isinstance(wait, Parked):
-                wait.unpark = self._unpark
         except StopIteration as stop:
             self.done, self.value = True, stop.value
         except Exception as error:  # noqa: BLE001
             self.done, self.error = True, error
-
-    def _unpark(self) -> None:
-        self.woken = True
 
     def result(self) -> Any:
         """Return the result of the procedure, or raise its error."""

@@ -13,6 +13,7 @@ import pytest
 from kit.scripted import DIE, GO, HANG, RAISE, Awaited, Scripted
 
 import rlightning_aio as rl
+from rlightning_aio._core.group.api.episode import outcome_of
 from rlightning_aio._core.group.engine import agent_steps
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio.errors import (
@@ -263,3 +264,68 @@ async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_
         assert requests.is_idle(0)
         await group.close()
         await asyncio.wait(steps)
+
+
+@pytest.mark.parametrize("place", PLACES, ids=["inline", "workers"])
+async def test_tasks_that_use_handles_have_their_own_results_values_and_errors(
+    place: dict[str, Any],
+) -> None:
+    async with rl.build_env_group(Counter, num_workers=6, **place) as group:
+        await group.reset()
+        envs = [group[env_id] for env_id in group.env_ids]
+        found = await asyncio.gather(
+            envs[0].step(RAISE),
+            envs[1].call("get_attr", "no_such"),
+            envs[2].call("close", "too", "many"),
+            envs[3].get_attr("action_space"),
+            envs[4].reset(seed=-1),
+            envs[5].step(GO),
+            return_exceptions=True,
+        )
+        assert all(isinstance(one, EnvRaised) for one in found[:3])
+        assert [one.env_id for one in found[:3]] == group.env_ids[:3]
+        assert "no_such" in str(found[1])
+        assert found[3] == Counter.action_space
+        assert isinstance(found[4], ValueError)
+        assert found[5].info["count"] == 1
+        assert group.pending == []
+
+
+async def test_a_handle_whose_task_is_cancelled_leaves_its_result_to_collect() -> None:
+    """The others get theirs."""
+    async with rl.build_env_group(Long, num_workers=3, placement="loop") as group:
+        await group.reset()
+        steps = [asyncio.ensure_future(group[env_id].step(0)) for env_id in group.env_ids]
+        while len(group.pending) < 3:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        steps[0].cancel()
+        rets = await asyncio.gather(*steps[1:])
+        assert [ret.env_id for ret in rets] == group.env_ids[1:]
+        assert group.pending == group.env_ids[:1]
+        assert (await group.collect_async())[0].ids() == group.env_ids[:1]
+
+
+@pytest.mark.parametrize("is_timeout", [False, True])
+async def test_a_reply_that_is_there_before_a_cancellation_is_returned(is_timeout: bool) -> None:
+    """The cancellation comes where the task waits next, unless a timeout has taken it back."""
+    loop = asyncio.get_running_loop()
+    reply: asyncio.Future[str] = loop.create_future()
+    seen: list[str] = []
+
+    async def main() -> None:
+        if is_timeout:
+            loop.call_soon(reply.set_result, "reply")
+            async with asyncio.timeout(0):
+                seen.append(await outcome_of(reply))
+            await asyncio.sleep(0.01)
+        else:
+            seen.append(await outcome_of(reply))
+            await asyncio.sleep(30)
+
+    task = asyncio.ensure_future(main())
+    await asyncio.sleep(0)
+    if not is_timeout:
+        reply.set_result("reply")
+        task.cancel()
+    await asyncio.wait([task])
+    assert (seen, task.cancelled()) == (["reply"], not is_timeout)

@@ -248,7 +248,8 @@ async def test_the_value_of_a_cancelled_call_is_dropped(group: Any, gates: list[
     stepping = asyncio.create_task(group.step(responses(0)))
     await asyncio.sleep(0)
     calling = asyncio.create_task(group["gated-1"].call("wait_at_gate"))
-    await asyncio.sleep(0)
+    while "gated-1" not in group.pending:  # noqa: ASYNC110
+        await asyncio.sleep(0)
     calling.cancel()
     await asyncio.wait([calling])
     with pytest.raises(NothingPending):

@@ -442,21 +442,7 @@ def test_a_result_that_another_call_read_wakes_its_caller(new_group: NewGroup) -
     assert ids_of(resetting) == ["fake-0", "fake-1"]
 
 
-def test_a_call_is_woken_by_results_of_its_own_alone(new_group: NewGroup) -> None:
-    """However many wait: a result wakes its caller, and the one that reads for all, or the next."""
-    group = new_group(10, 10, 10)
-    callers = [group.begin(group.steps.step(steps(slot), group.now)) for slot in range(30)]
-    for slot in [*range(5, 30, 3), *range(5), *range(6, 30, 3), *range(7, 30, 3)]:
-        before = [caller.num_turns for caller in callers]
-        group.finish(slot)
-        assert ids_of(callers[slot]) == [f"fake-{slot}"]
-        woken = [k for k, caller in enumerate(callers) if caller.num_turns > before[k]]
-        assert len(woken) <= 2, woken
-        assert sum(caller.num_turns for caller in callers) - sum(before) <= 3
-    assert all(caller.done for caller in callers)
-
-
-@pytest.mark.parametrize("whose", [0, 3], ids=["the one that reads for all", "another"])
+@pytest.mark.parametrize("whose", [0, 3])
 def test_calls_go_on_when_one_is_cancelled(new_group: NewGroup, whose: int) -> None:
     group = new_group(4)
     callers = [group.begin(group.steps.step(steps(slot), group.now)) for slot in range(4)]

@@ -51,7 +51,8 @@ async def test_a_cancelled_call_that_still_waits_for_its_turn_delays_no_request(
         batch, _ = await group.reset(seed=0)
         group.step_async(batch.take([1]).respond(action=[0]))
         call = asyncio.create_task(group["pole-0"].set_attr("gravity", 1.0))
-        await asyncio.sleep(0)
+        while "pole-0" not in group.pending:  # noqa: ASYNC110
+            await asyncio.sleep(0)
         call.cancel()
         with pytest.raises(asyncio.CancelledError):
             await call

@@ -236,7 +236,7 @@ def test_an_error_that_was_not_raised_yet_does_not_prevent_closing(times: int) -
         await group.init()
         link = link_of(group)
         broken = Broken(link, times)
-        call = asyncio.ensure_future(group["probe-0"].call("get_attr", "label"))
+        call = asyncio.ensure_future(group.call("get_attr", "label", env_ids=["probe-0"]))
         await asyncio.sleep(0)
         call.cancel()
         await broken.struck.wait()

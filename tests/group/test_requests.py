@@ -88,7 +88,7 @@ class Driven:
 
     def _call(self) -> None:
         slots = [SLOT, COMPANION]
-        self.ticket = self.table.tickets.open(np.array(slots), method="render" * self.method)
+        self.ticket = self.table.tickets.open(np.array(slots))
         op = Operation.CALL if self.method else Operation.RESET
         self._ask(slots, op, self.ticket.owner)
 

@@ -22,6 +22,7 @@ from rlightning_aio._core.group.state.request_states import (
     State,
 )
 from rlightning_aio._core.group.state.requests import Requests
+from rlightning_aio.protocol.entries import ANSWERS_WITH_VALUE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -66,7 +67,7 @@ def _asked(slots: NDArray[np.intp], owner: int) -> Changes:
 def _given_up(requests: Requests, ticket: Ticket) -> Changes:
     slots = ticket.own_slots(requests.owner)
     slots = slots[requests.state[slots] != State.IDLE]  # An interrupt came before it was sent.
-    values = slots if ticket.calls else slots[:0]
+    values = slots[ANSWERS_WITH_VALUE[requests.numbering.ops(slots)]]
     return [(Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, np.setdiff1d(slots, values))]
 
 

@@ -222,7 +222,7 @@ class Play(Session):
             self.refuse_busy(requests)
             return False
         except asyncio.CancelledError:
-            if self.clients:  # It may have waited for clients.
+            if self.clients or self.nested & requests.keys():  # Perhaps nothing was sent yet.
                 self.interrupted(requests, owner)
             self.model.orphan(owner)
             raise
@@ -231,6 +231,17 @@ class Play(Session):
             raise
         take(found)
         return True
+
+    async def answer_one(
+        self, env: Env, request: Request, call: Callable[[], Any], take: Callable[[Any], None]
+    ) -> bool:
+        """Make a call of one env; an asynchronous group sends it in the next turn of the loop."""
+        if self.is_async:
+            self.nested.add(env.env_id)
+        try:
+            return await self.answer({env.env_id: request}, call, take)
+        finally:
+            self.nested.discard(env.env_id)
 
     def send(self, requests: dict[str, Request], owner: Any) -> None:
         for env_id, request in requests.items():
@@ -675,8 +686,9 @@ class Play(Session):
     async def peek(self, env: Env, token: int) -> None:
         """Ask an env for its state."""
         handle = self.group[env.env_id]
-        await self.answer(
-            {env.env_id: Request("call")},
+        await self.answer_one(
+            env,
+            Request("call"),
             lambda: handle.call("peek", token),
             lambda value: self.take_value(env, value, token),
         )
@@ -693,7 +705,7 @@ class Play(Session):
             require(value is None and effect == "plain", "a value of a call that fails", value)
             env.request = None
 
-        await self.answer({env.env_id: request}, lambda: call("fault", effect, token), take)
+        await self.answer_one(env, request, lambda: call("fault", effect, token), take)
 
     def take_value(self, env: Env, value: Any, token: int) -> None:
         """Compare the value of `peek`."""
@@ -732,15 +744,17 @@ class Play(Session):
             possible = [state.scripts.subs[0].mark for state in env.possible()]
             require(value in possible, "another attribute", value, mark)
 
-        request = {env.env_id: Request("call")}
+        request = Request("call")
         try:
-            answered = await self.answer(request, lambda: handle.set_attr("mark", mark), take)
+            answered = await self.answer_one(
+                env, request, lambda: handle.set_attr("mark", mark), take
+            )
         except (asyncio.CancelledError, KeyboardInterrupt):
             env.loose += [state.marked(mark) for state in (env.state, *env.loose)]
             raise
         if answered and env.idle:
-            request = {env.env_id: Request("call")}
-            await self.answer(request, lambda: handle.get_attr("mark"), take_mark)
+            request = Request("call")
+            await self.answer_one(env, request, lambda: handle.get_attr("mark"), take_mark)
 
     async def op_handle(self, rng: Random) -> None:
         envs = self.ready()
@@ -757,8 +771,7 @@ class Play(Session):
             action = action_of(env, acts)
             request = Request("step", acts=acts)
             call = lambda: handle.step(action)  # noqa: E731
-        requests = {env.env_id: request}
-        await self.answer(requests, call, lambda ret: self.take_ret(env, ret, request))
+        await self.answer_one(env, request, call, lambda ret: self.take_ret(env, ret, request))
 
     def take_ret(self, env: Env, ret: Any, request: Request) -> None:
         row = row_of_ret(env.entry, ret)

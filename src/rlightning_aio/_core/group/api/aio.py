@@ -10,13 +10,14 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio._core.group.api.episode import Agents, EnvEpisode
-from rlightning_aio._core.group.api.facade import only_result, steps_of
+from rlightning_aio._core.group.api.facade import response_to
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
     ServerHandle,
 )
 from rlightning_aio._core.group.drivers.aio_driver import AioDriver
+from rlightning_aio._core.group.engine.agent_steps import EpisodeStart, MethodCall
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
 from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
 
@@ -165,16 +166,16 @@ class EnvHandle(EnvHandleInterface):
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
-        seeds = None if seed is None else [seed]
-        return only_result(await self._group.reset(seeds, options, [self.env_id]))
+        return (await self._asked(EpisodeStart(seed, options))).ret
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        return only_result(await self._group.step(steps_of(self.env_id, response)))
+        return (await self._asked(response_to(self.env_id, response))).ret
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.calls.call_one(time.monotonic(), slot, (name, args, kwargs))
-        return await self._driver.run(procedure)
+        return await self._asked(MethodCall(name, args, kwargs))
+
+    async def _asked(self, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
+        return await self._group._agents.asked(self._env_id, what)  # noqa: SLF001
 
     async def get_attr(self, name: str) -> Any:
         return await super().get_attr(name)

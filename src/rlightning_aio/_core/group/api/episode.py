@@ -1,7 +1,7 @@
-"""`EnvEpisode`: one episode of one env, for an agent that is one coroutine for each env.
+"""`Agents`: what is asked of one env at a time; `EnvEpisode`: one episode, for one coroutine.
 
-Invariant: its env is idle at its end, even where the agent was cancelled during a step. So no
-result of it ever comes to a call that collects those of other envs.
+Invariant: the env is idle at the end of an episode, even where the agent was cancelled during a
+step. So no result of it ever comes to a call that collects those of other envs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextvars import Context
 from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio._core.group.api.facade import response_to
-from rlightning_aio._core.group.engine.agent_steps import AgentStep, EpisodeStart
+from rlightning_aio._core.group.engine.agent_steps import AgentStep, EpisodeStart, MethodCall
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio.errors import EpisodeLost
 
@@ -28,7 +28,7 @@ __all__ = ["Agents", "EnvEpisode"]
 
 
 class Agents:
-    """The agents of one group: `AgentSteps` on its event loop."""
+    """`AgentSteps` of one group, on its event loop."""
 
     def __init__(self, steps: AgentSteps, driver: AioDriver) -> None:
         self._steps = steps
@@ -36,18 +36,27 @@ class Agents:
         self._serving: asyncio.Task[None] | None = None
 
     def ask(
-        self, env_id: str, what: PolicyResponse | EpisodeStart
-    ) -> tuple[AgentStep, asyncio.Future[StepEnd]]:
-        """Have a step or a reset sent in the next turn of the loop; return it, and its outcome."""
+        self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall
+    ) -> tuple[AgentStep, asyncio.Future[Any]]:
+        """Have something sent in the next turn of the loop; return it, and its outcome."""
         self._driver.check_caller()
         loop = asyncio.get_running_loop()
-        reply: asyncio.Future[StepEnd] = loop.create_future()
+        reply: asyncio.Future[Any] = loop.create_future()
         step = AgentStep(env_id, what, reply)
         if self._steps.ask(step):
             serving = self._driver.run(self._steps.serve(time.monotonic()))
             self._serving = new_task(serving, loop, Context())  # In no agent's context.
             self._serving.add_done_callback(self._on_end)
         return step, reply
+
+    async def asked(self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
+        """Ask for something and return its outcome; cancelled, leave a result to the collector."""
+        step, reply = self.ask(env_id, what)
+        try:
+            return await outcome_of(reply)
+        except asyncio.CancelledError:
+            self._steps.leave(step)
+            raise
 
     def loss(self, env_id: str) -> Outcome | None:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
@@ -56,6 +65,29 @@ class Agents:
     def _on_end(self, task: asyncio.Task[None]) -> None:
         if task is self._serving and task.cancelled():
             self._steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
+
+
+async def outcome_of(reply: asyncio.Future[Any]) -> Any:
+    """Wait for a reply, and return it.
+
+    A cancellation arrives only where this waits. If the reply was there first, it is returned, and
+    the cancellation comes again where the task waits next.
+    """
+    try:
+        return await reply
+    except asyncio.CancelledError:
+        if reply.cancelled() or not reply.done():
+            raise
+        asyncio.get_running_loop().call_soon(_cancel_again, asyncio.current_task())
+        return reply.result()
+
+
+def _cancel_again(task: asyncio.Task[Any] | None) -> None:
+    if (
+        task is not None and task.cancelling()
+    ):  # Else whoever cancelled it has thought better of it.
+        task.uncancel()
+        task.cancel()
 
 
 class EnvEpisode:
@@ -88,7 +120,6 @@ class EnvEpisode:
         # Steps, the reset, and calls that were not answered, also of an agent that awaits them no
         # more: it was cancelled, or has left them to a task of its own.
         self._open_steps: list[AgentStep] = []
-        self._open_calls = set[object]()
 
     async def __aenter__(self) -> Self:
         try:
@@ -104,8 +135,7 @@ class EnvEpisode:
         for step in self._open_steps:
             if not step.is_outstanding:
                 step.reply.cancel()  # It will not be sent.
-        if self._open_calls or any(step.is_outstanding for step in self._open_steps):
-            self._open_calls.clear()
+        if any(step.is_outstanding for step in self._open_steps):
             abort: Any = self._group.abort([self.env.env_id])
             aborting = asyncio.ensure_future(abort)
             # However often this is cancelled, it continues, and the env is idle in the end.
@@ -113,11 +143,11 @@ class EnvEpisode:
             # Read, so that asyncio doesn't log an error that nobody asks for.
             _ = aborting.cancelled() or aborting.exception()
 
-    async def _asked(self, what: PolicyResponse | EpisodeStart) -> StepEnd:
+    async def _asked(self, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
         step, reply = self._agents.ask(self.env.env_id, what)
         self._open_steps.append(step)
         try:
-            return await reply
+            return await outcome_of(reply)
         except EpisodeLost as aborted:
             self._lose(aborted.outcome)
             raise
@@ -137,7 +167,8 @@ class EnvEpisode:
         """
         loss: BatchedData | None = None
         if self.lost is None:
-            ret, is_over, loss = await self._asked(response_to(self.env.env_id, response))
+            end: StepEnd = await self._asked(response_to(self.env.env_id, response))
+            ret, is_over, loss = end
             if loss is None:
                 self.last, self.is_over = ret, is_over
                 return ret
@@ -155,15 +186,7 @@ class EnvEpisode:
                 another episode.
         """
         if self.lost is None:
-            self._open_calls.add(call := object())
-            try:
-                value = await self.env.call(name, *args, **kwargs)
-            except Exception as error:
-                self._open_calls.discard(call)
-                if isinstance(error, EpisodeLost):  # It was aborted.
-                    self._lose(error.outcome)
-                raise
-            self._open_calls.discard(call)
+            value = await self._asked(MethodCall(name, args, kwargs))
             if (lost := self._agents.loss(self.env.env_id)) is None:
                 return value
             self._lose(lost)

@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.drivers.wait import (
     LONGEST_SECONDS,
-    Parked,
     Patient,
     forked_from,
     this_process,
@@ -272,10 +270,6 @@ class AioDriver:
             return
         loop = asyncio.get_running_loop()
         woken = loop.create_future()
-        if type(wait) is Parked:
-            wait.unpark = partial(_wake, woken)
-            await woken
-            return
         timer = None
         if type(wait) is Patient:
             if timeout is not None and self._nudge is None:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
 
@@ -14,13 +14,12 @@ from rlightning_aio._core.hosts.base import Driver
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Sized
+    from collections.abc import Callable, Sized
 
 __all__ = [
     "LONGEST_SECONDS",
     "TURN",
     "GroupDriver",
-    "Parked",
     "Patient",
     "Procedure",
     "Wait",
@@ -51,23 +50,6 @@ class Patient(Wait):
 
     An asynchronous group keeps one timer for all such waits.
     """
-
-
-def _nobody_waits() -> None:
-    """Do nothing."""
-
-
-@dataclass(slots=True, eq=False)
-class Parked(Wait):
-    """A request to block until `unpark` is called, whatever sources report.
-
-    Only asynchronous groups have calls that park, while another call waits for the sources.
-
-    Attributes:
-        unpark: ends the wait; set by the driver.
-    """
-
-    unpark: Callable[[], None] = _nobody_waits
 
 
 TURN: Final = Wait(0.0)

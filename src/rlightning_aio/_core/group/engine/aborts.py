@@ -78,7 +78,6 @@ class Aborts:
             requests.end(host_id, entry)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
-        self._waiting.wake_serving()  # It may have results of these that it has not handed out.
         chosen = set(slots.tolist())
         now = yield from self._waiting.until(now, lambda: len(requests.unwanted & chosen))
         return now

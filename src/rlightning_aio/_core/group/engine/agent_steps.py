@@ -1,6 +1,7 @@
-"""`AgentSteps`: the resets and steps of agents. An agent is a coroutine that plays one env.
+"""`AgentSteps`: what is asked of one env at a time, by agents, and by tasks that use handles.
 
-What agents ask for in one turn of the event loop is sent as one batch, and results that are ready
+An agent is a coroutine that plays one env: it resets and steps it, and calls its tools. What all
+ask for in one turn of the event loop is sent as one batch, and results that are ready
 together are handed out as one. One call waits for all of them, while any agent waits: a step costs
 a row of a batch, and no call of its own. Where hundreds of long steps are outstanding, which end
 one after another, results wait for a hundredth of a step's time, so that there are batches.
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.calls import Calls
     from rlightning_aio._core.group.engine.resets import Resets
     from rlightning_aio._core.group.engine.steps import Steps
     from rlightning_aio._core.group.engine.waiting import Waiting
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["AgentStep", "AgentSteps", "EpisodeStart", "StepEnd"]
+__all__ = ["AgentStep", "AgentSteps", "EpisodeStart", "MethodCall", "StepEnd"]
 
 _MANY: Final = 400
 """With this number of steps outstanding, several end in a hundredth of the time of one."""
@@ -57,7 +59,7 @@ class StepEnd(NamedTuple):
 
 
 class _Reply(Protocol):
-    """A future of an agent that waits for a `StepEnd`; done early if the agent is cancelled."""
+    """The future of a caller; done early if that is cancelled."""
 
     def done(self) -> bool: ...
 
@@ -75,13 +77,21 @@ class EpisodeStart(NamedTuple):
     options: dict[str, Any] | None
 
 
+class MethodCall(NamedTuple):
+    """A call of a method of an env, such as a tool."""
+
+    name: str
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+
+
 class AgentStep:
-    """A step or a reset that an agent has asked for.
+    """A step, a reset or a call that was asked for.
 
     Args:
         env_id: of its env.
-        what: the response that the env is stepped with, or what it is reset with.
-        reply: gets its `StepEnd`, or the error.
+        what: the response that the env is stepped with, what it is reset with, or the call.
+        reply: gets its `StepEnd`, the value of a call, or the error.
 
     Attributes:
         env_id, what, reply: as given.
@@ -90,7 +100,9 @@ class AgentStep:
 
     __slots__ = ("env_id", "is_outstanding", "reply", "what")
 
-    def __init__(self, env_id: str, what: PolicyResponse | EpisodeStart, reply: _Reply) -> None:
+    def __init__(
+        self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall, reply: _Reply
+    ) -> None:
         self.env_id = env_id
         self.what = what
         self.reply = reply
@@ -99,6 +111,8 @@ class AgentStep:
     @property
     def kind(self) -> object:
         """A key that steps share which can be sent as one batch."""
+        if isinstance(self.what, MethodCall):
+            return "call", self.what.name
         if not isinstance(self.what, EpisodeStart):
             return "step"
         seed, options = self.what
@@ -108,11 +122,14 @@ class AgentStep:
 class AgentSteps:
     """See the module; the arguments are the group's parts."""
 
-    def __init__(self, tables: Tables, steps: Steps, resets: Resets, waiting: Waiting) -> None:
+    def __init__(
+        self, tables: Tables, steps: Steps, resets: Resets, calls: Calls, waiting: Waiting
+    ) -> None:
         self._tables = tables
         self._requests = tables.requests
         self._steps = steps
         self._resets = resets
+        self._calls = calls
         self._waiting = waiting
         self._asked: list[AgentStep] = []
         # Those that are outstanding, by slot.
@@ -129,8 +146,15 @@ class AgentSteps:
             self._is_served = True
             return True
         if len(self._asked) == 1:
-            self._waiting.wake_serving()
+            self._waiting.wake()
         return False
+
+    def leave(self, step: AgentStep) -> None:
+        """Leave the result of a step or a reset to the collector, as its caller was cancelled."""
+        slot = self._tables.envs.find_one(step.env_id)
+        if self._sent.get(slot) is step:
+            self._ended(slot)
+            self._waiting.leave(slot)
 
     def loss(self, env_id: str) -> Outcome | None:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
@@ -207,6 +231,10 @@ class AgentSteps:
             if first.seed is not None:
                 seeds = [cast("EpisodeStart", step.what).seed for step in asked]
             return self._resets.prepared(now, seeds, first.options, env_ids)
+        if isinstance(first, MethodCall):
+            each = [cast("MethodCall", step.what) for step in asked]
+            calls = [(call.name, call.args, call.kwargs) for call in each]
+            return self._calls.prepared(now, env_ids, calls)
         slots, packed = self._steps.write(BatchedData(env_ids, [step.what for step in asked]), now)
         return slots, partial(self._steps.send, slots, packed, now)
 
@@ -218,6 +246,10 @@ class AgentSteps:
             if not (reply := self._ended(slot)).done():
                 reply.set_exception(fault)
         ticket.errors.clear()
+        for slot, value in ticket.values.items():
+            if not (reply := self._ended(slot)).done():
+                reply.set_result(value)
+        ticket.values.clear()
         slots = self._requests.settle_ended(ticket)
         if len(slots):
             batch, _ = self._steps.hand_out(slots)
@@ -238,7 +270,7 @@ class AgentSteps:
         return step.reply
 
     def fail(self, error: BaseException) -> None:
-        """Pass an error that has ended `serve` to all agents."""
+        """Pass an error that has ended `serve` to all who wait."""
         self._is_served = False
         steps = [*self._sent.values(), *self._asked]
         self._sent.clear()

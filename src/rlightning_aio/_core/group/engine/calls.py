@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -50,51 +49,64 @@ class Calls:
         return self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
-        send = partial(self._send_calls, now, slots, call)
-        ticket, _ = yield from self._waiting.ask(now, slots, send, call[0])
-        return values_of([ticket])
+        send = self._prepared(now, slots, call[0], [call] * len(slots))
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        return values_of(ticket)
 
-    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call, ticket: Ticket) -> None:
-        what = f"the arguments of {call[0]}()"
-        self.send(now, slots, Operation.CALL, [call] * len(slots), what, ticket)
+    def prepared(
+        self, now: float, env_ids: Sequence[str], calls: Sequence[Call]
+    ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
+        """Check a call of one method for each env; return the slots, and what sends the calls."""
+        slots = self._dispatch.distinct(env_ids)
+        return slots, self._prepared(now, slots, calls[0][0], calls)
 
-    def send(
+    def _prepared(
+        self, now: float, slots: NDArray[np.intp], name: str, calls: Sequence[Call]
+    ) -> Callable[[Ticket], None]:
+        return self.request(now, slots, Operation.CALL, name, calls, f"the arguments of {name}()")
+
+    def request(
         self,
         now: float,
         slots: NDArray[np.intp],
         op: Operation,
+        name: str,
         arguments: Sequence[Any],
         what: str,
-        ticket: Ticket,
-    ) -> None:
-        """Send requests that return a value.
+    ) -> Callable[[Ticket], None]:
+        """Check and pack requests that return a value; return what sends them for a ticket.
 
         Args:
             now: monotonic seconds.
             slots: of local envs.
             op: the operation.
+            name: of the method that is called, or of the operation.
             arguments: of the request to each slot.
             what: describes the arguments in messages.
-            ticket: of the call, with the name of the operation as its method.
         """
         self._intake.apply_completions()
-        self._dispatch.check_local(slots, f"call {ticket.method} of")
-        self._dispatch.check_sendable(now, slots, f"call {ticket.method} of")
+        self._dispatch.check_local(slots, f"call {name} of")
+        self._dispatch.check_sendable(now, slots, f"call {name} of")
         packed = [
             self._dispatch.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
-        entries = self._requests.issue(slots, op, ticket.owner, now)
-        self._dispatch.hand_over(slots, entries, packed)
+
+        def send(ticket: Ticket) -> None:
+            entries = self._requests.issue(slots, op, ticket.owner, now)
+            self._requests.methods.update(dict.fromkeys(slots.tolist(), name))
+            self._dispatch.hand_over(slots, entries, packed)
+
+        return send
 
 
-def values_of(tickets: Sequence[Ticket]) -> list[Any]:
-    """The values that calls returned, in order of sending.
+def values_of(ticket: Ticket) -> list[Any]:
+    """The values that calls returned, in the order of their slots.
 
     If calls failed, the first error is raised, with the rest as its `others`.
     """
-    faults = [fault for ticket in tickets for fault in ticket.faults]
-    if faults:
-        faults[0].others = tuple(faults[1:])
-        raise faults[0]
-    return [ticket.values[slot] for ticket in tickets for slot in ticket.slots.tolist()]
+    if ticket.faults:
+        fault, *others = ticket.faults
+        fault.others = tuple(others)
+        raise fault
+    return [ticket.values[slot] for slot in ticket.slots.tolist()]

@@ -75,7 +75,7 @@ class Core:
         self.calls = Calls(tables, dispatch, waiting)
         self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, results, waiting)
         self._resets = Resets(tables, supervisor, dispatch, results, waiting)
-        self.agent_steps = AgentSteps(tables, self.steps, self._resets, waiting)
+        self.agent_steps = AgentSteps(tables, self.steps, self._resets, self.calls, waiting)
         self._aborts = Aborts(tables, supervisor, results, waiting)
 
     # -- life -------------------------------------------------------------------------

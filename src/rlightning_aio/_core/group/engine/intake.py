@@ -156,9 +156,7 @@ class Intake:
         doing = Operation(op).name.lower()
         go_on = "reset the env to go on"
         if answers_with_value(op):
-            doing = (
-                f"the call of {self._requests.tickets.method(self._requests.owner.item(slot))}()"
-            )
+            doing = f"the call of {self._requests.methods[slot]}()"
             go_on = "the env is still usable"
         raised = env_raised(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import EnvState
-    from rlightning_aio.outcomes import Loss
 
 __all__ = ["Snapshots"]
 
@@ -68,19 +67,15 @@ class Snapshots:
         """See `EnvGroup.snapshot`."""
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         self._check_restorable(slots)
-        op, nothing = Operation.SNAPSHOT, [()] * len(slots)
         each: list[int] = slots.tolist()
-        positions: list[Position] = []
-        losses: list[Loss | None] = []
-
-        def send(ticket: Ticket) -> None:
-            self._calls.send(now, slots, op, nothing, "nothing", ticket)
-            # A worker that has replied may die before others reply.
-            positions.extend(self._episodes.positions(slots))
-            losses.extend(self._episodes.why_lost(slot) for slot in each)
-
-        ticket, _ = yield from self._waiting.ask(now, slots, send, "snapshot")
-        replies = zip(each, positions, losses, values_of([ticket]), strict=True)
+        send = self._calls.request(
+            now, slots, Operation.SNAPSHOT, "snapshot", [()] * len(slots), "nothing"
+        )
+        # A worker that has replied may die before others reply.
+        positions = self._episodes.positions(slots)
+        losses = [self._episodes.why_lost(slot) for slot in each]
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        replies = zip(each, positions, losses, values_of(ticket), strict=True)
         snapshots: list[EnvSnapshot] = []
         for slot, position, loss, reply in replies:
             versions, state = cast("EnvState", reply)

@@ -1,12 +1,8 @@
 """`Waiting`: lets concurrent calls of a group wait for replies; and `Poller`, which finds them.
 
 Each call is a procedure that takes turns here until its replies are ready. The bell of the workers
-is armed for the call that waits for the fewest results, however long the other envs take.
-
-Where tasks share a group, one of the calls with a ticket *leads*: it is woken by whatever happens,
-reads the replies for all, and looks after the hosts. Each of the others is *parked*: it is woken by
-replies to its own requests, and to lead when the leader has what it waited for. So a reply wakes
-two calls, however many wait.
+is armed for the call that waits for the fewest results, however long the other envs take. What is
+read wakes all of them, so many envs that are asked one by one share one call (see `AgentSteps`).
 """
 
 from __future__ import annotations
@@ -17,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.wait import TURN, Parked, Procedure, Wait, earliest
+from rlightning_aio._core.group.drivers.wait import TURN, Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import OF_HOSTS
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, SelfStarting
@@ -59,7 +55,6 @@ class Waiting:
         self, tables: Tables, supervisor: Supervisor, poller: Poller, intake: Intake
     ) -> None:
         self._requests = tables.requests
-        self._tickets = tables.requests.tickets
         self._conditions = tables.conditions
         self._supervisor = supervisor
         self._poller = poller
@@ -69,8 +64,6 @@ class Waiting:
         self._driver = tables.driver
         # Then inline envs are executed in one turn each.
         self._shares_thread = tables.shares_thread
-        # Of the ticket whose call leads; 0 if none does.
-        self._leader = 0
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None
         self.wanted: dict[int, int] = {}
@@ -102,11 +95,7 @@ class Waiting:
 
         Needed after requests that the armed bell doesn't count, and when the number to arm changes.
         """
-        tickets = self._tickets
-        while tickets.replied:
-            if wait := tickets.parked.pop(tickets.replied.pop(), None):
-                wait.unpark()
-        if self.wanted:
+        if self.wanted or self._served is not None:
             self._driver.wake()
 
     def check_now(self) -> Procedure[float]:
@@ -160,7 +149,7 @@ class Waiting:
                     if not is_due:
                         supervisor.look_by = now + LOOK_SECONDS
                         is_due = self._conditions.unusual & OF_HOSTS != 0
-        finally:  # As `_want`, without a call.
+        finally:
             if (calls := self.wanted.pop(wanted)) > 1:
                 self.wanted[wanted] = calls - 1
             elif not self.wanted:
@@ -195,7 +184,7 @@ class Waiting:
     def _since_alone(self, owner: int, records: Sequence[HostRecord], now: float) -> float | None:
         """Return since when a call waits for nothing but held requests; None if it doesn't."""
         if owner > 0:
-            ticket = self._tickets.waiting[owner]
+            ticket = self._requests.tickets.waiting[owner]
             if ticket.apart:  # Each request is a call of its own.
                 sent: list[int] = [self._requests.sent_ns.item(r.slots.start) for r in records]
                 return min(sent) / 1e9
@@ -217,41 +206,8 @@ class Waiting:
             self.poll()
         return now
 
-    def _want(self, wanted: int, calls: int) -> None:
-        """Note that more or fewer calls want so many results."""
-        calls += self.wanted.pop(wanted, 0)
-        if calls:
-            self.wanted[wanted] = calls
-        elif not self.wanted:
-            self._bell.disarm()
-
-    def _park(self, ticket: Ticket, wanted: int) -> Procedure[float]:
-        """Wait for replies to a ticket, or to lead; return the time after that."""
-        parked = self._tickets.parked
-        self._want(wanted, 1)
-        try:
-            if self._poller.arm(min(self.wanted)):
-                return (yield TURN)
-            parked[ticket.owner] = wait = Parked()
-            now = yield wait
-        finally:
-            parked.pop(ticket.owner, None)
-            self._want(wanted, -1)
-        if self._leader == ticket.owner:
-            self.check(now)  # The group may have been closed.
-        return now
-
-    def _hand_on(self) -> None:
-        """Let a parked call lead."""
-        self._leader, wait = self._tickets.parked.popitem()
-        wait.unpark()
-
     def ask(
-        self,
-        now: float,
-        slots: NDArray[np.intp],
-        send: Callable[[Ticket], object],
-        method: str = "",
+        self, now: float, slots: NDArray[np.intp], send: Callable[[Ticket], object]
     ) -> Procedure[tuple[Ticket, float]]:
         """Send requests, and wait for all replies; return them in their ticket, and the time.
 
@@ -261,21 +217,18 @@ class Waiting:
             now: monotonic seconds.
             slots: whose requests.
             send: sends all of them for the ticket that it gets, or raises before the first.
-            method: see `Tickets.open`.
         """
-        ticket = self._requests.tickets.open(slots, method=method)
+        ticket = self._requests.tickets.open(slots)
         try:
             send(ticket)
             if self._supervisor.places.any:
                 self.poll()  # A client may turn out to be gone as it is asked.
             while ticket.remaining > 0:
-                now = yield from self._next(ticket, ticket.remaining)
+                now = yield from self.turn(ticket.remaining, None)
                 self.poll()
         except BaseException:
             self._give_up(ticket)
             raise
-        finally:
-            self._leave(ticket)
         self._requests.settle(ticket)
         return ticket, now
 
@@ -294,7 +247,7 @@ class Waiting:
         try:
             while (wait := work(ticket, now)) is not None:
                 if wait is REPLIES:
-                    now = yield from self._next(ticket, 1)
+                    now = yield from self.turn(1, None)
                 else:
                     now = yield wait
                     if now >= self._supervisor.look_by:
@@ -305,31 +258,12 @@ class Waiting:
             raise
         finally:
             self._served = None
-            self._leave(ticket)
         self._requests.settle(ticket)
 
-    def wake_serving(self) -> None:
-        """Let the call of `serve` work in the next turn."""
-        if self._served is None:
-            return  # It has not begun.
-        if wait := self._tickets.parked.pop(self._served.owner, None):
-            wait.unpark()
-        else:
-            self._driver.wake()
-
-    def _next(self, ticket: Ticket, wanted: int) -> Procedure[float]:
-        """Return the wait for `wanted` replies to a ticket, once, as the leader or not."""
-        if self._leader in (0, ticket.owner) or not self._shares_thread:
-            self._leader = ticket.owner
-            return self.turn(wanted, None)
-        return self._park(ticket, wanted)
-
-    def _leave(self, ticket: Ticket) -> None:
-        """End the wait of a call, which no longer leads."""
-        if self._leader == ticket.owner:
-            self._leader = 0
-            if self._tickets.parked:
-                self._hand_on()
+    def leave(self, slot: int) -> None:
+        """Give up one request of the call of `serve`, for which nobody waits any more."""
+        if self._served is not None:
+            self._give_up(self._requests.split(self._served, slot))
 
     def _give_up(self, ticket: Ticket) -> None:
         """Close a ticket whose call no longer waits; what is held for clients is never sent."""

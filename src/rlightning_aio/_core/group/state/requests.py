@@ -23,12 +23,17 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, S
 from rlightning_aio._core.group.state.uncollected import UncollectedErrors
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.protocol import exchange, kernel
-from rlightning_aio.protocol.entries import OP_BITS_ARRAY, SLOT_MASK_ARRAY, Operation, slot_of
+from rlightning_aio.protocol.entries import (
+    ANSWERS_WITH_VALUE,
+    OP_BITS_ARRAY,
+    SLOT_MASK_ARRAY,
+    Operation,
+    slot_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rlightning_aio._core.group.drivers.wait import Parked
     from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["CollectorQueue", "Requests", "Ticket", "Tickets"]
@@ -45,7 +50,6 @@ class Ticket(msgspec.Struct):
     Attributes:
         slots: whose requests; of a ticket that is `apart`, only once it is given up.
         remaining: number of its requests that have not ended.
-        method: name of the method that it calls; empty for steps and resets.
         apart: each of its requests is somebody else's, and has an error of its own. It stays open
             while requests come and go.
         ended: slots of an `apart` ticket whose results and errors are to be taken.
@@ -56,7 +60,6 @@ class Ticket(msgspec.Struct):
     owner: int
     slots: NDArray[np.intp]
     remaining: int
-    method: str
     apart: bool = False
     ended: list[NDArray[np.intp]] = []
     errors: dict[int, EnvFault] = {}
@@ -69,18 +72,13 @@ class Ticket(msgspec.Struct):
         return self.slots[owner[self.slots] == self.owner]
 
     @property
-    def calls(self) -> bool:
-        """True if the requests are calls of a method."""
-        return bool(self.method)
-
-    @property
     def faults(self) -> list[EnvFault]:
         """The errors, each once."""
         return list(dict.fromkeys(self.errors.values()))
 
-    def failures(self) -> list[tuple[EnvFault, NDArray[np.intp]]]:
-        """Return each error, with its own slots; those of aborted requests are not its own."""
-        own = set(self.slots.tolist())
+    def failures(self, slots: NDArray[np.intp]) -> list[tuple[EnvFault, NDArray[np.intp]]]:
+        """Return each error of `slots`, with those that it is of."""
+        own = set(slots.tolist())
         slots_of = {
             fault: [slot for slot in self.errors if slot in own and self.errors[slot] is fault]
             for fault in self.faults
@@ -93,25 +91,20 @@ class Tickets:
 
     Attributes:
         waiting: by owner.
-        parked: the waits of those that are woken only by replies of their own; by owner.
-        replied: owners of parked calls that are to be woken.
     """
 
     def __init__(self) -> None:
         self.waiting: dict[int, Ticket] = {}
-        self.parked: dict[int, Parked] = {}
-        self.replied: list[int] = []
         self._next_owner = 1
 
-    def open(self, slots: NDArray[np.intp], *, method: str = "", apart: bool = False) -> Ticket:
+    def open(self, slots: NDArray[np.intp], *, apart: bool = False) -> Ticket:
         """Open a ticket for a call whose requests are about to be issued.
 
         Args:
             slots: whose requests.
-            method: of the envs that is called; empty for steps and resets.
             apart: as of `Ticket`.
         """
-        ticket = Ticket(self._next_owner, slots, len(slots), method, apart)
+        ticket = Ticket(self._next_owner, slots, len(slots), apart)
         self._next_owner += 1
         self.waiting[ticket.owner] = ticket
         return ticket
@@ -120,8 +113,6 @@ class Tickets:
         """Note that requests of a call have ended; return its ticket."""
         ticket = self.waiting[owner]
         ticket.remaining -= count
-        if owner in self.parked:
-            self.replied.append(owner)
         return ticket
 
     def forget(self, owner: int, slots: NDArray[np.intp]) -> None:
@@ -129,11 +120,6 @@ class Tickets:
         ticket = self.waiting[owner]
         ticket.remaining -= len(slots)
         ticket.slots = ticket.slots[~np.isin(ticket.slots, slots)]
-
-    def method(self, owner: int) -> str:
-        """Return the method that the call `owner` calls, or an empty string."""
-        ticket = self.waiting.get(owner)
-        return "" if ticket is None else ticket.method
 
 
 class CollectorQueue(UncollectedErrors):
@@ -191,6 +177,7 @@ class Requests:
         numbering: of each slot's current request; tickets: calls that wait; collector: its queue.
         state: `State`; owner: of the current request.
         sent_ns: when it was sent.
+        methods: by slot, the name of the method that was called last.
         in_flight: requests of each host that are not answered; the only count of them.
         rings: of each host, if it is a live worker of this machine; kept up by the hosts.
         in_rings: all hosts had rings when the group started.
@@ -212,6 +199,7 @@ class Requests:
         self.unwanted: set[int] = set()
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
+        self.methods: dict[int, str] = {}
         self.in_flight = [0] * num_hosts
         self.rings: list[exchange.Ring | None] = [None] * num_hosts
         self.in_rings = False
@@ -416,7 +404,7 @@ class Requests:
             collector.num_ready += len(slots)
             collector.num_awaited -= len(slots)
         elif len(tickets) == 1 and not collector.num_awaited:
-            (ticket,) = tickets.values()  # It isn't parked: no other call is there.
+            (ticket,) = tickets.values()
             ticket.remaining -= len(slots)
             if ticket.apart:
                 ticket.ended.append(slots)
@@ -432,7 +420,10 @@ class Requests:
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
         self.anything_ended = True
-        self.tickets.note_ended(int(self.owner[slot]), 1).values[slot] = value
+        ticket = self.tickets.note_ended(int(self.owner[slot]), 1)
+        ticket.values[slot] = value
+        if ticket.apart:
+            ticket.ended.append(self.alone(slot))
         self.state[slot] = _SPENT_CODE
 
     def owners(self, slots: NDArray[np.intp]) -> list[tuple[int, NDArray[np.intp]]]:
@@ -489,7 +480,7 @@ class Requests:
         """Close a ticket that has all replies: results may be returned, the rest is idle."""
         del self.tickets.waiting[ticket.owner]
         self.owner[ticket.slots] = COLLECTOR
-        if ticket.method or ticket.errors:
+        if ticket.values or ticket.errors:
             self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
 
     def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
@@ -503,18 +494,33 @@ class Requests:
         self._forget(ended[states == _SPENT_CODE])
         return ended[states == _READY_CODE]
 
+    def split(self, ticket: Ticket, slot: int) -> Ticket:
+        """Move the request of one slot out of a ticket that is `apart`, into one of its own."""
+        slots = self.alone(slot)
+        own = self.tickets.open(slots)
+        self.owner[slots] = own.owner
+        ticket.remaining -= int(self.state[slot] == _BUSY_CODE)
+        ticket.ended = [kept for one in ticket.ended if len(kept := one[one != slot])]
+        for found, its in ((ticket.errors, own.errors), (ticket.values, own.values)):
+            if slot in found:
+                its[slot] = found.pop(slot)
+        return own
+
     def give_up(self, ticket: Ticket) -> None:
-        """Close a ticket that no longer waits: its steps and resets go to the collector."""
+        """Close a ticket that no longer waits: its steps and resets go to the collector.
+
+        Values of methods are for nobody else.
+        """
         slots = ticket.slots = ticket.own_slots(self.owner)
+        calls = ANSWERS_WITH_VALUE[self.numbering.ops(slots)]
         self.settle(ticket)
-        if ticket.calls:
-            owed = self.owed(slots)
-            self.owner[owed] = NOBODY
-            self.unwanted.update(owed.tolist())
-            return
+        called = self.owed(slots[calls])
+        self.owner[called] = NOBODY
+        self.unwanted.update(called.tolist())
+        slots = slots[~calls]
         ready = self.ready(slots)
         self.collector.num_awaited += len(self.owed(slots)) + len(ready)
-        for fault, its in ticket.failures():
+        for fault, its in ticket.failures(slots):
             self.collector.keep(its, fault)
         if len(ready):
             self.collector.append(ready)

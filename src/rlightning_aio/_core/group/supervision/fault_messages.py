@@ -117,10 +117,10 @@ def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
 
 
 def _doing(requests: Requests, slot: int) -> str:
-    op, method = requests.numbering.op(slot), requests.tickets.method(requests.owner.item(slot))
+    op = requests.numbering.op(slot)
     if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
         return f"a {Operation(op).name.lower()}"
-    return f"a call of {method}()" if method else "a call"
+    return f"a call of {requests.methods[slot]}()" if slot in requests.methods else "a call"
 
 
 def without_terminal(error: ErrorText, record: HostRecord) -> str:
