@@ -8,7 +8,7 @@ import multiprocessing
 import warnings
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -52,8 +52,6 @@ if TYPE_CHECKING:
 __all__ = ["VectorEnv", "per_worker"]
 
 T = TypeVar("T")
-_PATIENCE: Final = 1e6
-"""Seconds that `reset` waits for what an interrupted call has left: time limits end it before."""
 
 
 class _ResetNeeded(ResetNeeded, GymnasiumResetNeeded):
@@ -241,7 +239,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Wait until nothing is in flight, and drop it with its errors."""
         if not self._is_whole:
             with suppress(EnvFault):
-                self.group.drain(deadline=_PATIENCE)
+                self.group.drain()
 
     def _begun(self, batch: BatchedData, mask: NDArray[np.bool_] | None) -> tuple[Any, Any]:
         """Return the results of resets of all envs, or of those of a mask."""
