@@ -51,12 +51,7 @@ class Seen:
             if kind == "thread_name"
         }
         self.slices = [self._slice(event) for event in events if event["ph"] == "X"]
-        self.marks = [
-            (event["name"], *self._place[event["pid"], event["tid"]], event.get("args", {}))
-            for event in events
-            if event["ph"] == "i"
-        ]
-        assert {event["ph"] for event in events} <= set("MXi")
+        assert {event["ph"] for event in events} <= set("MX")
         self._check_nested()
         self._check_requests()
 

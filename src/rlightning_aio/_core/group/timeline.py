@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.core import Core
-    from rlightning_aio._core.group.state.conditions import Fate
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio.batch.columns import ResultColumns
 
@@ -39,7 +38,6 @@ __all__ = ["KEPT", "Trace"]
 
 KEPT: Final = 1 << 18
 """The number of results that are kept, and of slices of the trainer."""
-_MARKS: Final = 10_000
 _TRAINER: Final = 1
 """Number of the trainer among the processes; those of hosts follow."""
 
@@ -50,16 +48,6 @@ class _Slice(NamedTuple):
     name: str
     began: int
     ended: int
-
-
-class _Mark(NamedTuple):
-    """What has happened to a host, or to an env if `slot` is not -1."""
-
-    name: str
-    at: int
-    host_id: int
-    slot: int
-    cause: str
 
 
 class _Results:
@@ -115,7 +103,6 @@ class Trace(Scope):
         self._pid = os.getpid()
         self._results = _Results()
         self._slices: deque[_Slice] = deque(maxlen=KEPT)
-        self._marks: deque[_Mark] = deque(maxlen=_MARKS)
         # Requests without a result: entry, beginning in the env, and end.
         self._unfinished: list[tuple[int, int, int]] = []
         self._began = time.monotonic_ns()
@@ -137,7 +124,7 @@ class Trace(Scope):
         if self._core.lifetime.open:
             self._note_unreturned()
         write_file(self._path, _document(self._events()))
-        del self._results, self._marks, self._unfinished
+        del self._results, self._unfinished
 
     def _enter(self) -> None:
         self.start()
@@ -167,11 +154,8 @@ class Trace(Scope):
             columns = requests.numbering.entry[slots], requests.sent_ns[slots]
             self._results.add(*columns, times[:, 0], times[:, 1], size=len(slots))
 
-    def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:
-        now = time.monotonic_ns()
-        self._marks.append(_Mark(fate, now, host_id, slot, cause))
-        if fate == "hung":
-            self._note_unfinished(self._core.supervisor.records[host_id], now)
+    def note_hang(self, record: HostRecord) -> None:
+        self._note_unfinished(record, time.monotonic_ns())
 
     def _note_unreturned(self) -> None:
         """Note the results that no call has returned, and the requests that envs execute."""
@@ -228,11 +212,6 @@ class Trace(Scope):
                 yield self._request(entry, places, began, max(done, began), "")
         for entry, began, ended in self._unfinished:
             yield self._request(entry, places, max(began, since), ended, ", unfinished")
-        for mark in self._marks:
-            slot = mark.slot if mark.slot >= 0 else hosts.index(mark.host_id)
-            event = {"name": mark.name, "ph": "i", "s": "t" if mark.slot >= 0 else "p"}
-            event |= {"ts": (mark.at - self._began) / 1e3, "args": {"cause": mark.cause}}
-            yield event | places[slot]
 
     def _of_trainer(self, since: int, first_track: int) -> Iterator[dict[str, Any]]:
         rows = 0

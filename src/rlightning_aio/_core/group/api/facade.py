@@ -382,7 +382,7 @@ class Facade:
 
         Use ``with group.trace("run.json"):`` (or ``async with``), or `Trace.start` and
         `Trace.stop`. The timeline shows steps and resets of each env with the numbers of their
-        requests, the calls of the trainer, hangs and deaths: see docs/metrics.md. `span` adds other
+        requests, and the calls of the trainer: see docs/metrics.md. `span` adds other
         work of the trainer.
 
         Args:

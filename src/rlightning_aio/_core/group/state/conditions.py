@@ -8,13 +8,14 @@ The component that knows of a condition sets it and clears it; while any is set,
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Protocol
 
 from rlightning_aio.errors import GroupClosed
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio.batch.columns import ResultColumns
 
 __all__ = [
@@ -28,7 +29,6 @@ __all__ = [
     "OF_HOSTS",
     "UNLIKE_ENVS",
     "Conditions",
-    "Fate",
     "Lifetime",
     "Observed",
     "Observer",
@@ -105,8 +105,6 @@ class Lifetime:
 
 NO_SPAN: Final = contextlib.nullcontext()
 """The span of other work while no observer is attached."""
-Fate: TypeAlias = Literal["hung", "raised", "rebuilt", "died", "given up", "up"]
-"""What may happen to a host after its first start, or to one of its envs."""
 
 
 class Observer(Protocol):
@@ -120,8 +118,8 @@ class Observer(Protocol):
         """Record that results are returned as `parts`."""
         ...
 
-    def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:
-        """Record what happened to a host; `slot` is the env concerned, or -1."""
+    def note_hang(self, record: HostRecord) -> None:
+        """Record that a worker is killed, as what it executes takes too long."""
         ...
 
 
@@ -138,11 +136,6 @@ class Observed:
     def attach(self, observer: Observer | None) -> None:
         """Report events to `observer` from now on; None detaches the current one."""
         self.observer = observer
-
-    def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:
-        """Report what happened to a host; see `Observer.note_fate`."""
-        if self.observer is not None:
-            self.observer.note_fate(fate, host_id, slot, cause)
 
     @contextlib.contextmanager
     def call(self, name: str, began: float) -> Generator[None]:

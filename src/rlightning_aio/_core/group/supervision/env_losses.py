@@ -15,7 +15,6 @@ from rlightning_aio.protocol.entries import Operation
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio._core.group.state.conditions import Fate
     from rlightning_aio._core.group.supervision.fault_messages import CrashLog
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import ErrorText
@@ -66,7 +65,7 @@ class EnvLosses:
             return False
         doing = Operation(tables.requests.numbering.op(slot)).name.lower()
         message = f"{tables.envs.describe(slot)} raised in {doing}: {error.summary}; {then}"
-        self._note_restart(slot, message, "raised", error.summary, error.traceback)
+        self._note_restart(slot, message, error.traceback)
         return True
 
     def count_env(self, slot: int, why: Loss, message: str) -> tuple[bool, EnvFault]:
@@ -80,8 +79,7 @@ class EnvLosses:
         record = self._tables.record_of(slot)
         is_borne, then = record.restart_policy.count(self._counted(slot), pauses=False)
         if is_borne:
-            fate: Fate = "hung" if why.kind == "env_hung" else "rebuilt"
-            self._note_restart(slot, f"{message}; {then}", fate, why.cause)
+            self._note_restart(slot, f"{message}; {then}")
         elif not record.restart_policy.raises:
             then += ", so this request ends here; the next one tries again"
         env_id = self._tables.envs.env_ids[slot]
@@ -101,10 +99,7 @@ class EnvLosses:
         self._on_count()
         return deaths[slot]
 
-    def _note_restart(
-        self, slot: int, message: str, fate: Fate, cause: str, traceback: str = ""
-    ) -> None:
+    def _note_restart(self, slot: int, message: str, traceback: str = "") -> None:
         record = self._tables.record_of(slot)
         record.restarts += 1
         self._crash_log.note(record.config.name, message, traceback)
-        self._tables.observed.note_fate(fate, record.host.host_id, slot, cause)

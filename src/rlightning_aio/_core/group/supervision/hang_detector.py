@@ -143,8 +143,8 @@ class HangDetector:
         record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
         record.culprit = culprit_of(record, (entry,), self._requests, busy)
-        if record.culprit is not None:
-            self._tables.observed.note_fate("hung", record.host.host_id, record.culprit, "")
+        if (observer := self._tables.observed.observer) is not None:
+            observer.note_hang(record)
         self.kill(record, dump=True)
         return math.inf
 

@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.state.conditions import Fate
     from rlightning_aio._core.group.state.host_record import HostLoss
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
@@ -276,8 +275,6 @@ class Supervisor:
         if 0 in record.deaths.values():
             record.deaths = {slot: count for slot, count in record.deaths.items() if count}
             self._update_any_deaths()
-        if self._lifetime.open:
-            self._tables.observed.note_fate("up", record.host.host_id, -1, "")
         held, record.held = record.held, []
         for entries, arguments in held:
             record.host.submit(entries, arguments)
@@ -431,7 +428,6 @@ class Supervisor:
                             "max_episode_steps": self._envs.step_limits.item(other) or None,
                         }
                     )
-        self._tables.observed.note_fate("up", taken.host_id, -1, "")
         self._update_any_deaths()
         return self.places.release(record)
 
@@ -479,8 +475,6 @@ class Supervisor:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
         loss = host_loss(self._envs, requests, record, death, owed, then, replaced=replaced)
-        fate: Fate = "died" if replaced else "given up"
-        self._tables.observed.note_fate(fate, loss.host_id, -1, death.cause)
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:
