@@ -6,8 +6,9 @@ import asyncio
 import os
 import signal
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import uvloop
@@ -16,7 +17,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.errors import GroupClosed, RLightningError
+from rlightning_aio.errors import EnvBusy, GroupClosed, RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -246,3 +247,52 @@ def test_an_error_that_was_not_raised_yet_does_not_prevent_closing(times: int) -
         del link.on_readable
 
     asyncio.run(asyncio.wait_for(main(), HANG))
+
+
+class Endless:
+    """An awaitable env whose steps end when a test wants it."""
+
+    action_space = gym.spaces.Discrete(2)
+    goes_on: ClassVar[asyncio.Event]
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return "begun", {}
+
+    async def step(self, action: Any) -> Any:
+        await self.goes_on.wait()
+        return "stepped", 0.0, False, False, {}
+
+
+async def test_who_waits_for_a_busy_env_is_named() -> None:
+    """The way out of an interrupted cell of IPython, whose task lives on."""
+    Endless.goes_on = asyncio.Event()
+    async with rlightning_aio.build_env_group(
+        Endless, name="e", num_workers=1, placement="loop"
+    ) as group:
+        batch, _ = await group.reset()
+
+        async def cell() -> None:
+            await group.step(batch.respond(action=[0]))
+
+        task = asyncio.create_task(cell(), name="Cell-7")
+        await asyncio.sleep(0)
+        assert group.pending
+        for call in (group.reset, group.snapshot, lambda: group.step(batch.respond(action=[1]))):
+            with pytest.raises(EnvBusy, match=r"'Cell-7' \(.*test_ownership.py:\d+\).*cancelled"):
+                await call()
+        (found,) = [one for one in asyncio.all_tasks() if one.get_name() == "Cell-7"]
+        found.cancel()
+        await asyncio.wait([task])
+        Endless.goes_on.set()
+        assert (await group.reset())[0].observation == ["begun"]
+
+        Endless.goes_on.clear()
+        group.step_async(batch.respond(action=[0]))
+        task = asyncio.create_task(group.collect_async(), name="Cell-8")
+        await asyncio.sleep(0)
+        with pytest.raises(RLightningError, match="'Cell-8'"):
+            await group.collect_async()
+        with pytest.raises(EnvBusy, match=r"'Cell-8'.*drain"):
+            await group.reset()
+        Endless.goes_on.set()
+        assert (await task)[0].observation == ["stepped"]

@@ -85,6 +85,10 @@ class Driver(Protocol):
         """Call a function that runs an env; Ctrl-C may interrupt it."""
         ...
 
+    def others(self) -> str:
+        """Return a clause on the tasks that wait in other calls of the group, if there are any."""
+        ...
+
 
 class Host(Protocol):
     """Envs in one place, with indices from 0.

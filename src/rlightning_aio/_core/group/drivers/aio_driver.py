@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rlightning_aio._core.group.drivers.wait import (
     LONGEST_SECONDS,
@@ -133,6 +133,26 @@ class AioDriver:
         return RLightningError(
             f"this group belongs to the event loop that initialised it ({ours!r}), which {state}; "
             f"{do}; nothing was sent"
+        )
+
+    def others(self) -> str:
+        """Name the tasks that wait in other calls, and where they do: only errors ask for them."""
+        loop, found = self._loop, list[str]()
+        for task in asyncio.all_tasks(loop) if loop is not None and loop.is_running() else ():
+            where, step = "", task.get_coro()
+            while (frame := getattr(step, "cr_frame", None)) is not None:
+                if frame.f_code is _RUN and frame.f_locals.get("self") is self:
+                    if task is not asyncio.current_task():
+                        found.append(f"task {task.get_name()!r} ({where})")
+                    break
+                if not frame.f_globals.get("__name__", "").startswith("rlightning_aio."):
+                    where = f"{frame.f_code.co_filename}:{frame.f_lineno}"
+                step = getattr(step, "cr_await", None)
+        if not found:
+            return ""
+        return (
+            f"; it waits in {' and '.join(found)}, which asyncio.all_tasks() has, to be awaited or "
+            "cancelled"
         )
 
     # -- sources ------------------------------------------------------------------
@@ -284,3 +304,7 @@ class AioDriver:
                 self._waiting.remove(woken)
             if timer is not None:
                 timer.cancel()
+
+
+_RUN: Final = AioDriver.run.__code__
+"""The frames of calls that wait."""

@@ -208,6 +208,9 @@ class SyncDriver:
         finally:
             self._is_interruptible = before
 
+    def others(self) -> str:
+        return ""
+
     # -- waiting ----------------------------------------------------------------------
 
     def _block(self, until: float | None) -> None:

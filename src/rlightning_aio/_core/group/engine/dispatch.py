@@ -82,10 +82,11 @@ class Dispatch:
             State.SPENT: "its last request ended in an error that was not collected",
         }[State(state)]
         if owner == COLLECTOR:
-            return f"{why}; collect it first, with collect_async(), or end it with abort()"
+            others = self._driver.others()
+            return f"{why}{others}; collect it first, with collect_async(), or end it with drain()"
         if state != State.BUSY:
             why = "the call that asked it has not returned yet"
-        return f"{why}; wait for that call first"
+        return f"{why}{self._driver.others()}; wait for that call first"
 
     def _end_call(self, now: float, slot: int) -> bool:
         """Note the end of a request of nobody that has ended since the group last waited.

@@ -85,7 +85,8 @@ class Snapshots:
                 if loss is not None:
                     why_not = f"has lost its episode ({loss.cause})"
                 raise SnapshotError(
-                    f"env {env_id!r} {why_not}: reset it before its snapshot is taken"
+                    f"env {env_id!r} {why_not}: reset it before its snapshot is taken. What is in "
+                    "flight keeps its episode if drain() ends it, and not abort()"
                 )
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot])
             snapshots.append(EnvSnapshot(env_id, identity, versions, *position, state))
