@@ -14,8 +14,8 @@ ISAAC := .venv-isaac
 RLLIB := .venv-rllib
 # OpenEnv runs in processes of its own, and brings a hundred packages that nothing else here needs.
 OPENENV := .venv-openenv
-# MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce. The two projects of
-# policy servers pin far more than the code that their tests use, so they come alone.
+# MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce. openpi-client pins
+# far more than the code that its tests use, so it comes alone.
 ROBOTS := .venv-robots
 # LeRobot needs Python 3.12, for which PyTorch comes with gigabytes of CUDA.
 LEROBOT := .venv-lerobot

@@ -7,7 +7,6 @@ import math
 import os
 import subprocess
 import threading
-import time
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -166,15 +165,6 @@ class Talkative(Stub):
 
     def close(self) -> None:
         print("closed")  # noqa: T201
-
-
-@rl.ENVS.register("stub_waiting")
-class Waiting(Stub):
-    """Sleeps in each step, as an env does that waits for hardware."""
-
-    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        time.sleep(0.02)
-        return super().step(policy_resp)
 
 
 @rl.ENVS.register("finishing")

@@ -307,7 +307,7 @@ def test_the_reply_to_an_aborted_request_is_dropped(owner: Owner) -> None:
     assert table.in_flight == [0, 0]
 
 
-# -- the debug mode
+# -- every transition is checked
 
 
 def test_a_late_reply_has_no_effect() -> None:

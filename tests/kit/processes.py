@@ -21,13 +21,6 @@ def pid_of(group: Driven, env_id: str) -> int:
     return group.call(env_id, "returns", os.getpid)
 
 
-def kill_first_worker(group: Any) -> None:
-    """Kill it, as soon as its fork server has said which process a replacement is."""
-    while (pid := group.get_workers()[0]["pid"]) is None:
-        pass
-    kill(pid)
-
-
 def kill(pid: int) -> None:
     """Kill a process; return when it is dead."""
     descriptor = os.pidfd_open(pid)

@@ -1,7 +1,7 @@
 """Reached or not: what the programs made happen, of what can happen.
 
-These are the transitions of the tables `LEGAL` (of requests, as the debug mode checks them, and of
-losses of episodes), the classes of errors, the rows of docs/faults.md, and the operations.
+These are the transitions of the tables `LEGAL` (of requests and of losses of
+episodes), the classes of errors, the rows of docs/faults.md, and the operations.
 """
 
 from __future__ import annotations

@@ -25,7 +25,6 @@ from simulator.scripted import (
     Scripts,
     Words,
     blame_of,
-    decoded,
     element,
     slow_seconds,
     words_of,
@@ -975,10 +974,3 @@ def check_infos(columns: dict[str, Any], infos: Sequence[dict[str, Any]]) -> Non
             continue
         for k, info in enumerate(infos):
             require(not there[k] or same(columns[key][k], info[key]), "another info", key)
-
-
-def acts_of(entry: Entry, action: Any) -> list[Act]:
-    """What an action has the sub-environments of an env do."""
-    if entry.form != "stacked":
-        return [decoded(entry.controls, action)]
-    return [decoded(entry.controls, element(action, k)) for k in range(entry.num_envs)]

@@ -427,10 +427,6 @@ class World:
         self.note("Ctrl-C comes again")
         self.counts["interrupts again"] += 1
 
-    def interrupt_at(self, seconds: float) -> None:
-        """Press Ctrl-C after some seconds."""
-        self.after(seconds, self.interrupt)
-
     def add(self, process: Process) -> None:
         """Keep a process until the end."""
         self._processes.append(process)

@@ -56,7 +56,6 @@ REFUSED_NAMES = {
     "slot": "seat|place_of_env",
     "completion": "tell|told|tell_of|untold|unheard",
     "exit": "bury|buried",
-    "checkpoint": "standings?",
     "shown_result": "[sS]hown|came",
     "authenticator": "[gG]ate|[dD]oor",
 }

@@ -3,7 +3,7 @@
 A pure table over slots, the positions of envs in their group. It knows hosts by number only, no
 time and no I/O. An env has one request at a time. Each request ends once, in a result, a value, an
 error or a withdrawal, and goes to the call that waits for it, or else to `collect`. `LEGAL` lists
-every transition: tests are generated from it, and the debug mode (`checked`) executes it.
+every transition: tests are generated from it, and the random programs execute it.
 
 The table consists of arrays, so that a batch of thousands costs a few vector operations.
 """
