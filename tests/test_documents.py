@@ -126,8 +126,8 @@ def test_every_configuration_loads(tmp_path: Path) -> None:
 
 
 def test_the_documented_versions_are_those_of_the_project() -> None:
-    """The lowest are what the package asks for, and the tested ones what is installed; LeRobot and
-    MetaWorld are in none of these environments.
+    """The lowest are what the package asks for, and the tested ones what is installed; LeRobot is
+    in none of these environments.
     """
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
@@ -137,10 +137,10 @@ def test_the_documented_versions_are_those_of_the_project() -> None:
     pinned = dict(re.findall(r"^([\w-]+)==(\S+)", constraints, re.MULTILINE))
     table = (DOCS / "model.md").read_text().partition("## Supported versions")[2]
     rows = re.findall(r"^\| `([\w-]+)` \| ([\d.]*) ?\| (.*) \|$", table, re.MULTILINE)
-    assert len(rows) == 17
+    assert len(rows) == 15
     for name, least, tested in rows:
         assert dict(bounds).get(name, "") == least, name
-        if name not in {"python", "lerobot", "metaworld"}:
+        if name not in {"python", "lerobot"}:
             assert pinned[name] == tested, name
 
 
