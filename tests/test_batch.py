@@ -79,7 +79,20 @@ def columns(
     return ResultColumns(**{**values, **fields})
 
 
-def results(*parts: ResultColumns, sources: Any = None, group: object = "a group") -> BatchedData:
+class Group:
+    """Stands for a group; remembers what it has stopped."""
+
+    def __init__(self) -> None:
+        self.stopped: list[int] = []
+
+    def stop_hardware(self, slots: Any) -> None:
+        self.stopped += slots
+
+
+GROUP = Group()
+
+
+def results(*parts: ResultColumns, sources: Any = None, group: Any = GROUP) -> BatchedData:
     size = sum(map(len, parts))
     slots = np.zeros(size, np.intp)
     for part in parts:
@@ -318,6 +331,14 @@ def test_a_column_has_a_row_for_each_result(bad: Any) -> None:
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=bad)
     with pytest.raises(BadAction, match=r"'value' (has|is)"):
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=np.zeros(2), value=bad)
+
+
+def test_hardware_stops_when_its_batch_of_responses_is_refused() -> None:
+    """The group never hears of these actions."""
+    group = Group()
+    with pytest.raises(BadAction):
+        results(columns([0, 1], np.zeros((2, 1))), group=group).respond(action=None)
+    assert group.stopped == [0, 1]
 
 
 def test_plain_batches_can_be_answered() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final, overload
+from typing import TYPE_CHECKING, Any, Final, Protocol, overload
 
 import msgspec
 import numpy as np
@@ -35,7 +35,7 @@ from rlightning_aio.trees import index, mapped, zipped
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.batch.sent import Sources
@@ -61,15 +61,23 @@ _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
 """The end of an env's id: its number in the entry, and the name of a client."""
 
 
+class Issuer(Protocol):
+    """Stands for a group that returns batches: its `Tables`."""
+
+    def stop_hardware(self, slots: Iterable[int]) -> None:
+        """Stop what the envs of `slots` move, because their batch was refused."""
+        ...
+
+
 class Origin(msgspec.Struct):
     """Group and slots of a batch, so that the answer to it needs no look-up.
 
     Attributes:
-        issuer: stands for the group that has returned it: its `Tables`.
+        issuer: stands for the group that has returned it.
         repeats: True if `slots` may have an env twice; the group then looks the envs up.
     """
 
-    issuer: object | None
+    issuer: Issuer | None
     slots: NDArray[np.intp]
     names: EnvNames
     repeats: bool = False
@@ -389,14 +397,20 @@ class BatchedData:
             extras: further columns of n rows (``log_prob``, ``value``, …).
 
         Raises:
-            BadAction: the number of rows of a column is not the number of results.
+            BadAction: the number of rows of a column is not the number of results. Hardware of the
+                batch stops.
         """
         columns = {"action": action, **extras}
         origin = self._origin
         count = len(self) if origin is None else len(origin.slots)
-        for name, column in columns.items():
-            if type(column) is not np.ndarray or not column.ndim or len(column) != count:
-                mapped(lambda leaf, name=name: _check_rows(name, leaf, len(self)), column)
+        try:
+            for name, column in columns.items():
+                if type(column) is not np.ndarray or not column.ndim or len(column) != count:
+                    mapped(lambda leaf, name=name: _check_rows(name, leaf, len(self)), column)
+        except BadAction:
+            if origin is not None and origin.issuer is not None:
+                origin.issuer.stop_hardware(origin.slots.tolist())
+            raise
         return _responses(self, columns)
 
     @property
@@ -473,7 +487,7 @@ def _entry_of(env_id: str) -> str:
 
 def batch_of_results(
     parts: Sequence[ResultColumns],
-    issuer: object | None,
+    issuer: Issuer | None,
     slots: NDArray[np.intp],
     names: EnvNames,
     sources: Sources | None = None,

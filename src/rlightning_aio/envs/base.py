@@ -225,6 +225,16 @@ class BaseEnv(abc.ABC):
     def on_disconnect(self) -> None:
         """Bring the env to a safe state, because the trainer is gone. Default: do nothing."""
 
+    def stop(self) -> None:
+        """Stop what this env moves, at once. Default: `on_disconnect`.
+
+        Called of hardware only (see `Registry.register`): after a `reset` or `step` has raised or
+        its result was refused, when an action is refused, and when the trainer is gone or ends.
+        It may be called from another thread while `reset` or `step` is at work, and again and
+        again until that returns; what is at work should raise then.
+        """
+        self.on_disconnect()
+
     def close(self) -> Awaitable[None] | None:
         """Release everything; called once, also after a failed step. Default: nothing.
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio.protocol import kernel
+from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.exchange import (
     ARMED,
     AT_LAST,
@@ -69,13 +70,19 @@ def _capacity(num_envs: int) -> int:
 
 def rings_size(num_envs: int) -> int:
     """Size in bytes of the words and both rings of a worker with `num_envs` envs."""
-    return 8 * (_WORDS + 2 * _capacity(num_envs))
+    return 8 * (_WORDS + 2 * _capacity(num_envs) + num_envs)
 
 
 def _split(buffer: memoryview, num_envs: int) -> tuple[memoryview, memoryview, memoryview]:
     words = buffer.cast("B")[: rings_size(num_envs)].cast("q")
     capacity = _capacity(num_envs)
-    return words, words[_WORDS : _WORDS + capacity], words[_WORDS + capacity :]
+    reports = _WORDS + capacity
+    return words, words[_WORDS:reports], words[reports : reports + capacity]
+
+
+def _stops(words: memoryview[int], num_envs: int) -> memoryview[int]:
+    """Return a word for each env: the request up to which it must stop whatever it moves."""
+    return words[len(words) - num_envs :]
 
 
 class TrainerRings:
@@ -98,6 +105,7 @@ class TrainerRings:
         self._bell = bell
         self._index = index
         self._frames_sent = 0
+        self._stops = _stops(self._words, num_envs)
         bell.restart(index)
 
     def ring(self, wake: Callable[[], None]) -> Ring:
@@ -136,6 +144,10 @@ class TrainerRings:
         self._frames_sent += 1
         self._words[FRAMES_TO_WORKER] = self._frames_sent
         return self.worker_sleeps()
+
+    def stop(self, index: int, number: int) -> None:
+        """Tell the worker to stop an env, whatever it does of the requests up to `number`."""
+        self._stops[index] = number
 
     def reports(self) -> NDArray[np.int64]:
         """Read all unread reports, in order.
@@ -201,6 +213,22 @@ class WorkerRings:
         self.own = bell.own
         self._side = WorkerSide(self._words, requests, reports, self.own, bell.words, bell.counter)
         self._frames_sent = 0
+        self._stops = _stops(self._words, num_envs)
+        self._stopped = [0] * num_envs
+
+    def to_stop(self, first_slot: int) -> list[int]:
+        """Return the indices of the envs that must stop now.
+
+        Those that were named since the last call, and the one that executes a request which was to
+        be stopped.
+        """
+        stops, current = self._stops.tolist(), self._words[CURRENT]
+        found = [k for k, number in enumerate(stops) if number != self._stopped[k]]
+        self._stopped = stops
+        index = slot_of(current) - first_slot
+        if current and number_of(current) <= stops[index] and index not in found:
+            found.append(index)
+        return found
 
     def requests(self) -> list[int]:
         """Read all waiting entries, in order."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from rlightning_aio._core.group.episodes.episodes import Episodes
     from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
@@ -65,3 +65,11 @@ class Tables:
     def record_of(self, slot: int) -> HostRecord:
         """Return the record of the host of an env."""
         return self.records[self.requests.hosts.item(slot)]
+
+    def stop_hardware(self, slots: Iterable[int]) -> None:
+        """Stop those of `slots` that move something real, whatever they do now."""
+        for slot in slots:
+            record = self.record_of(slot)
+            if record.is_hardware:
+                host = record.host
+                host.stop(slot - host.first_slot, self.requests.numbering.number(slot))

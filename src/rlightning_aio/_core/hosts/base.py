@@ -171,6 +171,14 @@ class Host(Protocol):
         nobody uses what it holds.
         """
 
+    def stop(self, index: int, number: int) -> None:
+        """Stop what an env moves, at once, even while it executes a request.
+
+        Args:
+            index: of the env, which is hardware, in this host.
+            number: of its current or last request; later ones may move it again.
+        """
+
     def processor_ns(self) -> int | None:
         """Return for how long its living threads have run or waited for a core, if known."""
         return None

@@ -90,6 +90,7 @@ class StartOrder:
         spins: waiting may use a core for some microseconds.
         trainer_pid: the process that gives the order; None if it runs on another machine.
         tasks: of `known_tasks`.
+        is_hardware: the envs move something real.
     """
 
     config: EnvConfig
@@ -99,6 +100,7 @@ class StartOrder:
     spins: bool
     trainer_pid: int | None = field(default_factory=os.getpid)
     tasks: tuple[bytes, ...] = ()
+    is_hardware: bool = False
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class EnvGroup(GroupInterface):
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan)
-        self._driver.awaited = self._core.awaited
+        self._driver.interrupted = self._core.interrupted
 
     def _new_driver(self) -> SyncDriver:
         return SyncDriver()

@@ -50,11 +50,11 @@ class SyncDriver:
     """Watches sources with one set of descriptors, and runs procedures until they return."""
 
     def __init__(self) -> None:
-        # The queue of completions, the function that applies them, and the one that names the envs
-        # for which a call waits; set by the group.
+        # The queue of completions, the function that applies them, and the one that stops
+        # hardware on Ctrl-C and names the envs for which the call waited; set by the group.
         self.completions: Sized = ()
         self.apply_completions: Callable[[], None]
-        self.awaited: Callable[[float], str]
+        self.interrupted: Callable[[float], str]
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
@@ -134,7 +134,7 @@ class SyncDriver:
                     self._check_interrupt()
                 except BaseException as error:
                     if isinstance(error, KeyboardInterrupt):
-                        error.add_note(self.awaited(time.monotonic()))
+                        error.add_note(self.interrupted(time.monotonic()))
                     # Thrown, as a closed generator couldn't wait while cleaning up.
                     wait = procedure.throw(error)
                 else:

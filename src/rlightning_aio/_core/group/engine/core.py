@@ -100,8 +100,9 @@ class Core:
             self.waiting.poll()  # Results that are ready are no longer outstanding.
         return self.supervisor.workers.describe(now_ns)
 
-    def awaited(self, now: float) -> str:
-        """Say which envs a call waits for."""
+    def interrupted(self, now: float) -> str:
+        """Stop hardware, as Ctrl-C has ended a call, and say which envs the call waited for."""
+        self.tables.stop_hardware(self._all_slots.tolist())
         self.waiting.poll()
         return self.supervisor.workers.awaited(int(now * 1e9))
 

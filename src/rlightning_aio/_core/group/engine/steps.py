@@ -9,6 +9,7 @@ writes, and finds the words for what it refuses, and `Dispatch` sends.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
 
@@ -27,12 +28,20 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
-from rlightning_aio.errors import BadAction, NothingPending, RLightningError
+from rlightning_aio.errors import (
+    BadAction,
+    EnvBusy,
+    NothingPending,
+    RLightningError,
+    UnknownEnv,
+)
 from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_BEFORE, TRUNCATED
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
@@ -221,8 +230,17 @@ class Steps:
         Returns their slots, and what goes out of band.
 
         Raises:
-            RLightningError: something is wrong with the batch or its envs; nothing was sent.
+            RLightningError: something is wrong with the batch or its envs; nothing was sent. If it
+                is an action, hardware of the batch stops.
         """
+        try:
+            return self._write(batch, now)
+        except (BadAction, UnknownEnv, EnvBusy) as error:
+            if isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
+                self._stop_hardware(batch.ids(), error)
+            raise
+
+    def _write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         if self._completions:
             self._intake.apply_completions()
         answer = None if self._conditions.unusual else answer_of(batch, self._tables)
@@ -245,6 +263,15 @@ class Steps:
             write_column(action, slab, slots, rows, self._envs)
         self._results.note_sent(slots, columns)
         return slots, None
+
+    def _stop_hardware(self, ids: Sequence[str], error: RLightningError) -> None:
+        """Stop the hardware of a batch that was refused, unless only because an env is busy."""
+        known = set(ids)
+        if isinstance(error, EnvBusy) and len(known) == len(ids):
+            return
+        for env_id in known:
+            with suppress(UnknownEnv):
+                self._tables.stop_hardware([self._envs.find_one(env_id)])
 
     def _write_any(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Do the same for any batch."""

@@ -72,6 +72,7 @@ class HangDetector:
         A host that can't, and that can be killed, is killed if they don't end soon. Returns host
         and entry of those that were held for a replacement, and are no longer.
         """
+        self._tables.stop_hardware(slots.tolist())
         entries, hosts = self._requests.numbering.entry[slots], self._requests.hosts[slots]
         no_longer_held: list[tuple[int, int]] = []
         found: list[int] = sorted({*hosts.tolist()})

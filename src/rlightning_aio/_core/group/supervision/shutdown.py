@@ -37,6 +37,7 @@ class Shutdown:
         if self._tables.lifetime.closed:
             return
         self._tables.lifetime.end()
+        self._tables.stop_hardware(range(len(self._tables.envs)))
         alive = [r for r in self._tables.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         interrupt: KeyboardInterrupt | None = None
         for record in alive:

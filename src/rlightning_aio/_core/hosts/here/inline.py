@@ -7,6 +7,7 @@ Requests wait in a queue, so sending never blocks; while a driver waits, it exec
 from __future__ import annotations
 
 from collections import deque
+from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
@@ -20,6 +21,7 @@ from rlightning_aio._core.hosts.messages import (
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
+from rlightning_aio.envs.hardware import stop, stopped_by_signals
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.trees import copied
 
@@ -42,6 +44,7 @@ __all__ = ["InlineHost"]
 _Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
 """An entry, and the function that executes it."""
 _STEP: Final = int(Operation.STEP)
+_NOTHING: Final = nullcontext()
 
 
 class InlineHost(Host):
@@ -98,16 +101,22 @@ class InlineHost(Host):
                 self._queue.remove(waiting)
                 self._post(Withdrawn(self.host_id, waiting[0]))
 
+    def stop(self, index: int, number: int) -> None:
+        del number  # None is being executed now.
+        if index < len(self._runners):
+            stop(self._runners[index].env)
+
     def execute_next(self) -> bool:
         if not self._queue:
             return False
         entry, execute = self._queue.popleft()
         outcome = error = None
+        runner = self._runners[slot_of(entry) - self.first_slot]
         try:
-            outcome = self._driver.interruptible(execute)
+            with stopped_by_signals(runner.env) if self._order.is_hardware else _NOTHING:
+                outcome = self._driver.interruptible(execute)
         except BaseException as raised:
             error = raised
-        runner = self._runners[slot_of(entry) - self.first_slot]
         completion = completion_of(self.host_id, runner, entry, outcome, error)
         self._post(completion or Result(self.host_id, entry, {}))
         if isinstance(error, KeyboardInterrupt):

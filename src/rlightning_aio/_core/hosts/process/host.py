@@ -414,6 +414,10 @@ class ProcessHost(Host):
             for entry in entries.tolist():
                 self._link.send(FrameKind.ABORT, entry)
 
+    def stop(self, index: int, number: int) -> None:
+        if self._link is not None:
+            self._link.stop(index, number)
+
     def poll(self) -> None:
         if self._link is not None:
             self._link.poll()

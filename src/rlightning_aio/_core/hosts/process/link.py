@@ -169,6 +169,9 @@ class Link:
             if len(data) < CHUNK_BYTES:
                 return
 
+    def stop(self, index: int, number: int) -> None:
+        self._rings.stop(index, number)
+
     def poll(self) -> None:
         entries = self._rings.reports()
         if len(entries):

@@ -12,6 +12,7 @@ import contextlib
 import gc
 import os
 import pickle
+import select
 import socket
 import sys
 import time
@@ -26,6 +27,7 @@ from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
 from rlightning_aio._core.hosts.spinner import Spinner
+from rlightning_aio.envs.hardware import watched
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.protocol.entries import Operation, entry, op_of, slot_of
 from rlightning_aio.protocol.exchange import CAREFUL
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     )
     from rlightning_aio._core.hosts.running.row_writer import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
+    from rlightning_aio.envs.base import BaseEnv
 
 __all__ = ["Worker", "main"]
 
@@ -269,6 +272,8 @@ class Worker:
             for runner in built_envs(order):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
+            if order.is_hardware:
+                watched(lambda: self._closing, self._to_stop)
             self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
             started = [runner.started() for runner in self._runners]
         except BaseException as error:
@@ -278,6 +283,15 @@ class Worker:
         # at all that the fork server has imported, whose pages the workers share.
         gc.collect()
         self._post(Built(SENDER, started))
+
+    def _to_stop(self) -> list[BaseEnv]:
+        """Return the envs that must stop now; all, whatever they do, once the trainer is gone."""
+        poll = select.poll()
+        poll.register(self._channel, select.POLLRDHUP)
+        runners = self._runners
+        if not poll.poll(0):
+            runners = [self._runners[k] for k in self._rings.to_stop(self._first_slot)]
+        return [runner.env for runner in runners]
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs from the inherited descriptor of the arena."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from gymnasium.error import UnregisteredEnv
@@ -13,6 +14,7 @@ from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
+from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.registry import ENVS, placement_of
 
@@ -31,11 +33,20 @@ def build_env(
     env_class: type[BaseEnv] | None = None,
     worker_index: int = 0,
     preprocess_fn: Any = None,
+    *,
+    is_hardware: bool = False,
 ) -> BaseEnv:
     """Import the modules of the entry and build one env; `env_class` None resolves it."""
     for module in config.imports:
         importlib.import_module(module)
     env_class = env_class or ENVS.resolve(config.backend)
+    if is_hardware and ACTION_TIMEOUT in config.env_kwargs:
+        kwargs = dict(config.env_kwargs)
+        seconds = kwargs.pop(ACTION_TIMEOUT)
+        config = config.model_copy(update={"env_kwargs": kwargs})
+        env = build_env(config, env_class, worker_index, preprocess_fn)
+        limit_actions(env, seconds)
+        return env
     if RECORD_VIDEO not in config.env_kwargs:
         return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
     own = {name: value for name, value in config.env_kwargs.items() if name != RECORD_VIDEO}
@@ -88,7 +99,8 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
     kind = _runner_class(env, config)
     # Others are replaced by their host, with a runner of their own.
     rebuilt = config.on_env_error == "restart" and not kind.is_awaitable
-    return kind(env, inline=inline, rebuild=make if rebuilt else None)
+    rebuild = make if rebuilt else None
+    return kind(env, inline=inline, rebuild=rebuild, is_hardware=order.is_hardware)
 
 
 def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
@@ -112,9 +124,17 @@ def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
 
 
 def _built(order: StartOrder, config: EnvConfig, worker_index: int, preprocess_fn: Any) -> BaseEnv:
+    build = partial(
+        build_env,
+        config,
+        order.env_class,
+        worker_index,
+        preprocess_fn,
+        is_hardware=order.is_hardware,
+    )
     if order.tasks:
         # Only if one is missing: a module that registers it here would cause a warning.
         with contextlib.suppress(UnregisteredEnv):
-            return build_env(config, order.env_class, worker_index, preprocess_fn)
+            return build()
         register_tasks(order.tasks)
-    return build_env(config, order.env_class, worker_index, preprocess_fn)
+    return build()

@@ -29,6 +29,7 @@ from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
+from rlightning_aio.envs.hardware import checked_input_of, stop
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -39,7 +40,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
-from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.entries import Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.pickling import dumped
 from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -95,6 +96,7 @@ class EnvRunner:
         inline: results stay in this process. Observations that hold torch tensors are then
             returned without a copy; all other tensors become NumPy arrays on the CPU.
         rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
+        is_hardware: the env moves something real, and stops whatever goes wrong.
 
     Attributes:
         inline: it lives in the trainer's process.
@@ -112,8 +114,10 @@ class EnvRunner:
         *,
         inline: bool = False,
         rebuild: Callable[[], BaseEnv] | None = None,
+        is_hardware: bool = False,
     ) -> None:
         self.inline = inline
+        self._is_hardware = is_hardware
         self._rebuild = rebuild
         # The env has raised, and is to be rebuilt; it was closed for that.
         self._is_spent = self._has_closed = False
@@ -134,7 +138,7 @@ class EnvRunner:
         )
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
-        self._input = input_of(env)
+        self._input = checked_input_of(env) if self._is_hardware else input_of(env)
         free = env.transforms_actions or has_preprocess_fn(env)
         self._actions_beside_row = free or self.layout.action_leaves is None
 
@@ -248,7 +252,9 @@ class EnvRunner:
         return out_of_band
 
     def note_error(self, op: int, error: ErrorText) -> None:
-        """Record what a request has raised."""
+        """Record what a request has raised; hardware stops, unless a method call raised it."""
+        if self._is_hardware and not answers_with_value(op):
+            stop(self.env)
         self._is_spent |= self._rebuild is not None and error.ends_env(op)
 
     def _renew(self) -> None:
@@ -288,7 +294,7 @@ class EnvRunner:
         """Return a function that steps with the action in the row."""
         step_env, store, clock = self._step_env, self._store_step, time.monotonic_ns
         read_action, make = self._read_action, self._input
-        is_action = self._is_bare and not has_preprocess_fn(self.env)
+        is_action = self._is_bare and not (self._is_hardware or has_preprocess_fn(self.env))
         get_input = read_action if is_action else lambda: make(read_action(), {})
         if self._is_bare:
             store = self._writer.write_step

@@ -1,0 +1,191 @@
+"""What whoever runs an env that moves something real does for its safety.
+
+Rule: an action that its space does not contain never reaches it, and whatever goes wrong stops it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import signal
+import time
+from threading import Event, Thread, current_thread, main_thread
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio.envs.fast_path import FastPath
+from rlightning_aio.envs.results import has_preprocess_fn, input_of, is_awaitable, step_of
+from rlightning_aio.errors import BadAction, ConfigError
+from rlightning_aio.protocol.bounds import out_of_bounds
+from rlightning_aio.protocol.columns import Misfit, fitted_tree, leaves
+from rlightning_aio.trees import as_numpy, mapped
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterable
+
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.types import PolicyResponse
+
+__all__ = [
+    "ACTION_TIMEOUT",
+    "checked_input_of",
+    "limit_actions",
+    "stop",
+    "stopped_by_signals",
+    "watched",
+]
+
+_log = logging.getLogger("rlightning_aio")
+
+_LOOK_SECONDS: Final = 0.01
+"""Time between two looks at whether an env at work must stop."""
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+ACTION_TIMEOUT: Final = "action_timeout"
+"""In `env_kwargs` of an entry of hardware: see `limit_actions`."""
+
+
+def stop(env: BaseEnv) -> None:
+    """Stop what `env` moves; what that raises is logged."""
+    try:
+        env.stop()
+    except Exception:  # noqa: BLE001 - others must be stopped, too
+        _log.exception("env %r could not be stopped", env.env_id)
+
+
+def checked_input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
+    """Return `input_of(env)` that refuses actions which the env's action space does not contain.
+
+    They are cast to the dtypes of the space first. The actions of an env with
+    `transforms_actions` pass, and of one with a preprocess function those that it returns are
+    looked at.
+
+    Raises (from the function):
+        BadAction: the space does not contain the action.
+    """
+    if env.transforms_actions:
+        return input_of(env)
+    if has_preprocess_fn(env):
+        preprocess = env._preprocess_fn  # pyright: ignore[reportPrivateUsage]
+
+        def checked(policy_resp: PolicyResponse) -> Any:
+            return _fitting(env, preprocess(policy_resp))
+
+        env._preprocess_fn = checked  # pyright: ignore[reportPrivateUsage]
+        return input_of(env)
+    make = input_of(env)
+    return lambda action, extras: make(_fitting(env, action), extras)
+
+
+def _fitting(env: BaseEnv, action: Any) -> Any:
+    """Return `action`, cast to the dtypes of the action space."""
+    space = env.get_action_space()
+    fault = None
+    if leaves(space) is not None:
+        try:
+            action = mapped(lambda array: array[()], fitted_tree(space, as_numpy(action), "it"))
+        except Misfit as misfit:
+            fault = str(misfit)
+    if fault is None and not space.contains(action):
+        fault = out_of_bounds(space, action, "it") or f"{space} does not contain {action!r}"
+    if fault is None:
+        return action
+    raise BadAction(f"{env.env_id}: an action was refused: {fault}; the env got none and stops")
+
+
+def watched(is_over: Callable[[], bool], due: Callable[[], Iterable[BaseEnv]]) -> Thread:
+    """Start a thread that stops envs, even while they are at work in another thread.
+
+    Args:
+        is_over: ends the thread.
+        due: returns the envs to stop now. One that is at work is returned until its work ends,
+            as it may have begun to move after it was stopped.
+    """
+
+    def watch() -> None:
+        while not is_over():
+            for env in due():
+                stop(env)
+            time.sleep(_LOOK_SECONDS)
+
+    thread = Thread(target=watch, name="stops hardware", daemon=True)
+    thread.start()
+    return thread
+
+
+@contextlib.contextmanager
+def stopped_by_signals(env: BaseEnv) -> Generator[None]:
+    """Have signals that the program handles stop `env`, too, while the block is executed.
+
+    An event loop only notes Ctrl-C, so nothing else would end a motion that blocks it.
+    """
+    is_over = Event()
+    before: dict[int, Any] = {}
+
+    def handle(number: int, frame: Any) -> None:
+        watched(is_over.is_set, lambda: [env])
+        before[number](number, frame)
+
+    try:
+        if current_thread() is main_thread():
+            for number in _SIGNALS:
+                if callable(handler := signal.getsignal(number)):
+                    before[number] = handler
+                    signal.signal(number, handle)
+        yield
+    finally:
+        is_over.set()
+        for number, handler in before.items():
+            if signal.getsignal(number) is handle:  # The env may have set another.
+                signal.signal(number, handler)
+
+
+def limit_actions(env: BaseEnv, seconds: Any) -> None:
+    """Stop an env when no action comes for so long, and refuse steps then until its next reset.
+
+    The time begins with the end of a reset, and anew with each step.
+
+    Raises:
+        ConfigError: `seconds` is no positive number, or the env is awaitable.
+    """
+    where = f"{env.env_id}: env_kwargs.{ACTION_TIMEOUT}"
+    if type(seconds) not in (int, float) or not 0 < seconds < math.inf:
+        raise ConfigError(f"{where}: should be a number of seconds above 0, not {seconds!r}")
+    if is_awaitable(env):
+        raise ConfigError(f"{where}: an awaitable env can't have it")
+    reset, step, close = env.reset, step_of(env), env.close
+    due, expired = math.inf, False
+
+    def timed_reset(**arguments: Any) -> Any:
+        nonlocal due, expired
+        due, expired = math.inf, False
+        result = reset(**arguments)
+        due = time.monotonic() + seconds
+        return result
+
+    def timed_step(policy_resp: PolicyResponse) -> Any:
+        nonlocal due
+        due = time.monotonic() + seconds
+        if expired:
+            raise RuntimeError(
+                f"{env.env_id}: stopped, as no action came for {seconds:g} s (action_timeout); "
+                "reset() starts it again"
+            )
+        return step(policy_resp)
+
+    def late() -> list[BaseEnv]:
+        nonlocal due, expired
+        if time.monotonic() < due:
+            return []
+        due, expired = math.inf, True
+        return [env]
+
+    def timed_close() -> Any:
+        nonlocal due
+        due = -math.inf
+        return close()
+
+    changed: Any = env
+    changed.reset, changed.step, changed.close = timed_reset, timed_step, timed_close
+    if isinstance(env, FastPath):
+        changed.bare_step = changed.bare_reset = lambda: None
+    watched(lambda: due == -math.inf, late)

@@ -1,0 +1,278 @@
+"""Hardware stops: when an action or a result is refused, when a call is interrupted, at the end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from patience import HANG
+
+from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
+from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, RLightningError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+PLACEMENTS = ("process", "inline")
+SPACE = gym.spaces.Dict({"joints": gym.spaces.Box(-1, 1, (2,), np.float32)})
+
+
+class Arm(BaseEnv):
+    """Writes what happens to it to a log, and returns what its entry says.
+
+    A reset with ``options={"slow": True}`` lasts until the arm is stopped.
+    """
+
+    def __init__(self, config: EnvConfig, worker_index: int = 0, preprocess_fn: Any = None) -> None:
+        super().__init__(config, worker_index, preprocess_fn)
+        self.kwargs = config.env_kwargs
+        self.log = Path(config.env_kwargs["log"])
+        self.is_stopped, self.stopping = threading.Event(), threading.Lock()
+
+    def note(self, what: str) -> None:
+        with self.log.open("a") as file:
+            file.write(f"{what}\n")
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return SPACE
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def _ret(self, observation: Any) -> EnvRet:
+        return EnvRet(env_id=self.env_id, observation=observation)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:
+        self.is_stopped.clear()
+        self.note("reset")
+        if options:
+            self.is_stopped.wait(HANG)
+            raise RuntimeError("stopped on its way")
+        return self._ret({"joints": np.zeros(2, np.float32)})
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        if self.is_stopped.is_set():
+            raise RuntimeError("stopped; reset() starts it again")
+        self.note(f"step {np.asarray(policy_resp.action).tolist()}")
+        return self._ret(self.kwargs.get("result", {"joints": np.ones(2, np.float32)}))
+
+    def stop(self) -> None:
+        with self.stopping:
+            if not self.is_stopped.is_set():
+                self.note("stop")
+                self.is_stopped.set()
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "log"
+
+
+@pytest.fixture
+def arm(log: Path) -> Iterator[Callable[..., dict[str, Any]]]:
+    """Make an entry of one arm."""
+    ENVS.register("test arm", hardware=True)(Arm)
+
+    def entry(placement: str, **env_kwargs: Any) -> dict[str, Any]:
+        kwargs = {"log": str(log), **env_kwargs}
+        place = {"placement": placement, "env_kwargs": kwargs}
+        return {"name": "arm", "backend": "test arm", "task": "any", **place}
+
+    yield entry
+    del ENVS._classes["test arm"]  # noqa: SLF001
+    ENVS._hardware.pop("test arm", None)  # noqa: SLF001
+
+
+def lines(log: Path) -> list[str]:
+    return log.read_text().splitlines() if log.exists() else []
+
+
+def wait_for(log: Path, line: str) -> None:
+    until = time.monotonic() + HANG
+    while line not in lines(log):
+        assert time.monotonic() < until, lines(log)
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [([1e30, 0], r"holds 1\.0+[0-9]*e.30"), ([0, 1.001], "holds 1.001"), ([-2, 0], "holds -2")],
+)
+def test_an_action_beyond_the_bounds_never_reaches_an_arm(
+    arm: Any, log: Path, placement: str, action: list[float], words: str
+) -> None:
+    """The arm is stopped instead; what fits after the cast to float32 passes."""
+    with sync.build_env_group(arm(placement)) as group:
+        batch, _ = group.reset()
+        batch, _ = group.step(batch.respond(action=np.array([[1 + 1e-9, -1]])))
+        with pytest.raises(BadAction, match=words):
+            group.step(batch.respond(action=np.array([action])))
+        wait_for(log, "stop")
+    assert lines(log) == ["reset", "step [1.0, -1.0]", "stop"]
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_what_a_preprocess_function_makes_is_looked_at(arm: Any, log: Path, placement: str) -> None:
+    """What it gets may be anything."""
+
+    def scaled(policy_resp: PolicyResponse) -> Any:
+        return np.array(policy_resp.action["percent"]) / 100
+
+    class Preprocessed(Arm):
+        def step(self, policy_resp: PolicyResponse) -> EnvRet:
+            action = self._preprocess_fn(policy_resp)
+            return super().step(PolicyResponse(self.env_id, action))
+
+    ENVS.register("test arm", hardware=True)(Preprocessed)
+    with sync.build_env_group(arm(placement), preprocess_fn=scaled) as group:
+        group.reset()
+        group.step(BatchedData(["arm-0"], [PolicyResponse("arm-0", {"percent": [50, 100]})]))
+        with pytest.raises(BadAction, match=r"holds 1\.5"):
+            group.step(BatchedData(["arm-0"], [PolicyResponse("arm-0", {"percent": [150, 0]})]))
+        wait_for(log, "stop")
+    assert lines(log) == ["reset", "step [0.5, 1.0]", "stop"]
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize(
+    "result", [None, {}, {"joints": None}, {"joints": [1.0, 2.0, 3.0]}, {"joints": "two"}]
+)
+def test_an_arm_whose_result_is_refused_stops(
+    arm: Any, log: Path, placement: str, result: Any
+) -> None:
+    """A missing picture, say, is an error of the env that it does not raise itself."""
+    with sync.build_env_group(arm(placement, result=result)) as group:
+        batch, _ = group.reset()
+        with pytest.raises(EnvRaised):
+            group.step(batch.respond(action=np.zeros((1, 2))))
+        wait_for(log, "stop")
+
+
+def refused_batches() -> dict[str, Callable[[], BatchedData[Any]]]:
+    def of(*actions: Any) -> BatchedData[Any]:
+        return BatchedData(["arm-0"] * len(actions), [PolicyResponse("arm-0", a) for a in actions])
+
+    return {
+        "None": lambda: of(None),
+        "shape": lambda: of(np.zeros(3)),
+        "kind": lambda: of("fast"),
+        "NaN": lambda: of([np.nan, 0.0]),
+        "two rows": lambda: of(np.zeros(2), np.zeros(2)),
+        "no response": lambda: BatchedData(["arm-0"], [None]),
+        "unknown": lambda: BatchedData(
+            ["arm-0", "arm-7"], [PolicyResponse(i, np.zeros(2)) for i in ("arm-0", "arm-7")]
+        ),
+    }
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("name", refused_batches())
+def test_an_arm_stops_when_the_group_refuses_its_batch(
+    arm: Any, log: Path, placement: str, name: str
+) -> None:
+    """Although nothing was sent."""
+    with sync.build_env_group(arm(placement)) as group:
+        group.reset()
+        with pytest.raises((RLightningError, ValueError)):
+            group.step(refused_batches()[name]())
+        wait_for(log, "stop")
+        with pytest.raises(EnvRaised, match="stopped"):
+            group.step(BatchedData(["arm-0"], [PolicyResponse("arm-0", np.zeros(2))]))
+        group.reset()
+    assert lines(log).count("reset") == 2
+
+
+@pytest.mark.parametrize("columns", [None, np.zeros((0, 2)), np.zeros((2, 2))])
+def test_an_arm_stops_when_a_column_is_refused(arm: Any, log: Path, columns: Any) -> None:
+    """One without rows, or with a row too many."""
+    with sync.build_env_group(arm("process")) as group:
+        batch, _ = group.reset()
+        with pytest.raises((RLightningError, ValueError)):
+            group.step(batch.respond(action=columns))
+        wait_for(log, "stop")
+
+
+TRAINER = """
+import sys
+from faults.test_hardware import Arm
+from rlightning_aio import ENVS, sync
+import rlightning_aio as rl
+placement, log, kind = sys.argv[1:]
+ENVS.register("test arm", hardware=True)(Arm)
+entry = {"name": "arm", "backend": "test arm", "task": "any", "placement": placement}
+entry["env_kwargs"] = {"log": log}
+if kind == "sync":
+    with sync.build_env_group(entry) as group:
+        group.reset(options={"slow": True})
+else:
+    async def main():
+        async with rl.build_env_group(entry) as group:
+            await group.reset(options={"slow": True})
+    rl.run(main())
+"""
+
+
+@pytest.mark.parametrize("kind", ["sync", "async"])
+@pytest.mark.parametrize(
+    ("placement", "number"),
+    [
+        ("process", signal.SIGINT),
+        ("inline", signal.SIGINT),
+        ("process", signal.SIGTERM),
+        ("process", signal.SIGKILL),
+    ],
+)
+def test_an_arm_on_its_way_to_the_reset_position_stops(
+    log: Path, kind: str, placement: str, number: int
+) -> None:
+    """Whoever asked for the reset is interrupted or killed; nobody else could stop the arm."""
+    command = [sys.executable, "-c", TRAINER, placement, str(log), kind]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as trainer:
+        wait_for(log, "reset")
+        trainer.send_signal(number)
+        wait_for(log, "stop")
+        trainer.wait(HANG)
+
+
+def test_an_aborted_reset_stops_the_arm(arm: Any, log: Path) -> None:
+    """Before its worker is killed."""
+    with sync.build_env_group(arm("process")) as group:
+        group.reset_async(options={"slow": True})
+        wait_for(log, "reset")
+        group.abort()
+        assert "stop" in lines(log)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_program_that_sends_no_action_in_time_stops_the_arm(
+    arm: Any, log: Path, placement: str
+) -> None:
+    """With action_timeout, for robots that go on moving without one."""
+    with sync.build_env_group(arm(placement, action_timeout=0.2)) as group:
+        batch, _ = group.reset()
+        wait_for(log, "stop")
+        with pytest.raises(EnvRaised, match=r"no action came for 0\.2 s \(action_timeout\)"):
+            group.step(batch.respond(action=np.zeros((1, 2))))
+        batch, _ = group.reset()
+        group.step(batch.respond(action=np.zeros((1, 2))))
+    assert lines(log)[:4] == ["reset", "stop", "reset", "step [0.0, 0.0]"]
+
+
+@pytest.mark.parametrize("seconds", [0, -1, "1", None, float("inf")])
+def test_an_action_timeout_is_a_number_of_seconds(arm: Any, seconds: Any) -> None:
+    with (
+        pytest.raises(ConfigError, match="action_timeout: should be a number of seconds above 0"),
+        sync.build_env_group(arm("inline", action_timeout=seconds)),
+    ):
+        pass
