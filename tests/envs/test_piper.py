@@ -568,6 +568,45 @@ def test_cameras_and_reward_come_from_hooks(arm: WatchedArm, make: Any) -> None:
     assert ret.last_reward == pytest.approx(ret.observation["joint_positions"][0] - 1.0)
 
 
+_hang = threading.Event()
+
+
+def read_late() -> dict[str, np.ndarray]:
+    _hang.wait(HANG)
+    return read_images()
+
+
+def test_a_camera_that_hangs_stops_the_arm_after_its_time_limit(arm: WatchedArm, make: Any) -> None:
+    """And later pictures of that call are not taken for those of another one."""
+    env = make(
+        cameras={"read": f"{__name__}:read_late", "images": {"wrist": [4, 6, 3]}},
+        camera_timeout=0.3,
+        safe_stop="emergency_stop",
+    )
+    _hang.set()
+    env.reset()
+    _hang.clear()
+    with pytest.raises(TimeoutError, match=r"no images within 0\.3 s \(camera_timeout\)"):
+        env.step(respond([1.0, *READY[1:], 0.0]))
+    assert arm.emergency_stopped
+    _hang.set()
+    assert env.reset(options={"resume": True}).observation["wrist"][0, 0, 0] == 7
+
+
+def test_an_arm_can_be_stopped_on_its_way_to_the_reset_position(arm: WatchedArm, make: Any) -> None:
+    """From another thread; the reset raises, and the next one moves the arm again."""
+    env = make(reset_joints=[2.0, *READY[1:]], speed=20)
+    stopper = threading.Thread(
+        target=lambda: (arm.wait_for(lambda: arm.joints[0] > 0.1), env.stop()), daemon=True
+    )
+    stopper.start()
+    with pytest.raises(RuntimeError, match=r"the env's stop\(\) was called; reset\(\) starts"):
+        env.reset()
+    stopper.join()
+    assert arm.joints[0] < 1.0
+    assert env.reset().observation["joint_positions"][0] == pytest.approx(2.0, abs=0.021)
+
+
 @pytest.mark.parametrize(
     ("env_kwargs", "message"),
     [

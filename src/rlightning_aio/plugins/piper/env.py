@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from rlightning_aio import BaseEnv, EnvRet, PolicyResponse
 from rlightning_aio.envs.options import load_named, read_options
 from rlightning_aio.envs.pace import Pace
 from rlightning_aio.errors import BadAction, ConfigError
+from rlightning_aio.plugins.piper.cameras import Cameras
 from rlightning_aio.plugins.piper.link import (
     GRIPPER_FRAMES,
     JOINT_FRAMES,
@@ -82,12 +84,17 @@ class PiperEnv(BaseEnv):
         self._limits = action_limits(self.env_id, options)
         check_reset_position(self.env_id, options)
         cameras, reward = options.cameras, options.reward
-        self._read_images = self._load("cameras.read", cameras.read) if cameras else None
+        self._cameras: Cameras | None = None
+        if cameras:
+            read = self._load("cameras.read", cameras.read)
+            self._cameras = Cameras(read, options.camera_timeout)
         self._reward = self._load("reward", reward) if reward else None
         self._frames = JOINT_FRAMES | POSE_FRAMES | STATUS_FRAMES
         if options.gripper:
             self._frames |= GRIPPER_FRAMES
         self._stopped = True
+        # Held while the arm is started or stopped: `stop` comes from another thread.
+        self._stopping = threading.RLock()
         self._num_steps = 0
         self._pace = Pace(options.control_hz)
         self._link: ArmLink | None = None
@@ -166,11 +173,13 @@ class PiperEnv(BaseEnv):
         with self._stopping_on_error():
             link = self._answering_link()
             must_resume = self._must_resume(link, bool((options or {}).get("resume")))
-            self._stopped = False
-            link.arm(self.trainer_pid, self._options.connect_timeout)
+            with self._stopping:
+                self._stopped = False
+                link.arm(self.trainer_pid, self._options.connect_timeout)
             if must_resume:
                 self._resume(link)
             link.enable(self._options.connect_timeout)
+            self._check_watchdog(link)
             self._go_to_reset_position(link)
             self._num_steps = 0
             self._pace.restart()
@@ -211,14 +220,21 @@ class PiperEnv(BaseEnv):
         """Make the safe stop, as the trainer is gone."""
         self._safe_stop()
 
+    def stop(self) -> None:
+        """Make the safe stop, also from another thread; a reset or step at work then raises."""
+        self._safe_stop("the env's stop() was called")
+
     def close(self) -> None:
         """Make the safe stop and leave the channel; idempotent."""
-        try:
-            self._safe_stop()
-        finally:
-            if self._link is not None:
-                self._link.close()
-                self._link = None
+        if self._cameras:
+            self._cameras.close()
+        with self._stopping:
+            try:
+                self._safe_stop()
+            finally:
+                if self._link is not None:
+                    self._link.close()
+                    self._link = None
 
     def _require_link(self) -> ArmLink:
         if self._link is None:
@@ -245,11 +261,11 @@ class PiperEnv(BaseEnv):
             self._safe_stop()
             raise
 
-    def _safe_stop(self) -> None:
-        if self._stopped or self._link is None:
-            return
-        self._stopped = True
-        self._link.stop()
+    def _safe_stop(self, cause: str = "") -> None:
+        with self._stopping:
+            if not self._stopped and self._link is not None:
+                self._stopped = True
+                self._link.stop(cause)
 
     def _check_watchdog(self, link: ArmLink) -> None:
         if cause := link.stopped_because:
@@ -288,7 +304,7 @@ class PiperEnv(BaseEnv):
                 link.command_gripper(options.reset_gripper, options.gripper_effort)
             sent = link.mark()
             # Repeated until the arm is there, because the bus may lose frames.
-            link.wait_until(lambda: not self._off_target(link), 0.2)
+            link.wait_until(lambda: self._is_over(link), 0.2)
             link.wait_for_feedback(self._frames, sent, options.feedback_timeout)
             self._check_watchdog(link)
             self._raise_faults(link)
@@ -299,6 +315,10 @@ class PiperEnv(BaseEnv):
                     f"{self.env_id}: reset position not reached in {options.move_timeout:g} s: "
                     f"{missing}; the arm reports {link.status()}"
                 )
+
+    def _is_over(self, link: ArmLink) -> bool:
+        """Return True if the move to the reset position is over, or was stopped."""
+        return bool(link.stopped_because) or not self._off_target(link)
 
     def _off_target(self, link: ArmLink) -> str:
         """Describe the joint or gripper that is furthest from its reset position, if any."""
@@ -359,8 +379,8 @@ class PiperEnv(BaseEnv):
         }
         if self._options.gripper:
             observation["gripper"] = np.array([link.gripper()], np.float32)
-        if self._read_images:
-            observation |= self._read_images()
+        if self._cameras:
+            observation |= self._cameras.read()
         return observation
 
     def _info(self, late: float) -> dict[str, Any]:

@@ -104,7 +104,7 @@ class ArmLink:
         self._commanded: list[CanFrame] = []
         self._num_sent = 0
         self._confirmed: set[bytes] = set()
-        self._stopped_because = ""
+        self._stopped_because = self._own_cause = ""
         self._fault: Exception | None = None
         self._closing = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
@@ -232,7 +232,7 @@ class ArmLink:
             if kind == Kind.FAULT:
                 self._fault = ConnectionError(content.decode())
             elif kind == Kind.STOP:
-                self._stopped_because = content.decode()
+                self._stopped_because = content.decode() or self._own_cause
             elif kind == Kind.ARM:
                 self._stopped_because = ""
             self._confirmed.add(kind)
@@ -269,8 +269,13 @@ class ArmLink:
             cause = self._fault or f"it did not answer for {timeout:g} s"
             raise ConnectionError(f"the watchdog of the arm on {self._name} is gone: {cause}")
 
-    def stop(self) -> None:
-        """Make the safe stop. If the watchdog can't, start another one that only does this."""
+    def stop(self, cause: str = "") -> None:
+        """Make the safe stop. If the watchdog can't, start another one that only does this.
+
+        Args:
+            cause: what `stopped_because` says from now on.
+        """
+        self._own_cause = cause
         if self._request(Kind.STOP, b"", _STOP_SECONDS) or self._process is None:
             return
         self._fault = self._fault or ConnectionError("its watchdog did not answer")
@@ -357,7 +362,7 @@ class ArmLink:
         return all(self._sdk.GetArmEnableStatus())
 
     def enable(self, timeout: float) -> None:
-        """Switch the six motors on.
+        """Switch the six motors on, unless the arm is stopped meanwhile.
 
         Raises:
             TimeoutError: they aren't on after `timeout` seconds.
@@ -368,6 +373,8 @@ class ArmLink:
             sent = self.mark()
             # Repeated, because the bus may lose frames; motors report at least every 0.1 s.
             self.wait_until(lambda since=sent: not self._missing(POWER_FRAMES, since), 0.2)
+            if self._stopped_because:
+                return
             if self.is_enabled() and not self._missing(POWER_FRAMES, sent):
                 return
             if time.monotonic() >= deadline:

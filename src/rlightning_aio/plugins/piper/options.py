@@ -84,6 +84,8 @@ class PiperOptions(BaseModel):
     watchdog_timeout: float = Field(default=0.5, ge=0.1, le=10)
     """Seconds for which this process or the trainer may be suspended before the arm is stopped."""
     cameras: CameraOptions | None = None
+    camera_timeout: float = Field(default=0.5, gt=0)
+    """Seconds that ``cameras.read`` may take before the arm is stopped."""
     reward: str | None = None
     """``module:callable`` of (observation, action) that returns a float; None for 0."""
 
