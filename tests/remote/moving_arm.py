@@ -1,7 +1,8 @@
 """``moving_arm.py ADDRESS NAME LOG``: a client whose env moves something real.
 
 It writes a line into the file LOG before each motion. While a file LOG.hold exists, a motion goes
-on. It ends with the program that started it.
+on, until the arm is stopped, which makes the file LOG.stopped. It ends with the
+program that started it.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ class Arm(BaseEnv):
         super().__init__(EnvConfig(name="arm", backend="arm", task="-"))
         self._log = log
         self._hold = log.with_suffix(".hold")
+        self._stopped = log.with_suffix(".stopped")
+
+    def stop(self) -> None:
+        self._stopped.touch()
 
     def get_observation_space(self) -> gym.Space[Any]:
         return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -42,7 +47,10 @@ class Arm(BaseEnv):
     def _move(self, what: str) -> EnvRet:
         with self._log.open("a") as file:
             file.write(f"{what}\n")
+        self._stopped.unlink(missing_ok=True)
         while self._hold.exists():
+            if self._stopped.exists():
+                raise RuntimeError("the arm was stopped on its way")
             time.sleep(0.01)
         return EnvRet(env_id=self.env_id, observation=np.zeros(2, np.float32))
 

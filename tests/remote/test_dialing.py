@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import signal
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, cast
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import zmq
 from kit.counting import CountingEnv
 from patience import HANG
 
 from rlightning_aio import sync
+from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote import client as client_module
 
@@ -92,3 +97,61 @@ def test_a_client_whose_run_has_ended_dials_anew(monkeypatch: pytest.MonkeyPatch
             with contextlib.suppress(TimeoutError):
                 group.collect_async(deadline=0.01)
         running.result()
+
+
+@pytest.mark.parametrize("made", ["env", "callable"])
+def test_a_client_takes_a_gymnasium_env_or_a_callable(made: str) -> None:
+    """As the task of an entry does; the env counts as hardware unless it is said that it isn't."""
+    stops: list[str] = []
+
+    class Robot(gym.Env[Any, Any]):
+        observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action: Any) -> Any:
+            return action, 1.0, False, False, {}
+
+        def stop(self) -> None:
+            stops.append("stop")
+
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    with sync.build_env_group(server) as group:
+        given: Any = Robot() if made == "env" else Robot
+        with RemoteEnvClient(given, group["robots-0"].address, name="arm") as client:
+            client._env.is_finish = lambda: len(stops) == 2  # noqa: SLF001
+            thread = threading.Thread(target=client.run)
+            thread.start()
+            batch, _ = group.reset()
+            batch, _ = group.step(batch.respond(action=np.full((1, 1), 0.5)))
+            assert batch.observation.tolist() == [[0.5]]
+            with pytest.raises(BadAction, match=r"holds 1\.5"):
+                group.step(batch.respond(action=np.full((1, 1), 1.5)))
+            assert stops == ["stop"]
+            group.close()
+            thread.join(HANG)
+        assert stops == ["stop", "stop"]
+
+
+def test_an_awaitable_env_is_no_client() -> None:
+    """A client is a plain loop; the reason is given before it dials."""
+
+    class Awaitable:
+        observation_space = action_space = gym.spaces.Discrete(2)
+
+        async def reset(self, *, seed: Any = None, options: Any = None) -> Any: ...
+
+        async def step(self, action: Any) -> Any: ...
+
+    with pytest.raises(
+        ConfigError, match=r"is awaitable .* a client steps its env in a plain loop"
+    ):
+        RemoteEnvClient(Awaitable, "127.0.0.1", 9)
+
+
+@pytest.mark.parametrize("heartbeat", [0, 0.05, -1, math.inf, math.nan])
+def test_a_heartbeat_is_a_number_of_seconds(heartbeat: float) -> None:
+    """Too short a one would end every session."""
+    with pytest.raises(ConfigError, match=r"heartbeat: should be at least 0\.1 seconds"):
+        RemoteEnvClient(CountingEnv(), "127.0.0.1", 9, heartbeat=heartbeat)

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from patience import HANG
 from remote.faulty_proxy import Faults, FaultyProxy
 
 from rlightning_aio import EnvAway, ResetNeeded, sync
+from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,6 +49,9 @@ class ArmProcess:
 
     def motions(self) -> list[str]:
         return self._log.read_text().splitlines() if self._log.exists() else []
+
+    def is_stopped(self) -> bool:
+        return self._log.with_suffix(".stopped").exists()
 
     def hold(self) -> None:
         """Let the next motion go on until `let_go`."""
@@ -276,3 +281,54 @@ def test_seeds_and_index_go_by_place() -> None:
             group.close()
             for client in clients:
                 client.join()
+
+
+@pytest.mark.parametrize("operation", ["step", "reset"])
+@pytest.mark.parametrize("fault", ["silent", "closed", "aborted", "Ctrl-C"])
+def test_an_arm_at_work_is_stopped_when_its_session_is_over(
+    tmp_path: Path, fault: str, operation: str
+) -> None:
+    """Somebody watches the session while the env moves, however long that takes."""
+    with contextlib.ExitStack() as stack:
+        group = stack.enter_context(sync.build_env_group(entry(heartbeat=1)))
+        proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
+        arm = ArmProcess(proxy.address, tmp_path / "first")
+        stack.callback(arm.end)
+        batch, _ = group.reset()
+        arm.hold()
+        if operation == "step":
+            group.step_async(actions(batch))
+        else:
+            group.reset_async()
+        wait_for(group, lambda: len(arm.motions()) == 2)
+        assert not arm.is_stopped()
+        if fault == "closed":
+            group.close()
+        elif fault == "aborted":
+            group.abort()
+        elif fault == "Ctrl-C":
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+            with pytest.raises(KeyboardInterrupt):
+                group.collect_async()
+        else:
+            for pair in proxy._pairs:
+                pair.silent = True
+        until = time.monotonic() + HANG
+        while not arm.is_stopped():
+            assert time.monotonic() < until
+            time.sleep(0.01)
+
+
+@pytest.mark.parametrize("action", [None, np.full((1, 2), 3.0), np.zeros((2, 2)), np.zeros((1, 3))])
+def test_a_clients_arm_stops_when_an_action_is_refused(tmp_path: Path, action: Any) -> None:
+    """By the group, which sends it away, or by the client itself; a reset moves it again."""
+    with sync.build_env_group(entry()) as group, arms() as started:
+        arm = ArmProcess(group["robots-0"].address, tmp_path / "first")
+        started.append(arm)
+        batch, _ = group.reset()
+        with pytest.raises(BadAction):
+            group.step(batch.respond(action=action))
+        wait_for(group, arm.is_stopped)
+        batch, _ = group.reset()
+        group.step(actions(batch))
+        assert arm.motions() == ["reset None", "reset None", "step"]

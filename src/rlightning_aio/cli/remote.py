@@ -23,6 +23,7 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
+from rlightning_aio.registry import ENVS
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote.client import is_address
 from rlightning_aio.remote.keys import make_keys
@@ -54,12 +55,19 @@ def client(
         str | None,
         typer.Option(help="Name, unique at the server.", show_default="host name and process id"),
     ] = None,
+    heartbeat: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds of silence after which the server counts as gone.",
+            show_default="as the server says",
+        ),
+    ] = None,
 ) -> None:
     """Lend an env of this machine to the env_server of a trainer elsewhere.
 
     The command builds the first env of the config's entry in this process, and serves it until
     the env is finished or you press Ctrl-C. If the server is not there, or goes away, the client
-    dials again with growing pauses. Each time the server lets the env in, the env is reset.
+    dials again with growing pauses. Nothing moves before the trainer asks for a reset.
 
     For example:
 
@@ -72,8 +80,8 @@ def client(
     served: RemoteEnvClient | None = None
     try:
         with interruptible(), _faults_of(entry):
-            env = build_env(entry)
-            served = _client_of(env, connect, keys, name)
+            env = build_env(entry, is_hardware=ENVS.is_hardware(entry.backend))
+            served = _client_of(env, connect, keys, name, heartbeat)
             with served, connections_logged():
                 typer.echo(f"{served.name} connects to {connect}", err=True)
                 served.run()
@@ -109,9 +117,11 @@ def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
     return entry
 
 
-def _client_of(env: BaseEnv, address: str, keys: Path | None, name: str | None) -> RemoteEnvClient:
+def _client_of(
+    env: BaseEnv, address: str, keys: Path | None, name: str | None, heartbeat: float | None
+) -> RemoteEnvClient:
     try:
-        return RemoteEnvClient(env, address, keys=keys, name=name)
+        return RemoteEnvClient(env, address, keys=keys, name=name, heartbeat=heartbeat)
     except BaseException:
         env.close()
         raise

@@ -1,4 +1,4 @@
-"""What whoever runs an env that moves something real does for its safety.
+"""What a host or a client does for the safety of an env that moves something real.
 
 Rule: an action that its space does not contain never reaches it, and whatever goes wrong stops it.
 """
@@ -142,7 +142,7 @@ def stopped_by_signals(env: BaseEnv) -> Generator[None]:
 def limit_actions(env: BaseEnv, seconds: Any) -> None:
     """Stop an env when no action comes for so long, and refuse steps then until its next reset.
 
-    The time begins with the end of a reset, and anew with each step.
+    The time begins with the end of a reset, and again with each step.
 
     Raises:
         ConfigError: `seconds` is no positive number, or the env is awaitable.

@@ -1,16 +1,17 @@
 """`RemoteEnvClient`: an env of this machine that a trainer on another machine steps.
 
-Rule: a plain blocking loop on the caller's thread, which alone resets, steps and stops the env. A
-socket of ZMQ has one connection at most, which is one session; after its end, another socket dials
-again. ZMQ's own thread keeps the connection alive while the env steps, and notices if the server is
-silent. Deliberately left out: the meaning of messages (`client_session`), threads, and anything
-that unpickles.
+Rule: a plain blocking loop on the caller's thread, which alone resets and steps the env. A socket
+of ZMQ has one connection at most, which is one session; after its end, another socket dials again.
+ZMQ's own thread keeps the connection alive while the env steps, and notices if the server is
+silent. While hardware is at work, a thread has the sockets, and stops it when the session is over.
+Deliberately left out: the meaning of messages (`client_session`), and anything that unpickles.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import re
 import signal
@@ -18,21 +19,26 @@ import socket
 import time
 from math import ceil
 from pathlib import Path
-from threading import current_thread, main_thread
+from threading import Lock, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
+import gymnasium as gym
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from rlightning_aio.envs.base import initialised
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
+from rlightning_aio.envs.hardware import checked_input_of, stop, watched
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
+    is_awaitable,
     one_result,
     reads_extras,
     step_of,
 )
+from rlightning_aio.envs.simulators.callable import env_of_callable
 from rlightning_aio.errors import ClientRefused, ConfigError
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import (
@@ -59,9 +65,8 @@ from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable, Generator
 
-    from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.net.client_session import Event
 
 __all__ = ["RemoteEnvClient", "is_address"]
@@ -87,15 +92,20 @@ class RemoteEnvClient:
     that a robot stops.
 
     Args:
-        env: newly built. The client owns it, initialises it and closes it.
+        env: newly built: a `BaseEnv` or a Gymnasium env, or a callable that returns one. The client
+            owns it, initialises it and closes it.
         hostname: of the server, or its whole address, such as ``group["arms"].address``.
         port: of the server; None with a whole address.
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
         name: unique at the server; by default that of the keys, or else this machine's name and
             the process id.
-        hardware: the env moves something real: a trainer then never resets it by itself. None:
-            what the registry says of its backend.
+        hardware: the env moves something real: a trainer then never resets it by itself, an action
+            that its space does not contain never reaches it, and `BaseEnv.stop` is called whatever
+            goes wrong. None: what the registry says of the backend of a `BaseEnv`; True of any
+            other env, whose method ``stop`` is then called, if it has one.
+        heartbeat: seconds of silence after which the server counts as gone, at least 0.1. None: as
+            the server says; until then 1 for hardware, else 5.
 
     Attributes:
         name: of the client.
@@ -104,18 +114,20 @@ class RemoteEnvClient:
 
     Raises:
         ConfigError: the name is too long, the address is incomplete, the env's spaces can't be
-            announced, or the keys can't be read.
+            announced, the env is awaitable, the heartbeat is no such number, or the keys can't be
+            read.
     """
 
     def __init__(
         self,
-        env: BaseEnv,
+        env: BaseEnv | gym.Env[Any, Any] | Callable[[], Any],
         hostname: str,
         port: int | None = None,
         *,
         keys: str | os.PathLike[str] | None = None,
         name: str | None = None,
         hardware: bool | None = None,
+        heartbeat: float | None = None,
     ) -> None:
         given_by_keys = "" if keys is None else Path(keys).name
         self.name = name or given_by_keys or f"{socket.gethostname()}-{os.getpid()}"
@@ -125,12 +137,14 @@ class RemoteEnvClient:
             )
         self.num_steps = 0
         self.num_sessions = 0
-        self._env = env
         self._address = _address(hostname, port)
         self._keys = None if keys is None else read_client_keys(keys)
         if hardware is None:
-            hardware = ENVS.is_hardware(env.config.backend)
-        self._heartbeat = HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT
+            hardware = not isinstance(env, BaseEnv) or ENVS.is_hardware(env.config.backend)
+        self._is_hardware = hardware
+        self._own_heartbeat = _checked_heartbeat(heartbeat)
+        self._heartbeat = heartbeat or (HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT)
+        self._env = env = _own_env(env, self.name)
         try:
             self._session = ClientSession(
                 initialised(env),
@@ -143,7 +157,12 @@ class RemoteEnvClient:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         self._bare_step = fast_path_of(env).bare_step()
         self._env_step = step_of(env)
-        self._input = input_of(env)
+        self._input = checked_input_of(env) if hardware else input_of(env)
+        # The one that uses the sockets: the caller's thread, or the one that stops hardware.
+        self._using_sockets = Lock()
+        self._is_at_work = False
+        self._late_events: list[Event] = []
+        self._watcher: Thread | None = None
         self._request: StepRequest | ResetRequest | None = None
         # The env was reset or stepped, or a session has ended, since it was asked that last.
         self._asks_if_finished = False
@@ -203,6 +222,8 @@ class RemoteEnvClient:
                     request, self._request = self._request, None
                     self._execute(request)
         except BaseException as error:
+            if self._is_hardware:
+                stop(self._env)
             self._leave(f"{type(error).__name__}: {error}")
             raise
         self._leave("the env is finished")
@@ -283,6 +304,15 @@ class RemoteEnvClient:
         if self._dealer is None and wait_ms:
             time.sleep(wait_ms / 1000)  # A poller without sockets doesn't wait.
             return
+        self._read(wait_ms)
+        is_late = self._dealer is not None and time.monotonic() >= self._due
+        if is_late and self._session.phase is Phase.AWAY:
+            self._lose(f"no server answers at {self._address}")
+        self._flush()
+        self._log_state()
+
+    def _read(self, wait_ms: int | None) -> None:
+        """Wait for messages and events, at most so long, and apply them."""
         for source, _ in self._poller.poll(wait_ms):
             dealer = self._dealer
             if dealer is None:
@@ -291,11 +321,6 @@ class RemoteEnvClient:
                 self._read_event()
             elif (first := next_frame(dealer)) is not None:
                 self._apply(self._session.receive(receive_parts(dealer, first)))
-        is_late = self._dealer is not None and time.monotonic() >= self._due
-        if is_late and self._session.phase is Phase.AWAY:
-            self._lose(f"no server answers at {self._address}")
-        self._flush()
-        self._log_state()
 
     def _log_state(self) -> None:
         """Log the state of the connection, once for each trouble."""
@@ -346,13 +371,17 @@ class RemoteEnvClient:
     # -- env ------------------------------------------------------------------------
 
     def _apply(self, event: Event | None) -> None:
-        if isinstance(event, StepRequest | ResetRequest):
+        if self._is_at_work and event is not None:
+            self._late_events.append(event)
+        elif isinstance(event, StepRequest | ResetRequest):
             self._request, self._trouble = event, ""
             self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
         elif isinstance(event, Welcomed):
             self._trouble = ""
             self.num_sessions += 1
-            self._heartbeat = event.heartbeat  # ZeroMQ takes it for the next connection.
+            # ZeroMQ takes it for the next connection. In this one, the server's pings say when to
+            # give up, if that is earlier.
+            self._heartbeat = self._own_heartbeat or event.heartbeat
         elif isinstance(event, Refused):
             self._flush()
             self._hang_up()
@@ -368,6 +397,8 @@ class RemoteEnvClient:
             self._trouble = ""
             LOG.warning("%s: session over: %s", self.name, event.cause)
             self._asks_if_finished = True
+            if self._is_hardware and type(self._env).stop is not BaseEnv.stop:
+                stop(self._env)
             self._env.on_disconnect()
 
     def _execute(self, request: StepRequest | ResetRequest) -> None:
@@ -377,33 +408,64 @@ class RemoteEnvClient:
                 self._reset(request)
             else:
                 self._step(request)
-        except Exception as error:  # noqa: BLE001  # Any error of the env goes to the trainer.
+        except Exception as error:  # noqa: BLE001 - it goes to the trainer
+            if self._is_hardware:
+                stop(self._env)
+            LOG.exception("%s: the env raised", self.name)
             self._session.fail(request.number, ErrorText.of(error))
-            self._flush()
+        self._flush()
+        late, self._late_events = self._late_events, []
+        for event in late:
+            self._apply(event)
+
+    @contextlib.contextmanager
+    def _at_work(self) -> Generator[None]:
+        """Have a thread watch the session while hardware moves, and stop it if that is over."""
+        if not self._is_hardware:
+            yield
+            return
+        if self._watcher is None:
+            self._watcher = watched(lambda: self._closed, self._to_stop)
+        try:
+            self._is_at_work = True
+            yield
+        finally:
+            with self._using_sockets:
+                self._is_at_work = False
+
+    def _to_stop(self) -> list[BaseEnv]:
+        """Return the env if it is at work for a trainer that is gone."""
+        with self._using_sockets:
+            if not self._is_at_work:
+                return []
+            if self._session.phase is Phase.SERVING:
+                self._read(0)
+            return [] if self._session.phase is Phase.SERVING else [self._env]
 
     def _reset(self, request: ResetRequest) -> None:
         began_ns = time.perf_counter_ns()
-        ret = self._env.reset(seed=request.seed, options=request.options)
+        with self._at_work():
+            ret = self._env.reset(seed=request.seed, options=request.options)
         self._answer(request.number, "reset", ret, time.perf_counter_ns() - began_ns)
 
     def _step(self, request: StepRequest) -> None:
         began_ns = time.perf_counter_ns()
         if self._bare_step is not None:
-            *outcome, info = self._bare_step(self._input(request.action, request.extras))
+            with self._at_work():
+                *outcome, info = self._bare_step(self._input(request.action, request.extras))
             busy_ns = time.perf_counter_ns() - began_ns
             self.num_steps += 1
             self._session.answer(
                 request.number, ResultFields(*outcome), info, {}, busy_ns, time.time_ns()
             )
-            self._flush()
             return
-        ret = self._env_step(self._input(request.action, request.extras))
+        with self._at_work():
+            ret = self._env_step(self._input(request.action, request.extras))
         self.num_steps += 1
         self._answer(request.number, "step", ret, time.perf_counter_ns() - began_ns)
 
     def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
         self._session.finish(number, one_result(self._env, method, returned), busy_ns)
-        self._flush()
 
 
 @contextlib.contextmanager
@@ -434,7 +496,8 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server uses other security: keys on one side only?",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the handshake was not completed: is the key right?",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the handshake was not completed: the server is busy or "
+    "gone, or one side has other keys or none",
 }
 
 
@@ -442,6 +505,29 @@ def is_address(text: str) -> bool:
     """Return True for the whole address of a server: ``tcp://host:port``, IPv6 in brackets."""
     match = _ADDRESS.fullmatch(text)
     return match is not None and 0 < int(match[1]) <= _MAX_PORT
+
+
+def _own_env(env: Any, name: str) -> BaseEnv:
+    """Return a `BaseEnv` for what a client was given.
+
+    Raises:
+        ConfigError: it is awaitable.
+    """
+    if not isinstance(env, BaseEnv):
+        make: Any = env if not isinstance(env, gym.Env) else lambda: env
+        env = env_of_callable(EnvConfig(name=name, backend="callable", task=make))
+    if is_awaitable(env):
+        raise ConfigError(
+            f"env {env.env_id!r} is awaitable (its step is `async def`), and a client steps its "
+            "env in a plain loop; give it plain methods, or run it in a worker of the trainer"
+        )
+    return env
+
+
+def _checked_heartbeat(heartbeat: float | None) -> float | None:
+    if heartbeat is not None and not 0.1 <= heartbeat < math.inf:
+        raise ConfigError(f"heartbeat: should be at least 0.1 seconds, not {heartbeat}")
+    return heartbeat
 
 
 def _address(hostname: str, port: int | None) -> str:

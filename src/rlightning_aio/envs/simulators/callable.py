@@ -89,6 +89,12 @@ class _GivenEnv(GymnasiumEnv):
         self._made = made
         super().__init__(config, worker_index, preprocess_fn)
 
+    def stop(self) -> None:
+        """Call the method of that name which the env has, if it has one."""
+        stop: Any = getattr(self._made.unwrapped, "stop", None)
+        if callable(stop):
+            stop()
+
     def _make(self) -> Any:
         made, config = self._made, self.config
         is_vector = isinstance(self._made, gym.vector.VectorEnv)

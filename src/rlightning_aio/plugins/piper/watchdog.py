@@ -305,6 +305,8 @@ class Watchdog:
             if frames:
                 self._failing_since = None
         if was_stopping and not self._guard.stopping:
+            if self._guard.cause:
+                _say(f"an arm's watchdog has stopped it: {self._guard.cause}")
             self._unsent.append(Kind.STOP + self._guard.cause.encode())
             self._stop_requested = False
         elif self._stop_requested and not self._guard.stopping:
@@ -318,6 +320,12 @@ class Watchdog:
             except OSError:
                 return
             self._unsent.pop(0)
+
+
+def _say(text: str) -> None:
+    """Write a line to stderr, if there is one; the program that drove the arm may be gone."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"rlightning_aio: {text}\n".encode())
 
 
 class _Process:

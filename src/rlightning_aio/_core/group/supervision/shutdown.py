@@ -37,7 +37,9 @@ class Shutdown:
         if self._tables.lifetime.closed:
             return
         self._tables.lifetime.end()
-        self._tables.stop_hardware(range(len(self._tables.envs)))
+        for record in self._tables.records:
+            if record.place is None:  # Clients get a goodbye, as their host closes.
+                self._tables.stop_hardware(record.slots)
         alive = [r for r in self._tables.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         interrupt: KeyboardInterrupt | None = None
         for record in alive:

@@ -255,6 +255,12 @@ class EnvServerHost(Host):
         """Return the action of a step: `given`, or that of the row if it travels there."""
         return given if self._read_action is None else self._read_action()
 
+    def stop(self, index: int, number: int) -> None:
+        """Send the client away, which stops its env, whatever that does now."""
+        del index, number
+        self.server.sessions.dismiss(self._place, "an action was refused, or a call ended early")
+        self.server.flush()
+
     # -- events of the place -------------------------------------------------------------
 
     def on_taken(self, client: str, announced: Announcement) -> None:
