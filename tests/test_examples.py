@@ -87,7 +87,8 @@ def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
     assert {program: printed[program] for program in shown} == shown
     for example in map(str, examples):
         assert printed[example]
-        assert complained[example] == ""
+        # On a busy machine, another placement may be the faster one.
+        assert re.sub(r"entry .*`rlightning-aio bench` measures\n", "", complained[example]) == ""
 
 
 def test_omitted_pages_are_run_by_other_tests() -> None:
