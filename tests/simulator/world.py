@@ -58,6 +58,7 @@ from rlightning_aio._core.hosts import inbox
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
+from rlightning_aio._core.hosts.running import build_env
 from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -209,6 +210,7 @@ class World:
             (sharing, "_time_limit", lambda _: None),
             (process_hosts, "processor_ns", nothing_known),
             (spares, "kill_below", nothing_known),
+            (build_env, "register_tasks", nothing_known),  # The registry is this process's.
             # Some steps are timed by the kernel, which has a clock of its own.
             (hint, "_ENOUGH_RESULTS", math.inf),
             # Each process has a heap of its own, so these would act on one that is small.

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-from functools import partial
 from typing import TYPE_CHECKING, Any
-
-from gymnasium.error import UnregisteredEnv
 
 from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
@@ -63,6 +59,7 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
     """
     if not inline:
         seed_generators()
+        register_tasks(order.tasks)
     for index in range(len(order.worker_indices)):
         yield built_env(order, index, inline=inline)
 
@@ -91,7 +88,9 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
         config = config.model_copy(update={"task": makers[index]})
 
     def make() -> BaseEnv:
-        env = _built(order, config, worker_index, order.preprocess_fns[index])
+        fn = order.preprocess_fns[index]
+        hardware = order.is_hardware
+        env = build_env(config, order.env_class, worker_index, fn, is_hardware=hardware)
         env.trainer_pid = None if inline else order.trainer_pid
         return env
 
@@ -121,20 +120,3 @@ def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner  # noqa: PLC0415
 
     return AwaitedRunner
-
-
-def _built(order: StartOrder, config: EnvConfig, worker_index: int, preprocess_fn: Any) -> BaseEnv:
-    build = partial(
-        build_env,
-        config,
-        order.env_class,
-        worker_index,
-        preprocess_fn,
-        is_hardware=order.is_hardware,
-    )
-    if order.tasks:
-        # Only if one is missing: a module that registers it here would cause a warning.
-        with contextlib.suppress(UnregisteredEnv):
-            return build()
-        register_tasks(order.tasks)
-    return build()

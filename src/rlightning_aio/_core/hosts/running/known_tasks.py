@@ -1,20 +1,23 @@
-"""Gymnasium tasks that are registered in the trainer, for workers that have to make them.
+"""Gymnasium's registry in workers, as it is in the trainer.
 
-A script registers its tasks when it starts, and workers don't run the script.
+A script registers its tasks when it starts, and may change registered ones; workers don't run it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import pickle
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+from gymnasium.envs import registration
 
-from rlightning_aio.protocol.pickling import dumped_with_code
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from gymnasium.envs.registration import EnvSpec
 
@@ -22,13 +25,24 @@ __all__ = ["known_tasks", "register_tasks"]
 
 
 def known_tasks() -> tuple[bytes, ...]:
-    """Return all registered tasks that can be pickled."""
-    return tuple(_pickled(list(gym.registry.values())))
+    """Return all registered tasks that can be pickled.
+
+    Those that are named by texts come together; a class or function of another is unpickled by
+    itself, so that one whose module is missing in the worker costs no others.
+    """
+    specs = list(gym.registry.values())
+    named = [spec for spec in specs if _is_text(spec.entry_point, spec.vector_entry_point)]
+    others = [spec for spec in specs if not _is_text(spec.entry_point, spec.vector_entry_point)]
+    return (*_pickled(named), *(one for spec in others for one in _pickled([spec])))
+
+
+def _is_text(*entry_points: Any) -> bool:
+    return all(isinstance(one, str | None) for one in entry_points)
 
 
 def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
     try:
-        yield dumped_with_code(specs)
+        yield dumped(specs, "") if len(specs) > 1 else dumped_with_code(specs)
     except Exception:
         if len(specs) > 1:
             for spec in specs:
@@ -36,8 +50,38 @@ def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
 
 
 def register_tasks(tasks: Sequence[bytes]) -> None:
-    """Register the tasks of `known_tasks` that this process lacks and can unpickle."""
+    """Register the tasks of `known_tasks` that this process can unpickle.
+
+    They hold whatever this process has imported or will import: in the trainer, that came before
+    the program changed them. A call of `gymnasium.register` outside of an import still counts.
+    """
+    held: set[str] = set()
     for pickled in tasks:
         with contextlib.suppress(Exception):
             for spec in pickle.loads(pickled):
-                gym.registry.setdefault(spec.id, spec)
+                gym.registry[spec.id] = spec
+                held.add(spec.id)
+    modules: tuple[Any, ...] = (gym, gym.envs, registration)
+    for module in modules:
+        module.register = _holding(module.register, held)
+
+
+def _holding(register: Any, held: set[str]) -> Callable[..., None]:
+    """`register` without effect on ids in `held` while a module is imported."""
+    original: Any = getattr(register, "__wrapped__", register)
+
+    @functools.wraps(original)
+    def register_unless_held(id: str, *args: Any, **kwargs: Any) -> None:  # noqa: A002
+        if id not in held or not _is_importing():
+            original(id, *args, **kwargs)
+
+    return register_unless_held
+
+
+def _is_importing() -> bool:
+    frame = sys._getframe()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return True
+        frame = frame.f_back
+    return False
