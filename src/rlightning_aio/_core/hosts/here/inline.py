@@ -7,7 +7,6 @@ Requests wait in a queue, so sending never blocks; while a driver waits, it exec
 from __future__ import annotations
 
 from collections import deque
-from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
@@ -15,7 +14,7 @@ from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
-    Result,
+    Reported,
     Withdrawn,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
@@ -41,10 +40,9 @@ if TYPE_CHECKING:
 
 __all__ = ["InlineHost"]
 
-_Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
-"""An entry, and the function that executes it."""
+_Waiting: TypeAlias = "tuple[int, NDArray[np.int64], Callable[[], Any]]"
+"""An entry, by itself and as an array of one, and the function that executes it."""
 _STEP: Final = int(Operation.STEP)
-_NOTHING: Final = nullcontext()
 
 
 class InlineHost(Host):
@@ -84,7 +82,7 @@ class InlineHost(Host):
         return copied(arguments)
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
-        asked = cast("list[int]", entries.tolist())
+        asked, own = cast("list[int]", entries.tolist()), entries.copy()
         for position, entry in enumerate(asked):
             runner = self._runners[slot_of(entry) - self.first_slot]
             given = None if arguments is None else arguments[position]
@@ -92,7 +90,7 @@ class InlineHost(Host):
                 execute = partial(runner.execute, op_of(entry), given)
             else:
                 execute = runner.step
-            self._queue.append((entry, execute))
+            self._queue.append((entry, own[position : position + 1], execute))
 
     def abort(self, entries: NDArray[np.int64]) -> None:
         aborted = set(cast("list[int]", entries.tolist()))
@@ -109,16 +107,22 @@ class InlineHost(Host):
     def execute_next(self) -> bool:
         if not self._queue:
             return False
-        entry, execute = self._queue.popleft()
+        entry, alone, execute = self._queue.popleft()
         outcome = error = None
         runner = self._runners[slot_of(entry) - self.first_slot]
         try:
-            with stopped_by_signals(runner.env) if self._order.is_hardware else _NOTHING:
+            if self._order.is_hardware:
+                with stopped_by_signals(runner.env):
+                    outcome = self._driver.interruptible(execute)
+            else:
                 outcome = self._driver.interruptible(execute)
         except BaseException as raised:
             error = raised
-        completion = completion_of(self.host_id, runner, entry, outcome, error)
-        self._post(completion or Result(self.host_id, entry, {}))
+        completion = None
+        if outcome is not None or error is not None or op_of(entry) != _STEP:
+            completion = completion_of(self.host_id, runner, entry, outcome, error)
+        # The group records all that are reported side by side in one go.
+        self._post(completion or Reported(self.host_id, alone))
         if isinstance(error, KeyboardInterrupt):
             raise error  # It is meant for the program, but the request ends, too.
         return True
