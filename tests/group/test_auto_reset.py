@@ -120,8 +120,10 @@ async def test_an_env_whose_episode_ended_is_reset(start: Any, what: int) -> Non
 
 
 @pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_an_end_is_remembered_from_one_context_to_the_next(start: Any, what: int) -> None:
-    """No step in a context follows an end, wherever it was seen; a cut episode goes on."""
+async def test_a_context_begins_with_the_last_results_and_forgets_what_was_due(
+    start: Any, what: int
+) -> None:
+    """An end that was seen before the context counts, one that an earlier context saw doesn't."""
     group = await start(ENTRY)
     await group.reset()
     await group.step(responses("probe-0", what=what))  # These end before the first context.
@@ -135,14 +137,14 @@ async def test_an_end_is_remembered_from_one_context_to_the_next(start: Any, wha
         assert steps_of(batch) == [2], "outside a context, the caller handles ends"
     with group.auto_reset(max_episode_steps=2):
         batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
+        assert (steps_of(batch), flags) == ([3, 1, 1], [True, False, False])
         batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([1, 2, 2], [False, True, True])
+        assert (steps_of(batch), flags) == ([0, 2, 2], [False, True, True])
     batch, _ = await group.step(responses("probe-2"))
     assert steps_of(batch) == [3], "steps outside a context have no flags"
     with group.auto_reset(max_episode_steps=4, on_done=False):
         batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([2, 3, 4], [False, False, True])
+        assert (steps_of(batch), flags) == ([1, 3, 4], [False, False, True])
 
 
 async def test_each_entry_has_its_own_limit(start: Any) -> None:

@@ -158,6 +158,7 @@ class State:
 
     Attributes:
         count: steps since the reset, as returned; cut: the step limit was reached there.
+        forgotten: a context was left since its last result, and nothing is due any more.
         counted: which sub-environments are within an episode.
         begun: seed and options of the reset that began the episode.
         infos, finals: as reported with the last result; no infos if they aren't known.
@@ -165,7 +166,7 @@ class State:
 
     def __init__(self, codes: Sequence[int], entry: Entry) -> None:
         self.scripts = Scripts(codes, entry.mode, entry.own_limit)
-        self.count, self.cut = 0, False
+        self.count, self.cut, self.forgotten = 0, False, False
         self.returns, self.lengths = [0.0] * len(codes), [0] * len(codes)
         self.counted = [False] * len(codes)
         self.begun: tuple[int | None, dict[str, Any] | None] = None, None
@@ -194,7 +195,8 @@ class State:
     @property
     def ended(self) -> bool:
         """All episodes have ended, and the env resets none of them by itself."""
-        return self.scripts.mode == "disabled" and all(sub.over for sub in self.scripts.subs)
+        over = all(sub.over for sub in self.scripts.subs)
+        return self.scripts.mode == "disabled" and over and not self.forgotten
 
     @property
     def refuses(self) -> bool:
@@ -217,6 +219,7 @@ class State:
     def play(self, request: Request, limit: float = math.inf) -> Expected:
         """Do what was asked, under the limit of the `auto_reset` context that is open."""
         subs, mode = self.scripts.subs, self.scripts.mode
+        self.forgotten = False
         many = range(len(subs))
         nothing = [0.0 for _ in many], [False for _ in many], [False for _ in many]
         if request.kind == "restore":

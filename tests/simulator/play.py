@@ -664,7 +664,8 @@ class Play(Session):
         self.context.__exit__(None, None, None)
         self.context = self.model.context = None
         for env in self.model.envs.values():
-            env.state.cut = False
+            for state in (env.state, *env.loose, *env.torn):
+                state.cut, state.forgotten = False, True
 
     # -- operations: calls and handles
 

@@ -152,7 +152,7 @@ class Core:
 
     @property
     def _all_slots(self) -> NDArray[np.intp]:
-        """The slots of local envs, and of members that are present or not."""
+        """The slots of all envs."""
         return np.arange(len(self.envs))
 
     def drain_requests(

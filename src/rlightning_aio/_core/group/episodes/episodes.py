@@ -187,7 +187,7 @@ class Episodes:
         """Close the context: steps are plain again, and no env is due for a reset."""
         self._limits = None
         self.auto_reset_is_open = False
-        self.due[:] = self._cut[:] = False
+        self.due[:] = self._cut[:] = self._ended[:] = False
 
     def _update_due(self) -> None:
         if self._resets_ended:

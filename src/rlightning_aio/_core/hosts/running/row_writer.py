@@ -143,23 +143,15 @@ class RowWriter:
         return self._write_data(result, extra, is_fresh=self._hands_over)
 
     def write_reset(
-        self,
-        result: BareResult,
-        busy_ns: int,
-        extra: dict[str, Any] | None = None,
-        *,
-        is_loss: bool = False,
+        self, result: BareResult, busy_ns: int, extra: dict[str, Any] | None = None
     ) -> OutOfBand | None:
         """Write the first result of an episode, and return the part that is out of band.
 
-        It has no reward and no end, whatever `result` says, and its sums are 0. With `is_loss` it
-        marks the loss of the episode before, which is cut short and not counted. All else is as of
+        It has no reward and no end, whatever `result` says, and its sums are 0. All else is as of
         `write_step`.
         """
         self._write_times(busy_ns)
         self._write_no_transition()
-        if is_loss:
-            self._truncated[...] = True
         self._sums.begin()
         return self._write_data(result, extra)
 
