@@ -234,7 +234,7 @@ class VecEnv(_Base):
         if "final_obs" not in info:
             raise ValueError(
                 f"{type(self._inner).__name__} has ended an episode without final_obs in its "
-                "infos, so nobody knows the last observation: a vector env with same-step "
+                "infos, so the last observation is unknown: a vector env with same-step "
                 "autoreset must report it"
             )
         last = {"terminal_observation": info.pop("final_obs")}

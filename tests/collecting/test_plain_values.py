@@ -130,6 +130,7 @@ def test_values_of_several_sizes_are_collected(placement: str, kind: str, wait_a
         collector = Collector(group, policy, num_transitions=12, wait_all=wait_all)
         for _ in range(2):
             rollout = collector.collect()
+            assert rollout.env_ids == {0: "c-0", 1: "c-1"}
             observations, actions = rollout.observation, rollout["action"]
             if wait_all:
                 observations, actions = itertools.chain(*observations), itertools.chain(*actions)

@@ -165,7 +165,7 @@ class _Engine:
                 one.stop("the iterator of play() was closed")
             await surely({*self._playing})
             for task in self._playing:
-                # Read, so that asyncio doesn't log an error that nobody asks for.
+                # Read, so that asyncio doesn't log an error that is not asked for.
                 _ = task.cancelled() or task.exception()
             self.news.set()
 

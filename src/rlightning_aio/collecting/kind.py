@@ -100,6 +100,7 @@ class EnvKind:
     ) -> None:
         self.policy = policy
         self._meta_of = meta_of
+        self._env_ids: dict[int, str] = {}
         self.quota = quota
         self.num_steps = 0
         self.held: Part | None = None
@@ -123,6 +124,7 @@ class EnvKind:
         env_ids = batch.env_ids()
         newcomers: list[int] = rows.tolist()
         for row in newcomers:
+            self._env_ids[int(results.index[row])] = env_ids[row // results.num_sub_envs]
             meta = self._meta_of(env_ids[row // results.num_sub_envs])
             if meta is None:
                 continue
@@ -199,7 +201,7 @@ class EnvKind:
         columns["lag"] = version - columns["policy_version"]
         episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
-        return Rollout(columns, Ends(ends, end_observation), episodes)
+        return Rollout(columns, Ends(ends, end_observation), episodes, dict(self._env_ids))
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)

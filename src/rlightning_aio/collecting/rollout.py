@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from rlightning_aio.protocol.columns import gather
 from rlightning_aio.trees import Tree, mapped, zipped
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -53,6 +54,7 @@ class Rollout:
         policy_version: int64, `Collector.policy_version` when the action was chosen.
         lag: int64, how many versions that is behind the newest.
         index: int64, index of the env in the group: see `BatchedData.index`.
+        env_ids: the id of the env, or the place of a client, by index.
         first: True if an episode begins with the transition, or continues after a loss.
         ends: ``[k]``, positions of the ends (for ``[T, N]``, in the flattened block). The last
             transitions of chains come first, in the order of chains.
@@ -74,8 +76,15 @@ class Rollout:
     index: NDArray[np.int64]
     first: NDArray[np.bool_]
 
-    def __init__(self, columns: dict[str, Tree], ends: Ends, episodes: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        columns: dict[str, Tree],
+        ends: Ends,
+        episodes: dict[str, Any],
+        env_ids: Mapping[int, str] = MappingProxyType({}),
+    ) -> None:
         self._columns = columns
+        self.env_ids = env_ids
         index: Any = columns["index"]
         self.shape: tuple[int, ...] = index.shape
         self.ends, self._end_observation = ends

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.hosts.logs import LogSettings
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.outcomes import Loss
@@ -91,6 +92,7 @@ class StartOrder:
         trainer_pid: the process that gives the order; None if it runs on another machine.
         tasks: of `known_tasks`.
         is_hardware: the envs move something real.
+        logs: how a worker logs; None for Python's own way.
     """
 
     config: EnvConfig
@@ -101,6 +103,7 @@ class StartOrder:
     trainer_pid: int | None = field(default_factory=os.getpid)
     tasks: tuple[bytes, ...] = ()
     is_hardware: bool = False
+    logs: LogSettings | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, placement_for
+from rlightning_aio._core.hosts.logs import log_settings
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, makers_of
@@ -35,6 +36,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
     variables = _environment_variables([config for config, _ in shares])
     elsewhere = any(placement_for(config).spreads for config, _ in shares)
     tasks = known_tasks() if elsewhere else ()
+    logs = log_settings() if elsewhere else None
     orders = [
         StartOrder(
             config=_own_makers(config, [index for index, _ in share]).model_copy(
@@ -46,6 +48,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
             spins=num_processes <= num_cores,
             tasks=tasks,
             is_hardware=ENVS.is_hardware(config.backend),
+            logs=logs,
         )
         for host_id, (config, share) in enumerate(shares)
     ]

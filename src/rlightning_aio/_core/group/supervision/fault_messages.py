@@ -193,7 +193,7 @@ def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -
         kind = "not_started" if record.late or record.rebuild_error is not None else "env_died"
         why = Loss(cause, kind, "env", at_fault)
     if at_fault is None and record.awaits_several:
-        return why._replace(blame="infrastructure")  # All were waiting, so nobody is named.
+        return why._replace(blame="infrastructure")  # All were waiting, so none is named.
     return why
 
 

@@ -107,7 +107,7 @@ class _Turn(NamedTuple):
         workers, num_envs, cores: how many there are.
         whole: of a turn.
         step: of an env in it.
-        computing: processor time of a worker for it; None if nobody knows.
+        computing: processor time of a worker for it; None if unknown.
         apart: between a result and the next request of an env.
         batches: in a turn.
     """

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import os
 import time
 from collections import deque
 from contextvars import Context, ContextVar
@@ -48,7 +49,12 @@ F = TypeVar("F", bound=asyncio.Future[Any])
 
 
 def run_loop(main: Coroutine[Any, Any, T]) -> T:
-    """Run `main` to its end on a uvloop event loop, or on asyncio's if uvloop is missing."""
+    """Run `main` to its end on a uvloop event loop.
+
+    On asyncio's, if uvloop is missing, or ``RLIGHTNING_AIO_UVLOOP`` is 0 in the environment.
+    """
+    if os.environ.get("RLIGHTNING_AIO_UVLOOP") == "0":
+        return asyncio.run(main)
     try:
         import uvloop  # noqa: PLC0415  # There is none for Windows.
     except ImportError:

@@ -50,7 +50,10 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.process.fork_messages import Message
 
-__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "die_with_parent", "main"]
+__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "GYMNASIUM", "die_with_parent", "main"]
+
+GYMNASIUM: Final = (1, 2)
+"""The oldest version that workers can use; that of pyproject.toml."""
 
 BOOTSTRAP: Final = """
 import os, sys
@@ -438,11 +441,26 @@ def _import(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> s
             with contextlib.suppress(Exception):
                 importlib.import_module(module)
     except Exception:
-        error = traceback.format_exc()[-_ERROR_CHARACTERS:]
+        error = f"{_outdated()}{traceback.format_exc()[-_ERROR_CHARACTERS:]}"
     finish.close()
     watcher.join()
     finished.close()
     return error
+
+
+def _outdated() -> str:
+    """Name the version of Gymnasium that is needed, if this interpreter has an older one."""
+    # Not at the top: nothing else needs it, and it takes time.
+    from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415
+
+    try:
+        found = version("gymnasium")
+        is_old = tuple(map(int, found.split(".")[:2])) < GYMNASIUM
+    except (PackageNotFoundError, ValueError):
+        return ""
+    needed = ".".join(map(str, GYMNASIUM))
+    words = f"{sys.executable} has gymnasium {found}, and workers need {needed} or later:"
+    return f"{words} pip install 'gymnasium>={needed}'\n" if is_old else ""
 
 
 def _process_of(pid: int) -> int:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
+from rlightning_aio._core.hosts.logs import log_like
 from rlightning_aio._core.hosts.messages import Built, Closed
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
@@ -269,6 +270,8 @@ class Worker:
             assert order is not None
             self._spinner = Spinner(enabled=order.spins)
             self._order = order
+            if order.logs is not None:
+                log_like(order.logs, _name_of(order))
             for runner in built_envs(order):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
@@ -376,6 +379,13 @@ class Worker:
         """Send a completion to the trainer."""
         self._write(encode(*frame_of(completion)))
         self._rings.count_frame()
+
+
+def _name_of(order: StartOrder) -> str:
+    """The ids of a worker's envs, such as ``pole-3`` or ``pole-0 to pole-3``."""
+    first, last = order.worker_indices[0], order.worker_indices[-1]
+    name = f"{order.config.name}-{first}"
+    return name if first == last else f"{name} to {order.config.name}-{last}"
 
 
 def _end_child(error: BaseException | None) -> NoReturn:
