@@ -207,7 +207,7 @@ def test_a_resumed_evaluation_equals_an_uninterrupted_one(tmp_path: Path) -> Non
     seen: list[Attempt] = []
     with ResultsFile(path) as results:
         rest = evaluated(group_of(*envs), 4, seed=5, results=results, on_episode=seen.append)
-        assert len(results.played) == 12
+        assert len(results) == 12
     assert by_number(rest) == by_number(whole)
     assert seen == rest.attempts
     assert sorted(seen[:5], key=str) == sorted(kept, key=str)

@@ -47,6 +47,11 @@ class Room(gym.Env[Any, Any]):
         """Something to call."""
         return 2 * number
 
+    def mark(self, number: int = 0) -> int:
+        """Leave a number behind; return what was left, at first 0."""
+        self.number = number or getattr(self, "number", 0)
+        return self.number
+
     def stall(self) -> None:
         """Something that does not return."""
         time.sleep(3600)
@@ -81,6 +86,10 @@ class AwaitedRoom(Awaitable):
     async def tool(self, number: int) -> int:
         """Something to call."""
         return self.env.tool(number)
+
+    async def mark(self, number: int = 0) -> int:
+        """As of a room."""
+        return self.env.mark(number)
 
     async def stall(self) -> None:
         """Something that does not return."""

@@ -10,11 +10,13 @@ import asyncio
 import contextlib
 import math
 import tempfile
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
+from unittest.mock import patch
 
 import numpy as np
 from simulator.model import Violation, require
@@ -23,7 +25,7 @@ from simulator.session import action_of
 from simulator.training import InContext
 from simulator.world import Faults
 
-from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, file, play
 from rlightning_aio.attempts.rules import is_retried
 from rlightning_aio.errors import BadAction, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import BLAMES, is_bystanders
@@ -61,6 +63,15 @@ class Played:
     episode: AttemptEpisode
     acts: list[Act] = field(default_factory=list)
     end: str = ""
+
+
+class _AtOnce(Executor):
+    """Writes without a thread, which no world has."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        done = Future[Any]()
+        done.set_result(fn(*args, **kwargs))
+        return done
 
 
 class Attempts(InContext):
@@ -163,6 +174,7 @@ class Attempts(InContext):
         if self.has_ended:
             return
         self.op_seed, self.played, self.stubborn = rng.getrandbits(32), {}, set()
+        self.is_bug = False
         specs = self.specs(rng, 6)
         size, rules = rng.randint(1, 4), self._rules(rng)
         leave = self._leave(rng, len(specs))
@@ -179,7 +191,7 @@ class Attempts(InContext):
                 self.may_hang = may_time_out
                 await playing(None, None)
                 self._check_file(path, specs, size, rules)
-        if not (leaves or self.has_ended):
+        if not (leaves or self.has_ended or self.is_bug):
             keys = sorted(one.spec.key for one in found)
             require(keys == sorted(spec.key for spec in specs), "other groups", keys)
         if self.stubborn:
@@ -216,7 +228,7 @@ class Attempts(InContext):
         found: list[AttemptGroup] = []
 
         async def taken() -> None:
-            with ResultsFile(path) if path else contextlib.nullcontext() as results:
+            with results_file(path) if path else contextlib.nullcontext() as results:
                 groups = play(self.group, tasks(), self.agent, size, rules, results)
                 async with contextlib.aclosing(groups):
                     async for attempts in groups:
@@ -252,7 +264,11 @@ class Attempts(InContext):
         require(not late, "the envs are not free in time")
 
     def _end(self, error: RLightningError) -> None:
-        """Check that all envs are gone that could play something."""
+        """Check that no env is left that could play something, or all agents have raised."""
+        if "the agent has failed in all" in str(error):
+            require("raise" in self.features or "misuse" in self.features, "no agent has raised")
+            self.is_bug = True
+            return
         given_up = self.given_up()
         entries = {env.entry.name for env in self.envs if env.env_id not in given_up}
         require(
@@ -363,11 +379,11 @@ class Attempts(InContext):
 
     def _check_file(self, path: Path, specs: list[EpisodeSpec], size: int, rules: Rules) -> None:
         """A file has each attempt once, and none is missing."""
-        with ResultsFile(path) as results:
-            places = [(one.spec.key, one.index) for one in results.played]
-            whole = [one.spec.key for one in results.played if not one.outcome.is_failure]
+        with results_file(path) as results:
+            places = [(one.spec.key, one.index) for one in results]
+            whole = [one.spec.key for one in results if not one.outcome.is_failure]
         require(len({*places}) == len(places), "an attempt is twice in the file", places)
-        if self.has_ended:
+        if self.has_ended or self.is_bug:
             return
         for spec in specs:
             count = sum(key == spec.key for key, _ in places)
@@ -379,6 +395,11 @@ class Attempts(InContext):
         self.has_ended |= bool(self.given_up())
         await self.op_attempts(Random(1))
         await super().finish()
+
+
+def results_file(path: Path) -> ResultsFile:
+    with patch.object(file, "new_writer", _AtOnce):
+        return ResultsFile(path)
 
 
 async def _loaded(specs: list[EpisodeSpec]) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from typing import TYPE_CHECKING, Any
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, EnvRaised, RLightningError
 from rlightning_aio.outcomes import Outcome
+from rlightning_aio.protocol.entries import RENEW
 from rlightning_aio.trees import copied
 from rlightning_aio.types import PolicyResponse
 
@@ -87,7 +89,7 @@ class AttemptEpisode:
             action: of the env's action space.
             columns: anything to be kept with the action (``tokens``, ``log_prob``, …): see
                 `Attempt.columns`. The env gets it, too, as it does from a `PolicyResponse`. Lists,
-                dicts and arrays are copied, as the agent may go on to write into them.
+                dicts and arrays are copied, as the agent may write into them later.
 
         Raises:
             EnvRaised: its reward is None or not a finite number; the attempt has failed.
@@ -179,6 +181,15 @@ class AttemptInPlay(AttemptEpisode):
     async def leave(self) -> None:
         """End what is in flight; the env is idle after that."""
         await self._episode.__aexit__()
+
+    async def renew(self) -> None:
+        """Have an idle env rebuilt for its next reset, as one that has raised may be unusable.
+
+        Hardware stays, and so do the envs of clients.
+        """
+        if self._episode.lost is None:  # Else it is rebuilt already.
+            with contextlib.suppress(NotImplementedError, RLightningError):
+                await self._episode.env.call(RENEW)
 
     def end(self, why: str) -> None:
         """Refuse further steps."""

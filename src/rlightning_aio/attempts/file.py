@@ -1,50 +1,74 @@
 """`ResultsFile`: attempts as JSON lines; an interrupted run or evaluation resumes from them.
 
-Rule: one process at a time writes a file, and each line is complete before the next one. So however
-a run ends, the file holds each attempt that has ended, once. An incomplete last line is ignored.
+Rule: one process at a time writes a file, and each line is complete before the next one. A group of
+attempts is handed out when its lines are there. So however a run ends, none is lost. An incomplete
+last line is ignored.
 The first line says what plays.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import fcntl
 import json
 import os
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias
 
 from rlightning_aio.attempts.records import attempt_of
+from rlightning_aio.attempts.rules import is_final
+from rlightning_aio.attempts.spec import spec_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import check_writable
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping
+    from collections.abc import Callable, Generator, Iterator, Mapping
 
     from rlightning_aio.attempts.records import Attempt
+    from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
 
-__all__ = ["ResultsFile"]
+__all__ = ["ResultsFile", "new_writer"]
+
+_HANDED_OUT: Final = "handed_out"
+
+
+def new_writer() -> Executor:
+    """Make what writes the lines, one after another."""
+    return ThreadPoolExecutor(1, "results file")
+
+
+_Place: TypeAlias = "tuple[EpisodeKey, int, int]"
+"""What identifies an attempt: its episode's key, its index and its sub-environment."""
+
+
+class _Line(NamedTuple):
+    start: int
+    length: int
+    is_final: bool
 
 
 class ResultsFile:
     """Attempts as JSON lines, for this process alone; `play` and `evaluate` continue from it.
 
-    A line holds an attempt after its last try, as of `Attempt.to_json`. An attempt that had not
-    ended starts over. Cancelled attempts are not written: with ``Rules(first=…)`` a task is done
-    when as many others are in the file.
+    A line holds an attempt after its last try, as of `Attempt.to_json`, or says which group of
+    attempts `play` has handed out. An attempt that had not ended starts over, and so does one that
+    has failed by no fault of the policy; the last line of an attempt counts. Cancelled attempts are
+    not written: with ``Rules(first=…)`` a task is done when as many others are in the file. Lines
+    are written by a thread of its own, and read again when they are asked for.
 
     ::
 
         with ResultsFile("results.jsonl", {"policy": "act-1"}) as results:
             evaluate(group, policy, episodes, results=results)
 
+    Its length is the number of attempts in it, and its elements are these.
+
     Args:
         path: the file, created if it is missing; a link is followed.
         subject: what plays, as JSON values: the first line of the file. A file with another subject
             is refused.
-
-    Attributes:
-        played: the attempts in the file.
 
     Raises:
         ConfigError: the file can't be read and written, another process has it open, it belongs
@@ -55,7 +79,11 @@ class ResultsFile:
         self, path: str | os.PathLike[str], subject: Mapping[str, Any] | None = None
     ) -> None:
         self._name = f"results file {os.fspath(path)}"
-        self.played: list[Attempt] = []
+        self._lines: dict[_Place, _Line] = {}
+        self._handed_out: set[EpisodeKey] = set()
+        self._writer = new_writer()
+        self._last: Future[None] | None = None
+        self._error: ConfigError | None = None
         try:
             # Converted as reading does it: lists for tuples, texts for the keys of dicts.
             about: dict[str, Any] = json.loads(json.dumps({**(subject or {})}, allow_nan=False))
@@ -75,23 +103,85 @@ class ResultsFile:
             raise
 
     def add(self, attempt: Attempt) -> None:
-        """Save an attempt after its last try, as `play` and `evaluate` do.
+        """Have an attempt written after its last try, as `play` and `evaluate` do.
 
         Raises:
-            ConfigError: it can't be written; the file is unchanged.
+            ConfigError: what was given before can't be written.
         """
-        self._write(attempt.to_json())
-        self.played.append(attempt)
+        self._submit(self._add, attempt)
+
+    def hand_out(self, spec: EpisodeSpec) -> None:
+        """Have it written that the attempts at a task are handed out; it raises as `add` does."""
+        self._handed_out.add(spec.key)
+        self._submit(self._write, {_HANDED_OUT: spec.to_json()})
+
+    def is_handed_out(self, spec: EpisodeSpec) -> bool:
+        """Return True if the attempts at a task were handed out."""
+        return spec.key in self._handed_out
+
+    def find(self, spec: EpisodeSpec, index: int, sub_env: int = 0) -> Attempt | None:
+        """Read an attempt that is not played again; None if there is none."""
+        line = self._lines.get((spec.key, index, sub_env))
+        return self._attempt_at(line) if line is not None and line.is_final else None
+
+    def __len__(self) -> int:
+        self.flush()
+        return len(self._lines)
+
+    def __iter__(self) -> Iterator[Attempt]:
+        self.flush()
+        return map(self._attempt_at, [*self._lines.values()])
+
+    def flush(self) -> None:
+        """Wait until all is written.
+
+        Raises:
+            ConfigError: something can't be written; the file has no part of it.
+        """
+        if self._last is not None:
+            self._last.result()
+        self._check()
+
+    async def written(self) -> None:
+        """Wait as `flush` does, beside an event loop."""
+        if self._last is not None and not self._last.done():
+            await asyncio.wrap_future(self._last)
+        self._check()
 
     def close(self) -> None:
-        """Close the file, so that another process may open it."""
+        """Close the file, so that another process may open it; raises as `flush` does."""
+        self._writer.shutdown()
         self._file.close()
+        self._check()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+    # -- the thread that writes -------------------------------------------------------
+
+    def _submit(self, write: Callable[[Any], object], what: Any) -> None:
+        self._check()
+        self._last = self._writer.submit(self._noting, write, what)
+
+    def _noting(self, write: Callable[[Any], object], what: Any) -> None:
+        """Write, unless something before could not be written."""
+        if self._error is None:
+            try:
+                write(what)
+            except ConfigError as error:
+                self._error = error
+
+    def _add(self, attempt: Attempt) -> None:
+        start, length = self._write(attempt.to_json())
+        place = attempt.spec.key, attempt.index, attempt.sub_env
+        self._lines[place] = _Line(start, length, is_final(attempt.outcome))
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
 
     # -- lines ------------------------------------------------------------------------
 
@@ -101,6 +191,9 @@ class ResultsFile:
             yield
         except OSError as error:
             raise ConfigError(f"{self._name}: can't be written: {error.strerror}") from error
+
+    def _attempt_at(self, line: _Line) -> Attempt:
+        return attempt_of(json.loads(os.pread(self._file.fileno(), line.length, line.start)))
 
     def _lock(self) -> None:
         """Lock the file until it is closed, or until this process ends in any way."""
@@ -115,27 +208,41 @@ class ResultsFile:
 
     def _read(self, subject: dict[str, Any]) -> None:
         self._file.seek(0)
-        text, first = self._file.read(), _line_of(subject)
-        if len(text) < len(first) and first.startswith(text):  # Empty, or cut in that line.
-            self._file.truncate(0)
-            self._write(subject)
-            return
-        whole = text[: text.rfind(b"\n") + 1]
-        try:
-            before, *rows = [{**json.loads(line)} for line in whole.splitlines()]
-            self.played += map(attempt_of, rows)
-        except (ValueError, TypeError, KeyError):
-            raise ConfigError(f"{self._name}: is not a file of results") from None
+        first, start = _line_of(subject), 0
+        with open(self._file.fileno(), "rb", closefd=False) as lines:
+            line = lines.readline()
+            if len(line) < len(first) and first.startswith(line):  # Empty, or cut in that line.
+                self._file.truncate(0)
+                self._write(subject)
+                return
+            try:
+                before = {**json.loads(line)}
+                start = len(line)
+                while (line := lines.readline()).endswith(b"\n"):
+                    self._note(json.loads(line), start, len(line))
+                    start += len(line)
+            except (ValueError, TypeError, KeyError):
+                raise ConfigError(f"{self._name}: is not a file of results") from None
         if before != subject:
             raise ConfigError(
                 f"{self._name}: belongs to {before}, not to {subject}; name another file, or use "
                 "the same settings as before"
             )
-        self._file.truncate(len(whole))
+        self._file.truncate(start)
 
-    def _write(self, value: dict[str, Any]) -> None:
-        """Append a line; it is complete, or the file is unchanged."""
+    def _note(self, row: dict[str, Any], start: int, length: int) -> None:
+        """Note a line, not what it has: that is megabytes."""
+        if _HANDED_OUT in row:
+            self._handed_out.add(spec_of(row[_HANDED_OUT]).key)
+            return
+        attempt = attempt_of(row)
+        place = attempt.spec.key, attempt.index, attempt.sub_env
+        self._lines[place] = _Line(start, length, is_final(attempt.outcome))
+
+    def _write(self, value: dict[str, Any]) -> tuple[int, int]:
+        """Append a line; return its place. It is complete, or the file is unchanged."""
         line = _line_of(value)
+        length = len(line)
         with self._writing():
             end = self._file.seek(0, os.SEEK_END)
             try:
@@ -144,6 +251,7 @@ class ResultsFile:
             except OSError:
                 self._file.truncate(end)
                 raise
+        return end, length
 
 
 def _line_of(value: dict[str, Any]) -> bytes:

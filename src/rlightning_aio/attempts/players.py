@@ -25,6 +25,7 @@ class Players:
     Attributes:
         entry_of: the name of the config entry of each env.
         gone: envs whose worker is not replaced.
+        present: envs that are there and not gone.
     """
 
     def __init__(self, group: Any) -> None:
@@ -34,6 +35,7 @@ class Players:
         self._kinds: dict[_Player, None] = {}  # All that differ, the newest last.
         self.entry_of: dict[str, str] = {}
         self.gone: set[str] = set()
+        self.present: set[str] = set()
         self.refresh()
 
     def refresh(self) -> set[str]:
@@ -54,7 +56,8 @@ class Players:
                 self._kinds[player] = None
                 self.entry_of[env_id] = player.entry
             self.gone.update(worker["given_up"])
-        return present - self.gone
+        self.present = present - self.gone
+        return self.present
 
     def assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
         """Return an episode with the entry that plays it.

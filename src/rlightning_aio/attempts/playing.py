@@ -11,10 +11,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections import deque
+from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.episode import AttemptInPlay
+from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
@@ -39,6 +40,8 @@ _LOOK_SECONDS: Final = 0.2
 """Between looks for clients that have dialled in."""
 _MOST_LACKING: Final = 1000
 """Most attempts that wait for entries without an env while tasks are read for the others."""
+_LAST: Final = 100
+"""Attempts among which failures are counted."""
 _SURPLUS: Final = "enough other attempts at its task have ended"
 
 
@@ -70,18 +73,18 @@ async def play(
         agent: a coroutine function, which gets an `AttemptEpisode`.
         size: number of attempts at each task.
         rules: see `Rules`.
-        results: a file to which attempts are added. Those that it has are not played again: tasks
-            that are done there are left out, others come with attempts from the file, without
-            their observations.
+        results: a file; attempts are added, and a run continues from it. Attempts come from it
+            without observations.
 
-    Groups come as they are done. When the iterator ends, is closed (`contextlib.aclosing`) or is
-    cancelled, every env is idle or is being replaced, and no task is left.
+    Groups come in the order of their ends. When the iterator ends, is closed
+    (`contextlib.aclosing`) or cancelled, every env is idle or being replaced.
 
     Raises:
         EnvBusy: an env has a request in flight, or a result that was not collected.
         ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
-            is a file, and a task is there twice.
+            is a file, and a task is twice there.
         WorkerDied, EnvHung: all envs that could play a task are gone for good.
+        RLightningError: all attempts at the first task, or more than `rules` allow, have failed.
     """
     if size < 1:
         raise ValueError(f"size must be at least 1, not {size!r}")
@@ -92,7 +95,7 @@ async def play(
     try:
         while True:
             while engine.done:
-                yield engine.take()
+                yield await engine.take()
             if running.done():
                 running.result()  # Raises its error, if it has one.
                 return
@@ -102,6 +105,10 @@ async def play(
         running.cancel()
         await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
+
+
+def _is_bug(outcome: Outcome) -> bool:
+    return outcome.kind == "agent_raised" and outcome.blame != "policy"
 
 
 class _Engine:
@@ -123,18 +130,28 @@ class _Engine:
     ) -> None:
         self._group, self._source, self._agent = group, source, agent
         self._size, self._rules = size, rules
+        self._results = results
         self._queue = AttemptQueue(group, rules, results)
         self._has_clients = len(group) > group.size()
         self._playing: dict[asyncio.Task[Attempt], tuple[Job, Try]] = {}
         self._ended = deque[asyncio.Task[Attempt]]()
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
+        self._health = Health()
+        self._queue.may_play = lambda env_id: not self._health.rests(env_id, time.monotonic())
+        # Of the last attempts; whether a group has been played; and what began while most failed.
+        self._last = deque[Outcome](maxlen=_LAST)
+        self._has_played = False
+        self._probes: list[Try] = []
         self._wake = asyncio.Event()
         self.done = deque[AttemptGroup]()
         self.news = asyncio.Event()
 
-    def take(self) -> AttemptGroup:
-        """Hand over a group of attempts; others may take its place."""
+    async def take(self) -> AttemptGroup:
+        """Hand over a group of attempts that is in the file; others may take its place."""
+        if self._results is not None:
+            await self._results.written()
+            self._results.hand_out(self.done[0].spec)
         self._wake.set()
         return self.done.popleft()
 
@@ -152,13 +169,15 @@ class _Engine:
                 lacking = self._num_lacking()
                 if not self._playing and not lacking and self._source.is_at_end:
                     return
-                if not lacking and not self._has_clients:
-                    await self._wake.wait()
-                    continue
+                looks = lacking or self._has_clients
+                seconds = self._health.seconds_left(time.monotonic()) if len(self._queue) else None
+                if looks:
+                    seconds = min(seconds or _LOOK_SECONDS, _LOOK_SECONDS)
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(_LOOK_SECONDS):
+                    async with asyncio.timeout(seconds):
                         await self._wake.wait()
-                self._look()
+                if looks:
+                    self._look()
         finally:
             self._source.close()
             for _, one in self._playing.values():
@@ -184,7 +203,7 @@ class _Engine:
         """
         queue, begun = self._queue, 0
         while True:
-            while len(self._playing) < self._most and (env_id := queue.next_env()):
+            while self._may_begin() and (env_id := queue.next_env()):
                 if begun == _BURST:
                     return True
                 self._start(env_id)
@@ -196,7 +215,20 @@ class _Engine:
             spec = self._source.next(self._wake)
             if spec is None:
                 return False
-            queue.add(spec, self._size)
+            task = queue.add(spec, self._size)
+            file = self._results
+            if queue.is_done(task) and file is not None and not file.is_handed_out(task.spec):
+                self._settle(task)
+
+    def _may_begin(self) -> bool:
+        now, health = time.monotonic(), self._health
+        if len(self._playing) >= self._most or not health.may_begin(now):
+            return False
+        if health.is_slow and any(probe.goes_well for probe in self._probes):
+            health.recover(now)
+        if not health.is_slow:
+            self._probes.clear()
+        return True
 
     def _start(self, env_id: str) -> None:
         (job,) = self._queue.take(env_id)
@@ -204,6 +236,9 @@ class _Engine:
         episode = self._group.episode(env_id, job.spec.seed, options)
         view = AttemptInPlay(episode, job.spec, job.index)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
+        if self._health.is_slow:
+            self._probes.append(one)
+            self._health.note_begin(time.monotonic())
         task = asyncio.create_task(one.run())
         self._playing[task] = job, one
         task.add_done_callback(self._note_end)
@@ -225,12 +260,40 @@ class _Engine:
             queue.free[one.env_id] = None
         for env_id in queue.players.gone:
             queue.free.pop(env_id, None)
-        if queue.end(job, attempt) and queue.is_done(job.task):
-            self._settle(job.task)
+        self._health.note(attempt.outcome, self._most, time.monotonic())
+        if queue.end(job, attempt):
+            self._check_failures(attempt.outcome)
+            if queue.is_done(job.task):
+                self._settle(job.task, one.error)
 
-    def _settle(self, task: TaskInPlay) -> None:
-        """Hand over the attempts at a task, and cancel those that are left of it."""
+    def _check_failures(self, outcome: Outcome) -> None:
+        """Raise an error if more of the last attempts have failed than may."""
+        self._last.append(outcome)
+        if self._rules.max_failures is None:
+            return
+        kinds = Counter(one.kind for one in self._last if one.is_failure)
+        if kinds.total() > self._rules.max_failures * _LAST:
+            counts = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+            raise RLightningError(
+                f"{kinds.total()} of the last {len(self._last)} attempts have failed, more than "
+                f"max_failures={self._rules.max_failures:g} of {_LAST}: {counts}; the last one: "
+                f"{outcome.kind} on env {outcome.env_id!r}: {outcome.cause}"
+            )
+
+    def _settle(self, task: TaskInPlay, error: BaseException | None = None) -> None:
+        """Hand over the attempts at a task, and cancel those that are left of it.
+
+        Raises:
+            RLightningError: it is the first one, and the agent has failed in every attempt.
+        """
         task.is_settled = True
+        outcomes = [attempt.outcome for attempt in task.attempts.values()]
+        if not self._has_played and outcomes and all(map(_is_bug, outcomes)):
+            raise RLightningError(
+                f"the agent has failed in all {len(outcomes)} attempts at the first task, so no "
+                f"others are played: {outcomes[0].cause}"
+            ) from error
+        self._has_played = True
         left: list[Job] = []
         if len(task.attempts) < task.size:
             for job, one in self._playing.values():
@@ -251,7 +314,7 @@ class _Engine:
     # -- envs that are not there ------------------------------------------------------
 
     def _num_lacking(self) -> int:
-        """Number of attempts that wait for an entry of which no env is there."""
+        """Number of attempts that wait for an entry without an env."""
         return self._queue.lacking(one.env_id for _, one in self._playing.values())
 
     def _check_envs(self) -> None:

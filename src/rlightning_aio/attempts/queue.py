@@ -14,11 +14,11 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.attempts.players import Players
-from rlightning_aio.attempts.rules import tries_again
+from rlightning_aio.attempts.rules import is_of_env, tries_again
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from rlightning_aio.attempts.file import ResultsFile
     from rlightning_aio.attempts.records import Attempt
@@ -59,6 +59,7 @@ class Job:
         sub_env: of the env that it waits for.
         since: when it began to wait for an env, in monotonic seconds.
         failures: outcomes of its tries so far.
+        failed_on: the envs on which they failed, bystanders aside.
     """
 
     task: TaskInPlay
@@ -66,6 +67,7 @@ class Job:
     sub_env: int = 0
     since: float = 0.0
     failures: list[Outcome] = field(default_factory=list["Outcome"])
+    failed_on: set[str] = field(default_factory=set[str])
 
     @property
     def spec(self) -> EpisodeSpec:
@@ -85,6 +87,7 @@ class AttemptQueue:
         players: the envs.
         free: idle envs, the one that has been idle for longest first.
         fault: the last error of a worker that ended.
+        may_play: says of an idle env whether it may begin an attempt now.
     """
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
@@ -93,11 +96,10 @@ class AttemptQueue:
         present = self.players.refresh()
         self.free = {id_: None for id_ in self.players.entry_of if id_ in present}
         self.fault: WorkerDied | None = None
+        self.may_play: Callable[[str], bool] = lambda _: True
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
-        played = [] if results is None else results.played
-        self._before = {(one.spec.key, one.index, one.sub_env): one for one in played}
         self._places: set[tuple[EpisodeKey, int, int]] = set()
 
     # -- what waits -------------------------------------------------------------------
@@ -134,10 +136,10 @@ class AttemptQueue:
                 "another seed, or use another file for the next round"
             )
         self._places.add(place)
-        if place not in self._before:
-            return False
-        job.task.attempts[job.index] = self._before.pop(place)
-        return True
+        found = self._results.find(job.spec, job.index, job.sub_env)
+        if found is not None:
+            job.task.attempts[job.index] = found
+        return found is not None
 
     def _wait(self, job: Job) -> None:
         spec, job.since = job.spec, time.monotonic()
@@ -169,13 +171,31 @@ class AttemptQueue:
     # -- what is played next ----------------------------------------------------------
 
     def next_env(self) -> str | None:
-        """The next idle env that an attempt waits for; None if there is none."""
-        return next(filter(self._has_job, self.free), None) if len(self) else None
+        """The next idle env that an attempt waits for, and may play it; None if there is none."""
+        if not len(self):
+            return None
+        return next((id_ for id_ in self.free if self.may_play(id_) and self._has_job(id_)), None)
 
     def _has_job(self, env_id: str) -> bool:
         pinned = self._pinned.get(env_id)
-        return bool(pinned and any(pinned.values())) or bool(
-            self._waiting.get(self.players.entry_of[env_id])
+        return bool(pinned and any(pinned.values())) or self._shared_job(env_id) is not None
+
+    def _shared_job(self, env_id: str) -> int | None:
+        """Position of what an env plays next of those that any env may play.
+
+        One that has failed on it waits for another env, if there is one.
+        """
+        waiting = self._waiting.get(self.players.entry_of[env_id], ())
+        for position, job in enumerate(waiting):
+            if env_id not in job.failed_on or not self._others(job):
+                return position
+        return None
+
+    def _others(self, job: Job) -> bool:
+        """Return True if there are envs on which a job has not failed."""
+        players = self.players
+        return any(
+            players.entry_of[env_id] == job.spec.entry for env_id in players.present - job.failed_on
         )
 
     def take(self, env_id: str) -> list[Job]:
@@ -189,7 +209,12 @@ class AttemptQueue:
         if pinned:
             first = min(queue[0].index for queue in pinned)
             return [queue.popleft() for queue in pinned if queue[0].index == first]
-        return [self._waiting[self.players.entry_of[env_id]].popleft()]
+        position = self._shared_job(env_id)
+        assert position is not None
+        waiting = self._waiting[self.players.entry_of[env_id]]
+        job = waiting[position]
+        del waiting[position]
+        return [job]
 
     def take_next(self, env_id: str, sub_env: int) -> Job | None:
         """Remove what a sub-environment plays next that resets itself.
@@ -210,6 +235,8 @@ class AttemptQueue:
             return False
         if tries_again(self._rules, outcome, job.failures):
             job.failures.append(outcome)
+            if is_of_env(outcome):
+                job.failed_on.add(outcome.env_id)
             self._wait(job)
             return False
         attempt.failures = tuple(job.failures)
@@ -217,6 +244,11 @@ class AttemptQueue:
         if self._results is not None:
             self._results.add(attempt)
         return True
+
+    def flush(self) -> None:
+        """Wait until what has ended is in the file."""
+        if self._results is not None:
+            self._results.flush()
 
     def is_done(self, task: TaskInPlay) -> bool:
         """A task needs no further attempts."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from rlightning_aio.outcomes import is_bystanders
 
@@ -12,12 +12,27 @@ if TYPE_CHECKING:
 
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Rules", "is_retried", "needed", "tries_again"]
+__all__ = ["Rules", "is_final", "is_of_env", "is_retried", "needed", "tries_again"]
+
+
+_OF_ENVS: Final = ("env_raised", "env_died", "env_hung", "env_away", "not_started")
 
 
 def is_retried(outcome: Outcome) -> bool:
-    """Return True for a failure that neither the policy alone nor the caller has caused."""
-    return outcome.is_failure and outcome.blame not in ("policy", "caller")
+    """Return True for a failure that neither the policy alone, the caller nor a time limit of the
+    attempt has caused.
+    """
+    return not (is_final(outcome) or outcome.blame == "caller" or outcome.kind == "timed_out")
+
+
+def is_final(outcome: Outcome) -> bool:
+    """Return True unless a run that is resumed plays the attempt again."""
+    return not outcome.is_failure or outcome.blame == "policy"
+
+
+def is_of_env(outcome: Outcome) -> bool:
+    """Return True for a failure of the env itself, and not of a neighbour in its worker."""
+    return outcome.kind in _OF_ENVS and not is_bystanders(outcome)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +43,15 @@ class Rules:
         attempt_timeout: seconds from the reset to the end of an attempt; None for no limit.
         on_timeout: then the attempt has failed (``fail``), or it ends as truncated, with what it
             has earned (``end``).
-        retries: how often an attempt that has failed is tried again. A failure for which another
-            env of the worker is to blame isn't counted, and one that the policy alone or the caller
-            has caused is final.
+        retries: how often an attempt that has failed is tried again, on another env than before. A
+            failure for which another env of the worker is to blame isn't counted. What the policy
+            alone or the caller has caused isn't tried again, and neither is ``timed_out``.
         first: as soon as this many attempts have not failed, the group is complete, and the others
             are cancelled; None: it is complete if none has failed.
         max_concurrency: how many attempts may play at once; None for one on each env.
+        max_failures: the share of the last hundred attempts that may fail, after their last try. If
+            more have failed, `play` ends with an error that counts them by kind; None never ends
+            it.
 
     Raises:
         ValueError: a number is out of its range, or `on_timeout` is none of the two.
@@ -44,6 +62,7 @@ class Rules:
     retries: int = 2
     first: int | None = None
     max_concurrency: int | None = None
+    max_failures: float | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -55,6 +74,8 @@ class Rules:
             number: int | None = getattr(self, name)
             if number is not None and number < 1:
                 raise ValueError(f"{name} must be at least 1, not {number!r}")
+        if self.max_failures is not None and not 0 <= self.max_failures <= 1:
+            raise ValueError(f"max_failures must be a share, 0 to 1, not {self.max_failures!r}")
         if self.on_timeout not in ("fail", "end"):
             raise ValueError(f"on_timeout must be fail or end, not {self.on_timeout!r}")
 

@@ -56,7 +56,7 @@ class TaskSource:
             return None
 
     def close(self) -> None:
-        """Read no more."""
+        """End the reading."""
         self.is_at_end = True
         if self._reading is not None:
             self._reading.cancel()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from rlightning_aio.attempts.connections import is_connections
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault
@@ -61,11 +62,17 @@ class Try:
         self._stopped: str | None = None
         self._woken: asyncio.Future[None] | None = None
         self.error: BaseException | None = None
+        self._has_ended = False
 
     @property
     def env_id(self) -> str:
         """Id of its env."""
         return self._view.env_id
+
+    @property
+    def goes_well(self) -> bool:
+        """It has stepped, and has not ended."""
+        return not self._has_ended and bool(self._view.rewards)
 
     def stop(self, why: str) -> None:
         """End it soon, as cancelled."""
@@ -110,6 +117,9 @@ class Try:
             elif not ended.is_failure:
                 result = playing.result()
             await self._leave()
+        if ended.kind in ("env_raised", "not_started"):
+            await surely({asyncio.ensure_future(view.renew())})
+        self._has_ended = True
         return self._record(ended, result, time.monotonic() - began)
 
     async def _either(self, task: asyncio.Task[Any], limit: float | None) -> None:
@@ -145,7 +155,7 @@ class Try:
             _ = playing.cancelled() or playing.exception()
             return
         _log.warning(
-            "the agent of env %r goes on although it was cancelled; its env is given to others: "
+            "the agent of env %r continues although it was cancelled; its env is given to others: "
             "let CancelledError through",
             self.env_id,
         )
@@ -189,7 +199,7 @@ class Try:
         """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
         blame: Any = getattr(error, "blame", None)
         if blame not in BLAMES:
-            blame = "infrastructure" if isinstance(error, OSError | TimeoutError) else "caller"
+            blame = "infrastructure" if is_connections(error) else "caller"
         if blame == "caller" and type(error) not in self._logged:
             self._logged.add(type(error))
             _log.warning(

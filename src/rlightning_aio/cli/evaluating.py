@@ -254,7 +254,7 @@ async def _evaluate(
 ) -> None:
     progress.begin(f"starting {counted(len(group), 'env')}")
     # The random actions of the saved episodes must not be drawn again.
-    before = 0 if results is None else len(results.played)
+    before = 0 if results is None else len(results)
     async with group:
         respond = Responder(group, policy, None if order.seed is None else order.seed + before)
         try:

@@ -159,6 +159,7 @@ class PolicyPlay:
             self._films.keep(attempt)
         if not self._queue.end(job, attempt):
             return
+        self._queue.flush()
         if attempt.outcome.is_failure and not self._has_warned:
             self._has_warned = True
             _log.warning(

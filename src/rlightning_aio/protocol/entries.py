@@ -21,6 +21,7 @@ __all__ = [
     "OP_BITS",
     "OP_BITS_ARRAY",
     "OP_MASK",
+    "RENEW",
     "SLOT_MASK",
     "SLOT_MASK_ARRAY",
     "WITHOUT_OP",
@@ -50,6 +51,8 @@ class Operation(IntEnum):
     """A reset to a saved state; the reply is the last result of that time."""
 
 
+RENEW: Final = "_rlightning_aio_renew"
+"""A call of this name has an env rebuilt for its next request; hardware stays as it is."""
 _WITH_VALUE: Final = (Operation.CALL, Operation.SNAPSHOT)
 ANSWERS_WITH_VALUE: Final = np.isin(np.arange(max(Operation) + 1), _WITH_VALUE)
 """By operation, True if the reply to it is a value, not a result in a row."""

@@ -140,7 +140,7 @@ class EnvEpisode:
             aborting = asyncio.ensure_future(abort)
             # However often this is cancelled, it continues, and the env is idle in the end.
             await asyncio.wait([aborting])
-            # Read, so that asyncio doesn't log an error that nobody asks for.
+            # Read, so that asyncio doesn't log its error.
             _ = aborting.cancelled() or aborting.exception()
 
     async def _asked(self, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:

@@ -304,7 +304,8 @@ class AwaitedEnvs:
         None: its row holds the whole result.
         """
         raised = completion.error if isinstance(completion, Raised) and self._renews else None
-        if by is not None and raised is not None and raised.ends_env(op_of(record.entry)):
+        is_ended = raised is not None and raised.ends_env(op_of(record.entry))
+        if by is not None and record.env is by and (is_ended or by.runner.is_spent):
             self._put_away(record, by)
         if self._ending:
             return

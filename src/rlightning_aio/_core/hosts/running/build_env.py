@@ -97,9 +97,10 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
     env = make()
     kind = _runner_class(env, config)
     # Others are replaced by their host, with a runner of their own.
-    rebuilt = config.on_env_error == "restart" and not kind.is_awaitable
+    rebuilt = not (kind.is_awaitable or order.is_hardware)
     rebuild = make if rebuilt else None
-    return kind(env, inline=inline, rebuild=rebuild, is_hardware=order.is_hardware)
+    renews = rebuilt and config.on_env_error == "restart"
+    return kind(env, inline=inline, rebuild=rebuild, renews=renews, is_hardware=order.is_hardware)
 
 
 def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:

@@ -40,7 +40,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
-from rlightning_aio.protocol.entries import Operation, answers_with_value
+from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.pickling import dumped
 from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -95,7 +95,8 @@ class EnvRunner:
         env: built, not yet initialised.
         inline: results stay in this process. Observations that hold torch tensors are then
             returned without a copy; all other tensors become NumPy arrays on the CPU.
-        rebuild: rebuilds the env after an exception of its reset or step; None keeps it.
+        rebuild: makes the env again; None: that is left to its host, or it moves something real.
+        renews: an exception of its reset or step has it rebuilt.
         is_hardware: the env moves something real, and stops whatever goes wrong.
 
     Attributes:
@@ -103,6 +104,7 @@ class EnvRunner:
         fast_path: what the env offers to save time.
         step: steps with the action in the row.
         is_awaitable: its requests are awaited, together with those of other envs.
+        is_spent: another env takes its place before the next request.
 
     """
 
@@ -114,13 +116,14 @@ class EnvRunner:
         *,
         inline: bool = False,
         rebuild: Callable[[], BaseEnv] | None = None,
+        renews: bool = False,
         is_hardware: bool = False,
     ) -> None:
         self.inline = inline
         self._is_hardware = is_hardware
-        self._rebuild = rebuild
-        # The env has raised, and is to be rebuilt; it was closed for that.
-        self._is_spent = self._has_closed = False
+        self._rebuild, self._renews = rebuild, renews
+        # It is to be rebuilt, such as after an exception; it was closed for that.
+        self.is_spent = self._has_closed = False
         self.step: Execute = self._not_attached
         self._read_action: Callable[[], Any] = _no_action
         self._has_result = False
@@ -200,7 +203,7 @@ class EnvRunner:
         what `execute` does. The arguments are those of `execute`.
         """
         arguments = loaded(arguments)
-        if self._is_spent:
+        if self.is_spent and self._rebuild is not None:
             self._renew()
         if op == Operation.STEP:
             action, extras = arguments or STEP_IN_ROW
@@ -211,7 +214,12 @@ class EnvRunner:
             return self._snapshot, _outcome
         if op == Operation.RESTORE:
             return partial(self._restore, *arguments), self._finish_restore
+        if arguments[0] == RENEW:
+            return self._spend, _outcome
         return partial(call_env, self.env, *arguments), _outcome
+
+    def _spend(self) -> None:
+        self.is_spent = True
 
     def _snapshot(self) -> EnvState:
         versions = versions_of(self.env)
@@ -255,7 +263,7 @@ class EnvRunner:
         """Record what a request has raised; hardware stops, unless a method call raised it."""
         if self._is_hardware and not answers_with_value(op):
             stop(self.env)
-        self._is_spent |= self._rebuild is not None and error.ends_env(op)
+        self.is_spent |= self._renews and error.ends_env(op)
 
     def _renew(self) -> None:
         """Close the env, which has raised, and make another in its place.
@@ -276,7 +284,7 @@ class EnvRunner:
         if self.layout.key != key:
             raise ValueError("its spaces changed with the restart")
         self._attach_again()
-        self._is_spent = False
+        self.is_spent = False
 
     def close(self) -> Awaitable[None] | None:
         """Close the env, once."""
