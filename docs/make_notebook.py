@@ -10,26 +10,16 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, NOTEBOOK = ROOT / "docs" / "tutorial.md", ROOT / "examples" / "tutorial.ipynb"
-BADGE = "https://colab.research.google.com/assets/colab-badge.svg"
 
 
 def notebook() -> dict[str, Any]:
     """The notebook, as its file holds it."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    repository = project["urls"]["Repository"]
-    path = repository.removeprefix("https://github.com/")
-    colab = f"https://colab.research.google.com/github/{path}/blob/main/examples/tutorial.ipynb"
-    pages = f"{repository}/blob/main/docs"
-    cells = [
-        _cell(f"[![Open in Colab]({BADGE})]({colab})"),
-        _cell("%pip install --quiet rlightning-aio[video]", code=True, tags=["install"]),
-    ]
+    cells = [_cell("%pip install --quiet rlightning-aio[video]", code=True, tags=["install"])]
     for number, part in enumerate(
         re.split(r"^```python\n(.*?)^```\n", PAGE.read_text(), flags=re.MULTILINE | re.DOTALL)
     ):
@@ -38,9 +28,8 @@ def notebook() -> dict[str, Any]:
             source = f"%%writefile {named[1]}\n{part[named.end() :]}" if named else part
             cells.append(_cell(source, code=True))
         else:
-            # Links are those of a checkout, where a notebook on its own has none.
-            text = re.sub(r"\]\(([\w-]+\.md[^)]*)\)", rf"]({pages}/\1)", part)
-            cells.append(_cell(text.replace("](../", f"]({repository}/blob/main/")))
+            # A notebook on its own has no pages beside it, so links to them are their words.
+            cells.append(_cell(re.sub(r"\[([^]]+)\]\((?!http)[^)]+\)", r"\1", part)))
     for number, cell in enumerate(cells):
         cell["id"] = f"cell-{number}"
     kernel = {"display_name": "Python 3", "language": "python", "name": "python3"}

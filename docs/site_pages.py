@@ -37,7 +37,7 @@ SHOWN = {".py", ".ipynb", ".yaml", ".toml", ".txt", ".cff"}
 
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HOME_WORDS = {"VERSION": PROJECT["version"], "https://REPOSITORY": PROJECT["urls"]["Repository"]}
+HOME_WORDS = {"VERSION": PROJECT["version"]}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

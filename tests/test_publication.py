@@ -1,4 +1,4 @@
-"""What is prepared for publication agrees with the project: the recipe and the paper."""
+"""What is prepared for publication agrees with the project: the recipe."""
 
 from __future__ import annotations
 
@@ -26,16 +26,3 @@ def test_the_recipe_asks_for_what_the_project_asks_for() -> None:
         wanted.add(f"{CONDA_NAMES.get(name, name)} >={bound}")
     run = {entry for entry in recipe["requirements"]["run"] if not re.match(r"python |__", entry)}
     assert {entry for entry in run if entry.split()[0] not in OF_EXTRAS} == wanted
-
-
-def test_the_paper_is_complete() -> None:
-    """About a thousand words; its figures are there, and its citations are in the bibliography."""
-    paper = (ROOT / "paper" / "paper.md").read_text()
-    bibliography = (ROOT / "paper" / "paper.bib").read_text()
-    known = set(re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE))
-    assert 750 <= len(paper.partition("# Summary")[2].split()) <= 1250
-    assert set(re.findall(r"@(\w+)", paper.partition("# Summary")[2])) == known
-    figures = re.findall(r"\]\((\.\.[^)]+)\)", paper)
-    assert len(figures) >= 2
-    for figure in figures:
-        assert (ROOT / "paper" / figure).is_file(), figure
