@@ -14,7 +14,7 @@ from kit.scripted import Counts
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
 from rlightning_aio.collecting.episodes import whole_episodes
-from rlightning_aio.plugins.export import save_lerobot
+from rlightning_aio.plugins.lerobot_dataset import LeRobotWriter, named_columns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -122,7 +122,9 @@ def datasets() -> Any:
 def test_lerobot_reads_the_episodes(datasets: Any, tmp_path: Path) -> None:
     """With their numbers as they were played, and pictures as its codec keeps them."""
     rollouts = list(rollouts_of(12, 1))
-    save_lerobot(rollouts, "counting/half", tmp_path / "half", fps=10, task="count")
+    with LeRobotWriter("counting/half", tmp_path / "half", fps=10, task="count") as writer:
+        for rollout in rollouts:
+            writer.add(rollout)
     dataset = datasets.LeRobotDataset("counting/half", root=tmp_path / "half")
     episodes = list(whole_episodes(rollouts))
     assert (dataset.num_episodes, len(dataset)) == (4, 12)
@@ -136,5 +138,63 @@ def test_lerobot_reads_the_episodes(datasets: Any, tmp_path: Path) -> None:
         assert float(frame["next.reward"]) == step + 1
         assert bool(frame["next.done"]) == (step == 2)
         assert frame["task"] == "count"
-    with pytest.raises(ValueError, match="no whole episode"):
-        save_lerobot([], "counting/none", tmp_path / "none", fps=10)
+
+
+@pytest.mark.simulators
+def test_episodes_before_a_fault_are_saved_and_others_appended(
+    datasets: Any, tmp_path: Path
+) -> None:
+    """A rollout may end in the midst of one; what was begun when the fault came is left out."""
+    fields: dict[str, Any] = {"root": tmp_path / "half", "fps": 10, "task": "count"}
+
+    def collected(count: int) -> list[int]:
+        with LeRobotWriter("counting/half", **fields) as writer:
+            for rollout in rollouts_of(4, count):
+                writer.add(rollout)
+            raise KeyboardInterrupt
+
+    for count in (5, 2):  # Of 20 and of 8 transitions: six whole episodes, and two.
+        with pytest.raises(KeyboardInterrupt):
+            collected(count)
+    dataset = datasets.LeRobotDataset("counting/half", root=tmp_path / "half")
+    assert (dataset.num_episodes, len(dataset)) == (8, 24)
+    steps = [frame["observation.state"][1].item() for frame in dataset]
+    assert steps == [0, 1, 2] * 8
+    other = LeRobotWriter("counting/half", **{**fields, "fps": 5})
+    with pytest.raises(ValueError, match="fps: 10, not 5"), other as writer:
+        writer.add(next(rollouts_of(12, 1)))
+    named = LeRobotWriter("counting/half", **fields, names={"agent_pos": "observation.joints"})
+    with (
+        pytest.warns(UserWarning, match=r"no observation\.state"),
+        pytest.raises(ValueError, match=r"observation.joints: None, not float32 \(2,\)"),
+        named as writer,
+    ):
+        writer.add(next(rollouts_of(12, 1)))
+
+
+def test_a_dataset_without_an_episode_is_refused(tmp_path: Path) -> None:
+    writer = LeRobotWriter("counting/none", tmp_path / "none", fps=10)
+    with pytest.raises(ValueError, match="no whole episode"), writer:
+        writer.add(next(rollouts_of(4, 1)))
+    assert not (tmp_path / "none").exists()
+
+
+def test_columns_have_the_names_that_lerobots_policies_expect() -> None:
+    image, vector = np.zeros((2, 4, 6, 3), np.uint8), np.zeros((2, 7))
+    assert list(named_columns(vector, {})) == ["observation.state"]
+    observation = {
+        "agent_pos": vector, "environment_state": vector, "pixels": {"top": image},
+        "wrist": image, "arm": {"force": vector}, "pair": (vector,),
+    }  # fmt: skip
+    assert list(named_columns(observation, {})) == [
+        "observation.state", "observation.environment_state", "observation.images.top",
+        "observation.images.wrist", "observation.arm.force", "observation.pair.0",
+    ]  # fmt: skip
+    assert list(named_columns({"pixels": image}, {})) == ["observation.image"]
+    names = {"arm.force": "observation.state", "eye": "observation.images.eye"}
+    found = named_columns({"arm": {"force": vector}, "eye": image}, names)
+    assert list(found) == [*names.values()]
+    with pytest.raises(ValueError, match=r"names has \['leg'\]; the observation has \['arm'\]"):
+        named_columns({"arm": vector}, {"leg": "observation.state"})
+    with pytest.raises(ValueError, match=r"two columns .* observation\.state"):
+        named_columns({"agent_pos": vector, "arm": vector}, {"arm": "observation.state"})

@@ -10,12 +10,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
+from kit.scripted import Counts
 from patience import HANG
 
 from rlightning_aio import sync
+from rlightning_aio.collecting import Collector
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
 from rlightning_aio.plugins.lerobot import LeRobotPolicy
+from rlightning_aio.plugins.lerobot_dataset import LeRobotWriter
 
 pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
 
@@ -117,3 +122,74 @@ def test_a_policy_plays_as_in_lerobots_rollout(
     for one in found.attempts:
         assert one.reward == pytest.approx(float(alone[one.spec.seed]["reward"].sum()), rel=1e-4)
         assert one.success == bool(alone[one.spec.seed]["success"].any())
+
+
+class Following(Counts):
+    """The action should be the joints' positions; a camera sees one, too."""
+
+    observation_space = gym.spaces.Dict(
+        joints=gym.spaces.Box(-1, 1, (2,), np.float64),
+        wrist=gym.spaces.Box(0, 255, (64, 64, 3), np.uint8),
+    )
+    action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
+    length = 6
+
+    def does(self, action: Any) -> float:
+        return -float(np.abs(action - self.joints).mean())
+
+    @property
+    def joints(self) -> Any:
+        return np.sin(self.resets + 1.3 * self.steps + np.arange(2))
+
+    def observed(self) -> Any:
+        color = int(128 + 100 * self.joints[0])
+        return {"joints": self.joints, "wrist": np.full((64, 64, 3), color, np.uint8)}
+
+
+def test_act_learns_from_an_export_and_plays_in_the_same_env(tmp_path: Path) -> None:
+    """The mapping of names is the only thing that both are given."""
+    torch = pytest.importorskip("torch")
+    torch.manual_seed(0)
+    names = {"joints": "observation.state"}
+    entry = {"name": "env", "task": Following, "num_workers": 2, "placement": "inline"}
+    root = tmp_path / "data"
+
+    def demonstrated(batch: Any) -> Any:
+        return {"action": batch.observation["joints"].astype(np.float32)}
+
+    with sync.build_env_group(entry) as group, group.auto_reset(9):
+        collector = Collector(group, demonstrated, num_transitions=24)
+        with LeRobotWriter("me/following", root, fps=10, names=names) as writer:
+            for _ in range(3):
+                writer.add(collector.collect())
+
+    dataset = module_of("datasets.lerobot_dataset").LeRobotDataset(
+        "me/following", root=root, delta_timestamps={"action": [0.0, 0.1]}
+    )
+    policies = module_of("policies.factory")
+    config = policies.make_policy_config(
+        "act", device="cpu", push_to_hub=False, pretrained_backbone_weights=None,
+        **{**SMALL["act"], "chunk_size": 2, "n_action_steps": 1, "use_vae": False,
+        "pre_norm": True, "dropout": 0.0},
+    )  # fmt: skip
+    policy = policies.make_policy(config, ds_meta=dataset.meta)
+    assert set(config.input_features) == {"observation.state", "observation.images.wrist"}
+    processors = policies.make_pre_post_processors(config, dataset_stats=dataset.meta.stats)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
+    losses = []
+    policy.train()
+    for _ in range(14):
+        for rows in torch.utils.data.DataLoader(dataset, batch_size=24, shuffle=True):
+            loss, _ = policy.forward(processors[0](rows))
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.item())
+    assert losses[-1] < losses[0] / 4
+    for part in (policy, *processors):
+        part.save_pretrained(tmp_path)
+
+    with sync.build_env_group(entry) as group, group.auto_reset(9):
+        loaded = LeRobotPolicy.from_pretrained(tmp_path, names=names)
+        found = evaluate(group, loaded, 4)
+    assert all(one.reward > -0.15 * one.length for one in found.played)

@@ -46,13 +46,20 @@ class WholeEpisode:
         return len(self.reward)
 
 
-def whole_episodes(rollouts: Iterable[Rollout]) -> Iterator[WholeEpisode]:
+def whole_episodes(
+    rollouts: Iterable[Rollout], begun: dict[int, list[dict[str, Any]]] | None = None
+) -> Iterator[WholeEpisode]:
     """Join the transitions of successive rollouts of one `Collector`, in arrays of their own.
+
+    Args:
+        rollouts: none is kept.
+        begun: a dict that is empty at first, for what is handed over in several calls: it keeps the
+            parts of the episode that each env has begun.
 
     Raises:
         ValueError: the envs have several agents.
     """
-    begun: dict[int, list[dict[str, Any]]] = {}  # Parts of the episode that each env has begun.
+    begun = {} if begun is None else begun
     for rollout in rollouts:
         if isinstance(rollout.done, dict):
             raise ValueError("episodes of several agents can't be exported")

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlightning_aio.plugins.lerobot_dataset import named_columns
 from rlightning_aio.policies import ActionChunks
 from rlightning_aio.policies.episodes import begins_of_envs
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -30,14 +31,18 @@ __all__ = ["LeRobotPolicy"]
 class LeRobotPolicy:
     """Plays a `PreTrainedPolicy` of LeRobot, with its action chunks and its observation history.
 
-    Observations have the names of LeRobot's environments (``pixels``, ``agent_pos``, …). The text
-    of the task is ``task_description`` or ``task`` in the info of an episode's reset.
+    Observations get the names that `LeRobotWriter` gives them. The text of the task is
+    ``task_description`` or ``task`` in the info of an episode's reset.
 
     Args:
         policy: one whose `predict_action_chunk` takes observations, such as ACT, diffusion, π0 and
             SmolVLA.
         preprocessor: as LeRobot's `make_pre_post_processors` returns it.
         postprocessor: likewise.
+        names: of columns; see `LeRobotWriter`.
+
+    Raises:
+        ValueError: `names` doesn't fit the observations.
     """
 
     def __init__(
@@ -45,6 +50,8 @@ class LeRobotPolicy:
         policy: Any,
         preprocessor: Callable[[dict[str, Any]], dict[str, Any]],
         postprocessor: Callable[[Any], Any],
+        *,
+        names: Mapping[str, str] | None = None,
     ) -> None:
         config = policy.config
         decay = getattr(config, "temporal_ensemble_coeff", None)
@@ -52,6 +59,7 @@ class LeRobotPolicy:
         policy.reset()
         self._policy = policy
         self._preprocess, self._postprocess = preprocessor, postprocessor
+        self._names = names or {}
         steps = int(config.n_action_steps) if decay is None else None
         self._chunks = ActionChunks(self._predict, steps, temporal_ensemble=decay)
         self._num_seen = int(config.n_obs_steps)
@@ -60,12 +68,15 @@ class LeRobotPolicy:
         self._tasks: dict[str, str] = {}
 
     @classmethod
-    def from_pretrained(cls, path: str | Path, device: str = "cpu") -> LeRobotPolicy:
+    def from_pretrained(
+        cls, path: str | Path, device: str = "cpu", *, names: Mapping[str, str] | None = None
+    ) -> LeRobotPolicy:
         """Load a folder that LeRobot saved, or a model of the Hub, with its processors.
 
         Args:
             path: such as ``outputs/train/…/checkpoints/last/pretrained_model``.
             device: of the network.
+            names: of columns; see `LeRobotWriter`.
         """
         factory = import_module("lerobot.policies.factory")
         config = import_module("lerobot.configs.policies").PreTrainedConfig.from_pretrained(path)
@@ -76,7 +87,7 @@ class LeRobotPolicy:
             pretrained_path=str(path),
             preprocessor_overrides={"device_processor": {"device": device}},
         )
-        return cls(policy.to(device), *processors)
+        return cls(policy.to(device), *processors, names=names)
 
     def __call__(self, batch: BatchedData) -> NDArray[Any]:
         """Return the next action of each env."""
@@ -92,9 +103,10 @@ class LeRobotPolicy:
 
     def _observed(self, batch: BatchedData) -> dict[str, Any]:
         """Return observations as the network takes them."""
-        convert = import_module("lerobot.envs.utils").preprocess_observation
+        columns = named_columns(batch.observation, self._names)
         tasks = [self._tasks.get(env_id, "") for env_id in batch.env_ids()]
-        return self._preprocess({**convert(batch.observation), "task": tasks})
+        tensors = {name: _tensor(column) for name, column in columns.items()}
+        return self._preprocess({**tensors, "task": tasks})
 
     def _note(self, batch: BatchedData) -> None:
         """Keep the last observations of each env; the first one counts for those before it."""
@@ -122,3 +134,12 @@ class LeRobotPolicy:
             name: stack([stack([one[name] for one in self._seen[env_id]]) for env_id in env_ids])
             for name in self._seen[env_ids[0]][0]
         }
+
+
+def _tensor(column: NDArray[Any]) -> Any:
+    """Return rows as LeRobot's datasets have them: images from 0 to 1, with channels first."""
+    if column.ndim == 1:
+        column = column[:, None]
+    tensor = import_module("torch").from_numpy(np.ascontiguousarray(column)).float()
+    is_image = column.dtype == np.uint8 and column.ndim == 4
+    return tensor.permute(0, 3, 1, 2).contiguous() / 255 if is_image else tensor
