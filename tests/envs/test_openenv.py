@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
+import math
 import threading
 from functools import wraps
 from typing import TYPE_CHECKING, Any
@@ -19,11 +21,14 @@ from gymnasium import spaces
 from patience import HANG
 
 import rlightning_aio as rl
+from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerRefused
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from rlightning_aio.collecting import Rollout
 
 ENVS = 4
 
@@ -259,3 +264,73 @@ async def test_fields_become_columns_of_their_spaces() -> None:
     assert isinstance(space, spaces.Dict)
     assert space["a"] == spaces.Discrete(5)
     assert space["b"] == spaces.Box(-np.inf, np.inf, (2, 2), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("rewards", "expected"),
+    [
+        ([None, None, 1.0], [0.0, 0.0, 1.0]),
+        ([0.5, None, None], [0.5, 0.0, 0.0]),
+        ([None, 0, None], [0.0, 0.0, 0.0]),
+        ([None, None, None], [0.0, 0.0, math.nan]),
+    ],
+)
+def test_an_episode_without_any_reward_has_none(
+    monkeypatch: pytest.MonkeyPatch, rewards: list[float | None], expected: list[float]
+) -> None:
+    """A reward of 0 would look like a verdict."""
+    left = list(rewards)
+    executed = Misbehaving._executed
+
+    def with_rewards(self: Any, session: Any, message: Any) -> Any:
+        reply = executed(self, session, message)
+        if message["type"] == "step":
+            reply["data"] |= {"reward": left.pop(0), "done": not left}
+        return reply
+
+    monkeypatch.setattr(Misbehaving, "_executed", with_rewards)
+
+    async def played() -> list[float]:
+        async with (
+            Misbehaving(capacity=1) as server,
+            rl.build_env_group(entry(server.url, num_workers=1)) as group,
+        ):
+            await group.reset()
+            return [(await group.step(steps_of("o-0")))[0].reward.item() for _ in rewards]
+
+    assert np.array_equal(asyncio.run(played()), expected, equal_nan=True)
+
+
+@pytest.mark.parametrize("placement", ["loop", "process"])
+@pytest.mark.parametrize("wait_all", [True, False])
+def test_a_collector_has_no_row_of_a_step_whose_session_was_lost(
+    placement: str, wait_all: bool
+) -> None:
+    """Each row is one step further than the one before, and no lost episode counts."""
+
+    async def collected() -> Rollout:
+        async with Misbehaving(capacity=2) as server:
+            calls = itertools.count()
+
+            def policy(batch: rl.BatchedData) -> Any:
+                if next(calls) == 3:
+                    server.fates.append("restart")
+                return {"action": [{"number": next(numbers)} for _ in batch.ids()]}
+
+            fields = {"num_workers": 2, "placement": placement}
+            async with rl.build_env_group(entry(server.url, **fields)) as group:
+                with group.auto_reset(math.inf):
+                    collector = Collector(group, policy, num_transitions=20, wait_all=wait_all)
+                    return await collector.collect()
+
+    rollout = asyncio.run(collected())
+    assert rollout.reward.tolist() == np.ones(rollout.shape).tolist()
+    assert not len(rollout.episodes["length"])
+    seen = rollout.observation
+    seen = [one for row in seen for one in row] if wait_all else seen
+    ends = dict(zip(rollout.ends.tolist(), rollout.end_observation, strict=True))
+    after = 2 if wait_all else 1
+    for row, one in enumerate(seen):
+        then = ends.get(row) or seen[row + after]
+        assert (then["episode"], then["count"]) == (one["episode"], one["count"] + 1)
+    assert len({one["episode"] for one in seen}) == 4

@@ -131,6 +131,8 @@ def test_numpy_scalars_and_tuples_travel_as_plain_values() -> None:
         (spaces.Dict(a=spaces.Discrete(2)), {"b": 1}, "keys \\['a'\\], found keys \\['b'\\]"),
         (spaces.Tuple([spaces.Discrete(2)]), [], "a tuple of 1, found one of 0"),
         (spaces.Text(2), "too long", "not in"),
+        (spaces.Discrete(3), 3, "observation is 3, which is not in Discrete"),
+        (spaces.Dict(a=spaces.Discrete(3, start=-1)), {"a": 2}, r"\['a'\] is 2, which is not in"),
     ],
 )
 def test_a_value_that_does_not_fit_its_space_is_not_sent(space: Any, value: Any, says: str) -> None:

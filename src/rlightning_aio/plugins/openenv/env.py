@@ -8,6 +8,7 @@ a worker that dies has: its action may have taken effect, so no action is ever s
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 import uuid
 from collections.abc import Mapping
@@ -112,6 +113,7 @@ class OpenEnv(BaseEnv):
         self._urls = (config.task_name, *options.urls)
         self._url = worker_index % len(self._urls)
         self._session = self._new_session()
+        self._has_reward = False  # In this episode.
 
     def _new_session(self) -> OpenEnvSession:
         return OpenEnvSession(self._urls[self._url], self._options.headers)
@@ -143,6 +145,7 @@ class OpenEnv(BaseEnv):
         if seed is not None:
             arguments["seed"] = seed
         data = await self._first_reply({"type": "reset", "data": arguments})
+        self._has_reward = False
         observation, info = self._read(data)
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
@@ -188,11 +191,19 @@ class OpenEnv(BaseEnv):
         return EnvRet(
             env_id=self.env_id,
             observation=observation,
-            last_reward=float(data.get("reward") or 0.0),
+            last_reward=self._reward_of(data, done=done),
             last_terminated=done and not cut,
             last_truncated=cut,
             info=info,
         )
+
+    def _reward_of(self, data: dict[str, Any], *, done: bool) -> float:
+        """Read the reward: nothing yet counts as 0, but an episode without any has none (NaN)."""
+        reward = data.get("reward")
+        self._has_reward |= reward is not None
+        if reward is None:
+            return 0.0 if self._has_reward or not done else math.nan
+        return float(reward)
 
     def _read(self, data: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return the observation and the info."""

@@ -119,7 +119,15 @@ class _Number(_Array):
 
     def __init__(self, space: spaces.Discrete, what: str) -> None:
         super().__init__(space, what)
+        self._space = space
         self._values = range(int(space.start), int(space.start + space.n))
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        super().pack(value, packed)
+        number = self.form.read(packed.frames[-1])[()]
+        if int(number) not in self._values:
+            packed.frames.pop()
+            raise Misfit(f"{self._what} is {number}, which is not in {self._space}")
 
     def unpack(self, arriving: _Arriving) -> Any:
         number = super().unpack(arriving)[()]
