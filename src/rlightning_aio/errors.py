@@ -204,6 +204,20 @@ def env_raised(
     return error
 
 
+def unreadable(error: Exception, env_id: str) -> EnvRaised:
+    """Make the error for a result of an env that raises where it is read."""
+    what = f"returned what can't be read in this process: {type(error).__name__}: {error}"
+    kind = type(error).__qualname__
+    fault = _kind_of(kind)(
+        f"env {env_id!r} {what}; put plain values into its observation and info, such as "
+        "str(error) for an exception",
+        env_id=env_id,
+    )
+    fault.exception_type, fault.exception_text = kind, str(error)
+    fault.outcome = Outcome("env_raised", "env", what, env_id)
+    return fault
+
+
 class ActionRefused(EnvRaised, BadAction):
     """`EnvRaised` for `BadAction`."""
 

@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from rlightning_aio.batch.names import EnvNames
+from rlightning_aio.errors import unreadable
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.trees import Tree, index, mapped
@@ -150,10 +151,18 @@ class ResultColumns(msgspec.Struct):
     # -- one row ----------------------------------------------------------------------
 
     def out_of_band_of(self, row: int) -> dict[str, Any]:
-        """Out-of-band values of `row`."""
+        """Out-of-band values of `row`.
+
+        Raises:
+            EnvRaised: they can't be unpickled in this process.
+        """
         found = self.out_of_band.get(row)
         if isinstance(found, bytes):
-            found = self.out_of_band[row] = pickle.loads(found)
+            try:
+                found = pickle.loads(found)
+            except Exception as error:
+                raise unreadable(error, self.names.env_ids[self.slots.item(row)]) from error
+            self.out_of_band[row] = found
         return found or {}
 
     def observation_of(self, row: int) -> Any:

@@ -22,6 +22,7 @@ from rlightning_aio.batch.parts import (
     reported_infos_of_parts,
     rows_in_order,
 )
+from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,6 +77,28 @@ def are_over(batch: BatchedData) -> list[bool]:
 def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
     done = part.done
     return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
+
+
+def values_or_faults(batch: BatchedData) -> list[Any]:
+    """Return the results as separate values; in place of one that can't be read, the error."""
+    try:
+        return batch.values()
+    except EnvFault as fault:
+        if len(batch) == 1:
+            return [fault]
+    return [one for row in range(len(batch)) for one in values_or_faults(batch.take([row]))]
+
+
+def readable(batch: BatchedData) -> tuple[BatchedData, list[EnvFault]]:
+    """Return the results of a batch that can be read here, and the errors of the others."""
+    if not any(part.out_of_band for part in parts_of(batch)):
+        return batch, []
+    found = values_or_faults(batch)
+    faults = [one for one in found if isinstance(one, EnvFault)]
+    if not faults:
+        return batch, []
+    rows = [row for row, one in enumerate(found) if not isinstance(one, EnvFault)]
+    return batch.take(rows), faults
 
 
 def lost_rows(batch: BatchedData) -> set[int]:

@@ -23,6 +23,7 @@ from rlightning_aio._core.group.api.facade import (
     is_resettable,
 )
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
+from rlightning_aio.batch.contents import readable
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.rollout import Rollout
@@ -279,7 +280,13 @@ class Collector(Generic[G, R]):
         has_rejoined = False
         while True:
             if self._received is not None:
-                self._split_received(self._received)
+                received, faults = readable(self._received)
+                if faults:
+                    for fault in faults:
+                        self._note(fault)
+                    self._received = received if len(received) else None
+                    raise faults[0]
+                self._split_received(received)
                 self._received = None
             if not self._store():
                 return self._full()

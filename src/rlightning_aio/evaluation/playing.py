@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio.attempts.records import Attempt, success_of
-from rlightning_aio.batch.contents import all_agents, summed_rewards
+from rlightning_aio.batch.contents import all_agents, readable, summed_rewards
 from rlightning_aio.errors import EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
@@ -183,8 +183,13 @@ class PolicyPlay:
 
     def _continue(self, batch: BatchedData) -> Procedure[None]:
         """Add results to their episodes, and begin others or step their envs."""
+        self._pending.difference_update(batch.env_ids())
+        batch, faults = readable(batch)
+        for fault in faults:
+            self._note_fault(fault)
+        if not len(batch):
+            return
         env_ids = batch.env_ids()
-        self._pending.difference_update(env_ids)
         if self._films is not None:
             yield from self._film(self._films, env_ids)
         for part in batch.by_entry().values() if self._separate else (batch,):

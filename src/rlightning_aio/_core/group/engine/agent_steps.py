@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
 from rlightning_aio._core.group.drivers.wait import TURN, Wait
 from rlightning_aio._core.group.engine.waiting import REPLIES
-from rlightning_aio.batch.contents import are_over, lost_rows
+from rlightning_aio.batch.contents import are_over, lost_rows, values_or_faults
 from rlightning_aio.batch.data import BatchedData
+from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -258,9 +259,13 @@ class AgentSteps:
 
     def _resolve(self, batch: BatchedData, slots: NDArray[np.intp]) -> None:
         lost = lost_rows(batch)
-        rows = zip(slots.tolist(), batch.values(), are_over(batch), strict=True)
+        rows = zip(slots.tolist(), values_or_faults(batch), are_over(batch), strict=True)
         for row, (slot, ret, is_over) in enumerate(rows):
-            if not (reply := self._ended(slot)).done():
+            if (reply := self._ended(slot)).done():
+                continue
+            if isinstance(ret, EnvFault):
+                reply.set_exception(ret)
+            else:
                 loss = batch.take([row]) if row in lost else None
                 reply.set_result(StepEnd(ret, is_over, loss))
 

@@ -1,7 +1,8 @@
 """How a worker ends: as Python does, without what the fork server has left to be done at its end.
 
 A worker is forked, so Python's own end would also run the exit functions of the fork server's
-modules, some of which delete what other workers use. `multiprocessing` ends its processes likewise.
+modules, and some of those delete what other workers use. `multiprocessing` ends its processes
+likewise.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _threading: Any = threading
 
 
 def drop_inherited() -> None:
-    """Forget, in a process that was forked just now, what its parent is to do at its end."""
+    """Forget, in a process that was forked just now, what its parent does at its end."""
     _atexit._clear()  # noqa: SLF001
     finalize: Any = weakref.finalize
     for finaliser in list(finalize._registry):  # noqa: SLF001
@@ -34,8 +35,8 @@ def drop_inherited() -> None:
 def run_all() -> None:
     """Wait for threads, run finalisers and exit functions, and collect garbage.
 
-    Files that nobody refers to any more are closed by that, temporary folders removed, and daemons
-    of `multiprocessing` ended.
+    This closes files that have no references, removes temporary folders, and ends daemons of
+    `multiprocessing`.
     """
     gc.collect()
     _threading._shutdown()  # noqa: SLF001

@@ -1,0 +1,122 @@
+"""Results that can't be unpickled here: failures of their own env, named, and of nobody else."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rlightning_aio
+from rlightning_aio import Collector, evaluate, sync
+from rlightning_aio.attempts import EpisodeSpec, Rules, play
+from rlightning_aio.errors import EnvRaised
+
+EPISODE = 3
+
+
+class HttpError(Exception):
+    """As those of HTTP clients: pickle calls it with its message alone."""
+
+    def __init__(self, message: str, *, response: int) -> None:
+        super().__init__(message)
+        self.response = response
+
+
+class Failing(gym.Env[int, int]):
+    """Reports such an error in a reset, or in the second step, of its first episodes."""
+
+    observation_space: Any = gym.spaces.Discrete(9)
+    action_space: Any = gym.spaces.Discrete(2)
+    switches_task = True
+
+    def __init__(self, where: str, last: int) -> None:
+        self.where, self.last = where, last
+        self.step_number = self.episode = 0
+
+    def _info(self, where: str) -> dict[str, Any]:
+        fails = where == self.where and self.episode <= self.last
+        return {"error": HttpError("not found", response=404)} if fails else {"text": "fine"}
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        del options
+        self.step_number = 0
+        self.episode += 1
+        return 0, self._info("reset")
+
+    def step(self, action: int) -> Any:
+        del action
+        self.step_number += 1
+        info = self._info("step" if self.step_number == 2 else "")
+        return self.step_number, 1.0, self.step_number == EPISODE, False, info
+
+
+def entries(where: str, last: int = 1) -> list[dict[str, Any]]:
+    return [
+        {"name": name, "backend": "callable", "task": partial(Failing, place, last)}
+        for name, place in (("good", "nowhere"), ("bad", where))
+    ]
+
+
+def policy(batch: Any) -> Any:
+    return batch.respond(action=np.zeros(len(batch), np.int64))
+
+
+WHERE = pytest.mark.parametrize("where", ["reset", "step"])
+
+
+@WHERE
+async def test_in_play_an_attempt_of_its_env_fails(where: str) -> None:
+    async def agent(episode: Any) -> None:
+        while not episode.is_over:
+            await episode.step(0)
+
+    async with rlightning_aio.build_env_group(entries(where, last=99)) as group:
+        tasks = [EpisodeSpec("t", seed=k, entry=name) for k in range(2) for name in ("good", "bad")]
+        playing = play(group, tasks, agent, rules=Rules(retries=0))
+        attempts = [one for done in [a async for a in playing] for one in done]
+    outcomes = [(one.outcome.kind, one.outcome.blame) for one in attempts]
+    assert outcomes.count(("terminated", "policy")) == outcomes.count(("env_raised", "env")) == 2
+    failed = [one.outcome for one in attempts if one.outcome.is_failure]
+    assert {one.env_id for one in failed} == {"bad-0"}
+    assert "HttpError" in failed[0].cause
+
+
+@WHERE
+def test_in_an_evaluation_an_episode_of_its_env_fails(where: str) -> None:
+    with sync.build_env_group(entries(where, last=99)) as group:
+        attempts = evaluate(group, policy, episodes=4, retries=0).attempts
+    failed = [one.outcome for one in attempts if one.outcome.is_failure]
+    assert {(one.kind, one.env_id) for one in failed} == {("env_raised", "bad-0")}
+    assert len(failed) == len(attempts) - len(failed) == 4
+
+
+@WHERE
+def test_a_collector_raises_it_once_and_goes_on(where: str) -> None:
+    with sync.build_env_group(entries(where)) as group:
+        collector = Collector(group, policy, num_transitions=8)
+        with pytest.raises(EnvRaised, match=r"'bad-0'.*can't be read") as raised:
+            collector.collect()
+        assert raised.value.env_id == "bad-0"
+        for _ in range(4):
+            rollout = collector.collect()
+            assert len(rollout.reward) == 8
+        assert {*rollout.index.tolist()} == {0, 1}
+
+
+@WHERE
+def test_a_batch_raises_it_where_its_row_is_read(where: str) -> None:
+    with sync.build_env_group(entries(where)) as group:
+        batch, _ = group.reset()
+        for _ in range(2 if where == "step" else 0):
+            batch, _ = group.step(policy(batch))
+        assert batch.reward.tolist() == [0.0 if where == "reset" else 1.0] * 2
+        assert batch.take([0]).info() == [{"text": "fine"}]
+        for read in (lambda: batch.infos, lambda: batch["bad-0"], batch.info, batch.values):
+            with pytest.raises(EnvRaised, match=r"'bad-0'.*HttpError.*'response'.*str\(error\)"):
+                read()
+        batch, _ = group.reset()
+        assert batch.info() == [{"text": "fine"}] * 2
