@@ -15,6 +15,7 @@ from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
 from rlightning_aio.collecting.episodes import whole_episodes
 from rlightning_aio.plugins.lerobot_dataset import LeRobotWriter, named_columns
+from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -67,6 +68,38 @@ def test_rollouts_are_joined_to_whole_episodes(wait_all: bool) -> None:
         np.testing.assert_array_equal(episode.terminated, [False, False, True])
         assert not episode.truncated.any()
         assert episode.action.shape == (3, 1)
+
+
+class Talking(Counting):
+    """Tells and is told plain Python values, as an OpenEnv session is."""
+
+    observation_space = gym.spaces.Dict(rest=Anything(), count=gym.spaces.Discrete(9))
+    action_space = Anything()
+
+    def observed(self) -> Any:
+        return {"rest": {"text": str(self.steps)}, "count": self.steps}
+
+
+@pytest.mark.parametrize("wait_all", [False, True])
+def test_episodes_of_plain_values_are_lists(tmp_path: Path, wait_all: bool) -> None:
+    """A LeRobot dataset can't hold these, and says so."""
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": [{"say": one["text"]} for one in batch.observation["rest"]]}
+
+    entry = {"name": "env", "task": Talking, "num_workers": 2, "placement": "inline"}
+    with sync.build_env_group(entry) as group, group.auto_reset(9):
+        collector = Collector(group, policy, num_transitions=8, wait_all=wait_all)
+        rollouts = [copy.deepcopy(collector.collect()) for _ in range(3)]
+    episodes = [*whole_episodes(rollouts)]
+    assert len(episodes) > 4
+    for episode in episodes:
+        assert episode.observation["rest"] == [{"text": str(step)} for step in range(4)]
+        assert episode.observation["count"].tolist() == [0, 1, 2, 3]
+        assert episode.action == [{"say": str(step)} for step in range(3)]
+    writer = LeRobotWriter("talking/none", tmp_path / "none", fps=10)
+    with pytest.raises(ValueError, match="hold plain Python values"), writer:
+        writer.add(rollouts[0])
 
 
 def test_copies_of_rollouts_can_be_kept_for_later() -> None:

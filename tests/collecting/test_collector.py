@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import copy
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from collecting.scripted import Script, Tickets, scripted_group
 from group import sample_envs
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from kit.counting import ClientThread, CountingEnv
 from kit.scripted import Scripted
 from patience import HANG
@@ -19,6 +20,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector
+from rlightning_aio.collecting.episodes import whole_episodes
 from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
@@ -514,3 +516,24 @@ def test_columns_share_their_memory_with_torch() -> None:
         assert not rollout.observation.any()
         next_values = torch.zeros(len(rollout.ends))
         assert rollout.advantages(torch.from_numpy(rollout.value), next_values, 0.9, 0.9).any()
+
+
+def carts_of_a_loop() -> SyncVectorEnv:
+    makers = [lambda: gym.make("CartPole-v1")] * 3
+    return SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+
+
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_sub_environments_of_a_vector_env_without_resets_wait_for_the_others(
+    placement: str,
+) -> None:
+    """A `SyncVectorEnv` refuses to step those whose episode is over; their rows are left out."""
+    entry = {"name": "v", "task": carts_of_a_loop, "placement": placement, "num_workers": 2}
+    with sync.build_env_group(entry) as group, group.auto_reset(math.inf):
+        collector = Collector(group, None, num_transitions=300, seed=0)
+        rollouts = [copy.deepcopy(collector.collect()) for _ in range(3)]
+    episodes = [*whole_episodes(rollouts)]
+    assert len(episodes) > 12
+    for one in episodes:
+        assert one.terminated.tolist() == [False] * (len(one.reward) - 1) + [True]
+    assert sum(len(rollout) for rollout in rollouts) == 900

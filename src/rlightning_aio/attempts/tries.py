@@ -30,7 +30,7 @@ Agent: TypeAlias = "Callable[[AttemptEpisode], Awaitable[Any]]"
 """Plays one attempt."""
 
 _PATIENCE_SECONDS: Final = 0.5
-"""How long a cancelled agent may take to end, before its env goes on without it."""
+"""How long a cancelled agent may take to end, before its env continues without it."""
 _log = logging.getLogger("rlightning_aio")
 
 

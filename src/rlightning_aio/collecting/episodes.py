@@ -6,7 +6,8 @@ Those that were lost with a worker, or whose begin is in no rollout, are left ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class WholeEpisode:
 
     Attributes:
         observation: ``[T + 1, *obs]``, the first one from the reset; of Dict and Tuple spaces a
-            dict or tuple of such arrays.
+            dict or tuple of such arrays; of plain values a list.
         action: ``[T, *action]``, likewise.
         reward: ``[T]`` float32.
         terminated, truncated: ``[T]``; the last of either is True.
@@ -94,8 +95,16 @@ def _segments(rollout: Rollout, ends: dict[int, int]) -> Iterator[tuple[int, NDA
 
 def _part(rollout: Rollout, rows: NDArray[np.intp]) -> dict[str, Any]:
     size, axes = len(rollout), len(rollout.shape)
+
+    def part(leaf: Any) -> Any:
+        if isinstance(leaf, list):  # Of plain values, or of lists of them.
+            listed = cast("list[Any]", leaf)
+            values = [*chain.from_iterable(listed)] if axes > 1 else listed
+            return [values[row] for row in rows.tolist()]
+        return leaf.reshape(size, *leaf.shape[axes:])[rows]
+
     return {
-        name: mapped(lambda leaf: leaf.reshape(size, *leaf.shape[axes:])[rows], rollout[name])
+        name: mapped(part, rollout[name])
         for name in ("observation", "action", "reward", "terminated", "truncated")
     }
 

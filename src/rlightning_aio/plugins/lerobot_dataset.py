@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, cast
 import numpy as np
 
 from rlightning_aio.collecting.episodes import whole_episodes
+from rlightning_aio.trees import walked
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Mapping
@@ -98,13 +99,19 @@ class LeRobotWriter:
             rollout: successive ones of one `Collector`.
 
         Raises:
-            ValueError: see the class; or the envs have several agents.
+            ValueError: see the class; or the envs have several agents or plain values.
         """
         for episode in whole_episodes([rollout], self._begun):
             self._write(self._columns(episode))
 
     def _columns(self, episode: WholeEpisode) -> dict[str, NDArray[Any]]:
         """Return the columns of an episode by LeRobot's names, a row for each step."""
+        given = episode.observation, episode.action
+        if any(isinstance(leaf, list) for _, leaf in walked(given)):
+            raise ValueError(
+                "these episodes hold plain Python values, which are no columns of a LeRobot "
+                "dataset; whole_episodes(rollouts) has them"
+            )
         columns = {
             **named_columns(episode.observation, self._names),
             "action": episode.action,

@@ -1,9 +1,9 @@
 """What MuJoCo's threads copy out of each simulation after a step or reset, into arrays of all.
 
 Rule: the data of a simulation are in the cache of the thread that computed them, and contact forces
-follow from them only until the thread goes on. So the compiled function `_advance.c` resets or
-steps a simulation, computes its forces and copies parts of its fields, before MuJoCo goes on. Where
-it was not built, `threads` has MuJoCo copy whole fields, and NumPy picks the parts; for contact
+follow from them only until the thread continues. So the compiled function `_advance.c` resets or
+steps a simulation, computes its forces and copies parts of its fields, before it goes on. Where it
+was not built, `threads` has MuJoCo copy whole fields, and NumPy picks the parts; for contact
 forces MuJoCo then keeps all data of each simulation. The compiled function draws the noise of
 resets and computes rewards and ends, too, which other threads than the trainer's then do.
 """

@@ -20,7 +20,9 @@ from rlightning_aio.types import EnvRet, PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Generator
 
+    import numpy as np
     from gymnasium.envs.registration import EnvSpec
+    from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.wrappers import ClassName
@@ -50,6 +52,8 @@ class GymnasiumEnv(FastPath, BaseEnv):
             self.num_envs = int(self.env.num_envs)
             self.fresh_results = getattr(self.env.unwrapped, "fresh_results", False)
         self.autoreset = autoreset_mode_of(self.env).name.lower()  # pyright: ignore[reportAttributeAccessIssue]
+        refuses = isinstance(self.env.unwrapped, SyncVectorEnv)
+        self._waits = refuses and self.autoreset == "disabled"
         self.switches_task = bool(getattr(self.env.unwrapped, "switches_task", False))
         if self.max_episode_steps is None and self.env.spec is not None:
             self.max_episode_steps = self.env.spec.max_episode_steps
@@ -84,10 +88,23 @@ class GymnasiumEnv(FastPath, BaseEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         action = as_numpy(self._preprocess_fn(policy_resp))
-        return result_of(self.env_id, self.env.step(action))
+        return result_of(self.env_id, self._stepped()(action))
+
+    def _step_waiting(self, actions: Any) -> Any:
+        """Step all, though some wait for the others to end: those play an episode of no one.
+
+        A `SyncVectorEnv` steps none whose episode is over.
+        """
+        over: NDArray[np.bool_] = self.env.unwrapped._autoreset_envs  # noqa: SLF001
+        if over.any():
+            self.env.reset(options={"reset_mask": over.copy()})
+        return self.env.step(actions)
 
     def bare_step(self) -> BareStep | None:
-        return self.env.step if type(self).step is GymnasiumEnv.step else None
+        return self._stepped() if type(self).step is GymnasiumEnv.step else None
+
+    def _stepped(self) -> BareStep:
+        return self._step_waiting if self._waits else self.env.step
 
     def bare_reset(self) -> BareReset | None:
         return self.env.reset if type(self).reset is GymnasiumEnv.reset else None

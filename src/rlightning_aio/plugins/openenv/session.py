@@ -91,7 +91,7 @@ class OpenEnvSession:
         Cancelled, it closes the socket, and with it the session.
 
         Raises:
-            ServerRefused: the reply is an error, after which the session goes on.
+            ServerRefused: the reply is an error, after which the session continues.
             ServerGone: the socket is lost.
         """
         socket = self._socket

@@ -73,7 +73,7 @@ class Results:
         if self._last_sent is not None and self._last_sent[0] is not slots:
             self._enter_last_sent()  # Else all of it is replaced.
         kept: dict[str, Any] = {}
-        for name, column in columns.items():  # Their maker may go on writing to them.
+        for name, column in columns.items():  # Their maker may still write to them.
             kept[name] = column.copy() if type(column) is np.ndarray else copied(column)
         self._last_sent = slots, kept
         entries = {0}
@@ -108,7 +108,7 @@ class Results:
     def begin_schemas(self, slots: range) -> None:
         """The host of `slots` announces its ways of holding infos (anew, after a restart)."""
         shared: dict[int, InfoSchema] = {}
-        # A new list: batches that were handed out go on reading the old one.
+        # A new list: batches that were handed out still read the old one.
         self._schemas = list(self._schemas)
         for slot in slots:
             self._schemas[slot] = shared

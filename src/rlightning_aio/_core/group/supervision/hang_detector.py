@@ -150,7 +150,7 @@ class HangDetector:
         return math.inf
 
     def _expiry(self, record: HostRecord, current: tuple[int, int]) -> float:
-        """Return the time when the worker exceeds its limit, if it goes on like this."""
+        """Return the time when the worker exceeds its limit, if it continues like this."""
         entry, since_ns = current
         if entry and since_ns:
             limit = record.limits.get(self._requests.numbering.op(slot_of(entry)))
@@ -166,7 +166,7 @@ class HangDetector:
         assert record.killable is not None
         slots = slice(record.slots.start, record.slots.stop)
         entries = int(self._requests.numbering.entry[slots].sum())
-        # Where all envs wait, the worker says now and then that its event loop goes on.
+        # Where all envs wait, the worker says now and then that its event loop runs.
         return self._in_flight(record), entries, record.killable.traffic, *current
 
     def _check_dying(self) -> None:

@@ -171,7 +171,7 @@ class AwaitedEnv:
             self._close_error = self._close_error or ErrorText.of(error)
 
     def closing(self) -> asyncio.Task[None]:
-        """Return the task that closes it: its own, or another if what it executes goes on."""
+        """Return the task that closes it: its own, or another if what it executes continues."""
         if self.stopped.done():
             return self.task
         if self._closing is None:
