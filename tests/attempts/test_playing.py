@@ -24,7 +24,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.records import success_of
-from rlightning_aio.errors import EpisodeLost, WorkerDied
+from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -898,3 +898,12 @@ async def test_a_file_keeps_no_columns_in_memory(tmp_path: Path) -> None:
             tracemalloc.stop()
             assert held < 40 * 50_000
             assert [one.columns["tokens"][0][-1] for one in results] == [19_999] * 40
+
+
+async def test_a_group_is_played_once_at_a_time() -> None:
+    async with sandboxes(2) as group:
+        async with contextlib.aclosing(play(group, tasks(9), once)) as groups:
+            await anext(groups)
+            with pytest.raises(EnvBusy, match="another play"):
+                await played(group, tasks(1), once)
+        assert len(await played(group, tasks(3), once)) == 3

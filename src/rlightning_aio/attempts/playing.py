@@ -13,6 +13,7 @@ import contextlib
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakSet
 
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
@@ -42,6 +43,7 @@ _MOST_LACKING: Final = 1000
 """Most attempts that wait for entries without an env while tasks are read for the others."""
 _LAST: Final = 100
 """Attempts among which failures are counted."""
+_in_play: Final[WeakSet[EnvGroup]] = WeakSet()
 _SURPLUS: Final = "enough other attempts at its task have ended"
 
 
@@ -80,18 +82,17 @@ async def play(
     (`contextlib.aclosing`) or cancelled, every env is idle or being replaced.
 
     Raises:
-        EnvBusy: an env has a request in flight, or a result that was not collected.
+        EnvBusy: an env has a request in flight or a result to be collected, or plays already.
         ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
             is a file, and a task is twice there.
         WorkerDied, EnvHung: all envs that could play a task are gone for good.
         RLightningError: all attempts at the first task, or more than `rules` allow, have failed.
     """
-    if size < 1:
-        raise ValueError(f"size must be at least 1, not {size!r}")
-    if busy := group.pending:
-        raise EnvBusy(f"{busy[0]!r} has a request whose result was not collected; collect it")
+    _check(group, size)
     engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
     running = asyncio.create_task(engine.run())
+    _in_play.add(group)
+    running.add_done_callback(lambda _: _in_play.discard(group))
     try:
         while True:
             while engine.done:
@@ -105,6 +106,15 @@ async def play(
         running.cancel()
         await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
+
+
+def _check(group: EnvGroup, size: int) -> None:
+    if size < 1:
+        raise ValueError(f"size must be at least 1, not {size!r}")
+    if group in _in_play:
+        raise EnvBusy("another play() plays on this group: end it before, or build a second group")
+    if busy := group.pending:
+        raise EnvBusy(f"{busy[0]!r} has a request whose result was not collected; collect it")
 
 
 def _is_bug(outcome: Outcome) -> bool:

@@ -6,6 +6,8 @@ Left out: rules and documentation. The rules are in the core, the docstrings in 
 from __future__ import annotations
 
 import asyncio
+import signal
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -227,6 +229,9 @@ def build_env_group(
 def run(main: Coroutine[Any, Any, T]) -> T:
     """Run `main` to its end on a uvloop event loop, or on asyncio's if uvloop is missing.
 
+    SIGTERM, as Slurm and Kubernetes send it, ends it as Ctrl-C does: `main` is cancelled, so groups
+    close their envs. `asyncio.to_thread` has up to 256 threads.
+
     Raises:
         RuntimeError: an event loop already runs in this thread.
     """
@@ -236,7 +241,21 @@ def run(main: Coroutine[Any, Any, T]) -> T:
             "an event loop runs here already, as in a notebook: `await` the coroutine instead of "
             "giving it to rlightning_aio.run"
         )
-    return run_loop(main)
+    if (
+        threading.current_thread() is not threading.main_thread()
+        or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+    ):
+        return run_loop(main)
+    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        return run_loop(main)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    del number, frame
+    signal.raise_signal(signal.SIGINT)
 
 
 def _is_loop_running() -> bool:

@@ -216,7 +216,13 @@ class AwaitedEnvs:
         # Others that still run were closed, and reported, when they were put away.
         open_ = [env for env in self._envs if not env.has_closed]
         envs = sorted(open_, key=lambda env: env.index)
-        await end_all(envs, self._close_seconds)
+        try:
+            await end_all(envs, self._close_seconds)
+        except BaseException:
+            # A close that is cancelled with everything else has ended, too, but not well.
+            if left := [env.name for env in envs if env.close_error or not env.has_closed]:
+                log.error("interrupted; these envs were not closed: %s", ", ".join(left))
+            raise
         errors = [(env.index, error) for env in envs if (error := env.close_error) is not None]
         closed = {**self._closed, **{env: env.name for env in envs}}
         await cancel(self._leftovers(closed), CANCEL_SECONDS / 4)

@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import Context, ContextVar
 from types import coroutine
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LONG_TURN_SECONDS",
+    "MOST_THREADS",
     "OWNER",
     "TimeLimit",
     "awaited_calls",
@@ -40,6 +42,8 @@ __all__ = [
 
 LONG_TURN_SECONDS: Final = 0.1
 """An env that holds the event loop for longer is reported."""
+MOST_THREADS: Final = 256
+"""Of the loops of `run_loop`; asyncio's own have the number of cores and four more."""
 OWNER: Final[ContextVar[object]] = ContextVar("rlightning_aio_env", default=None)
 """The env on whose behalf code runs, also in tasks that the env has started."""
 log = logging.getLogger("rlightning_aio")
@@ -52,14 +56,23 @@ def run_loop(main: Coroutine[Any, Any, T]) -> T:
     """Run `main` to its end on a uvloop event loop.
 
     On asyncio's, if uvloop is missing, or ``RLIGHTNING_AIO_UVLOOP`` is 0 in the environment.
+    `asyncio.to_thread` has up to `MOST_THREADS` threads there, made as they are needed, so that
+    envs that wait in one don't wait for one another.
     """
+    served = _served(main)
     if os.environ.get("RLIGHTNING_AIO_UVLOOP") == "0":
-        return asyncio.run(main)
+        return asyncio.run(served)
     try:
         import uvloop  # noqa: PLC0415  # There is none for Windows.
     except ImportError:
-        return asyncio.run(main)
-    return uvloop.run(main)
+        return asyncio.run(served)
+    return uvloop.run(served)
+
+
+async def _served(main: Coroutine[Any, Any, T]) -> T:
+    threads = ThreadPoolExecutor(MOST_THREADS, "to_thread")
+    asyncio.get_running_loop().set_default_executor(threads)
+    return await main
 
 
 class _CollectorTime:
