@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import sys
 from typing import Any, cast
 
 import msgspec
@@ -83,6 +84,59 @@ def test_rewards_and_flags_survive_for_agents_and_sub_environments(
     packed = Packed([], [])
     header = layout.pack(outcome, packed)
     assert same(tuple(layout.unpack(*packed, header[1:])), tuple(outcome))
+
+
+def compressed() -> tuple[ResultLayout, Any]:
+    """A layout with an image and a vector, and a value of it."""
+    pytest.importorskip("zstandard")
+    space = spaces.Dict(
+        image=spaces.Box(0, 255, (64, 64, 3), np.uint8), state=spaces.Box(-1, 1, (400,))
+    )
+    image = np.repeat(np.arange(64, dtype=np.uint8), 192).reshape(64, 64, 3)
+    return ResultLayout(space, 1, (), "zstd"), {"image": image, "state": sampled(space["state"], 1)}
+
+
+def test_images_are_compressed_without_loss_and_what_does_not_shrink_is_not() -> None:
+    """Arrays of other dtypes are left as they are."""
+    layout, value = compressed()
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)
+    for image, is_small in ((value["image"], True), (noise, False)):
+        packed = Packed([], [])
+        header = layout.pack(ResultFields({**value, "image": image}, 0.0, False, False), packed)
+        assert (len(packed.frames[0]) < 12288) == is_small
+        assert len(packed.frames[1]) == 1600
+        found = layout.unpack(*packed, header[1:]).observation
+        assert same(found, {**value, "image": image})
+
+
+@pytest.mark.parametrize("fault", ["larger", "smaller", "unknown", "cut", "longer", "noise"])
+def test_a_frame_that_states_another_size_is_not_expanded(fault: str) -> None:
+    """Nor one that states none, is damaged, or has more behind it."""
+    layout, value = compressed()
+    import zstandard
+
+    packed = Packed([], [])
+    layout.pack(ResultFields(value, 0.0, False, False), packed)
+    good = packed.frames[0]
+    unknown = zstandard.ZstdCompressor(write_content_size=False)
+    packed.frames[0] = {
+        "larger": zstandard.compress(bytes(1 << 24)),
+        "smaller": zstandard.compress(bytes(100)),
+        "unknown": unknown.compress(bytes(12288)),
+        "cut": good[:-8],
+        "longer": good + b"more",
+        "noise": b"no frame",
+    }[fault]
+    with pytest.raises(WireError, match="a compressed frame"):
+        layout.unpack(*packed, (0.0, False, False))
+
+
+def test_without_the_library_compression_is_refused_with_the_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    with pytest.raises(WireError, match=r"pip install 'rlightning-aio\[zstd\]'"):
+        ResultLayout(spaces.Discrete(2), 1, (), "zstd")
 
 
 def test_a_value_that_cannot_be_sent_is_left_out_and_named() -> None:

@@ -30,6 +30,9 @@ EXCEPTIONS: Final[dict[tuple[str, str], str]] = {
     ("rlightning_aio.batch.data.BatchedData", "methods of a class"): (
         "Half of them are columns of results, one property each."
     ),
+    ("rlightning_aio.remote.client.RemoteEnvClient", "arguments of a constructor"): (
+        "Each is a setting of its own of one connection."
+    ),
     ("rlightning_aio.vector.env.VectorEnv", "arguments of a constructor"): (
         "It takes those of Gymnasium's AsyncVectorEnv, so that programs change only an import."
     ),

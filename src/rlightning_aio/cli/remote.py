@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -62,6 +62,9 @@ def client(
             show_default="as the server says",
         ),
     ] = None,
+    compression: Annotated[
+        str | None, typer.Option(help="Of images: zstd.", show_default="as they are")
+    ] = None,
 ) -> None:
     """Lend an env of this machine to the env_server of a trainer elsewhere.
 
@@ -81,7 +84,8 @@ def client(
     try:
         with interruptible(), _faults_of(entry):
             env = build_env(entry, is_hardware=ENVS.is_hardware(entry.backend))
-            served = _client_of(env, connect, keys, name, heartbeat)
+            options: dict[str, Any] = {"heartbeat": heartbeat, "compression": compression}
+            served = _client_of(env, connect, keys=keys, name=name, **options)
             with served, connections_logged():
                 typer.echo(f"{served.name} connects to {connect}", err=True)
                 served.run()
@@ -117,11 +121,9 @@ def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
     return entry
 
 
-def _client_of(
-    env: BaseEnv, address: str, keys: Path | None, name: str | None, heartbeat: float | None
-) -> RemoteEnvClient:
+def _client_of(env: BaseEnv, address: str, **options: Any) -> RemoteEnvClient:
     try:
-        return RemoteEnvClient(env, address, keys=keys, name=name, heartbeat=heartbeat)
+        return RemoteEnvClient(env, address, **options)
     except BaseException:
         env.close()
         raise

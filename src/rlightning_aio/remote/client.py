@@ -20,7 +20,7 @@ import time
 from math import ceil
 from pathlib import Path
 from threading import Lock, Thread, current_thread, main_thread
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import gymnasium as gym
 import zmq
@@ -58,6 +58,7 @@ from rlightning_aio.protocol.net.wire import (
     HARDWARE_HEARTBEAT,
     MAX_FRAME_BYTES,
     MAX_NAME_LENGTH,
+    WireError,
     ping_ms,
 )
 from rlightning_aio.registry import ENVS
@@ -104,6 +105,8 @@ class RemoteEnvClient:
             that its space does not contain never reaches it, and `BaseEnv.stop` is called whatever
             goes wrong. None: what the registry says of the backend of a `BaseEnv`; True of any
             other env, whose method ``stop`` is then called, if it has one.
+        compression: ``zstd`` compresses images of observations, without loss; None sends them as
+            they are. Both ends need the extra ``zstd``.
         heartbeat: seconds of silence after which the server counts as gone, at least 0.1. None: as
             the server says; until then 1 for hardware, else 5.
 
@@ -128,6 +131,7 @@ class RemoteEnvClient:
         name: str | None = None,
         hardware: bool | None = None,
         heartbeat: float | None = None,
+        compression: Literal["zstd"] | None = None,
     ) -> None:
         given_by_keys = "" if keys is None else Path(keys).name
         self.name = name or given_by_keys or f"{socket.gethostname()}-{os.getpid()}"
@@ -152,8 +156,9 @@ class RemoteEnvClient:
                 free_actions=env.transforms_actions or has_preprocess_fn(env),
                 reads_extras=reads_extras(env),
                 hardware=hardware,
+                compression=_checked_compression(compression),
             )
-        except UnsupportedSpace as error:
+        except (UnsupportedSpace, WireError) as error:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         self._bare_step = fast_path_of(env).bare_step()
         self._env_step = step_of(env)
@@ -522,6 +527,12 @@ def _own_env(env: Any, name: str) -> BaseEnv:
             "env in a plain loop; give it plain methods, or run it in a worker of the trainer"
         )
     return env
+
+
+def _checked_compression(given: Any) -> Literal["zstd"] | None:
+    if given not in (None, "zstd"):
+        raise ConfigError(f"compression should be 'zstd' or None, not {given!r}")
+    return given
 
 
 def _checked_heartbeat(heartbeat: float | None) -> float | None:

@@ -126,7 +126,7 @@ def _announcement(
         kind,
         meta,
         ClientTraits(hello.free_actions, hello.reads_extras, hello.hardware),
-        ResultLayout(observation_space, hello.num_envs, hello.agents),
+        ResultLayout(observation_space, hello.num_envs, hello.agents, hello.compression),
         SpaceLayout(action_space, "action"),
     )
 

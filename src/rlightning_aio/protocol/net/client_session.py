@@ -21,6 +21,7 @@ from rlightning_aio.protocol.net.wire import (
     Bye,
     ClientHello,
     ClientResult,
+    Compression,
     Failure,
     FromServer,
     Part,
@@ -116,6 +117,7 @@ class ClientSession:
         free_actions: the env accepts actions that do not fit its action space.
         reads_extras: the env reads columns that the policy attaches to the action.
         hardware: the env moves something real.
+        compression: of images in observations.
 
     Attributes:
         phase: state of the connection.
@@ -123,6 +125,7 @@ class ClientSession:
 
     Raises:
         UnsupportedSpace: a space can't be announced.
+        WireError: the library for `compression` is not installed.
     """
 
     def __init__(
@@ -133,6 +136,7 @@ class ClientSession:
         free_actions: bool = False,
         reads_extras: bool = False,
         hardware: bool = True,
+        compression: Compression | None = None,
     ) -> None:
         self.phase = Phase.AWAY
         self.outbox: deque[list[bytes]] = deque()
@@ -150,11 +154,12 @@ class ClientSession:
             free_actions=free_actions,
             reads_extras=reads_extras,
             hardware=hardware,
+            compression=compression,
         )
         # Neither is None, because `describe` accepted them.
         observation_space = cast("gym.Space[Any]", meta.observation_space)
         action_space = cast("gym.Space[Any]", meta.action_space)
-        self._results = ResultLayout(observation_space, meta.num_envs, meta.agents)
+        self._results = ResultLayout(observation_space, meta.num_envs, meta.agents, compression)
         self._actions = SpaceLayout(action_space, "action")
         self._reader: Reader[FromServer] = Reader(FromServer)
         self._writer = Writer()

@@ -8,8 +8,9 @@ messages (`wire`).
 
 from __future__ import annotations
 
+from importlib import import_module
 from math import prod
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -20,9 +21,11 @@ from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
 from rlightning_aio.trees import as_array
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
+
+    from rlightning_aio.protocol.net.wire import Compression
 
 __all__ = ["MAX_HEAD", "Packed", "ResultFields", "ResultLayout", "SpaceLayout"]
 
@@ -48,13 +51,19 @@ class SpaceLayout:
     Args:
         space: made of Box, Discrete, MultiBinary, MultiDiscrete, Dict, Tuple and Text.
         what: what messages call a value, such as ``"observation"``.
+        compression: of arrays of `_LEAST_BYTES` uint8 at least, such as images.
 
     Attributes:
         num_frames, num_texts: of one value.
+
+    Raises:
+        WireError: its library is not installed.
     """
 
-    def __init__(self, space: gym.Space[Any], what: str) -> None:
-        self._node = _node_of(space, what)
+    def __init__(
+        self, space: gym.Space[Any], what: str, compression: Compression | None = None
+    ) -> None:
+        self._node = _node_of(space, what, _Zstd() if compression else None)
         self._only = self._node.form if type(self._node) is _Array else None
         self.num_frames = self._node.num_frames
         self.num_texts = self._node.num_texts
@@ -112,6 +121,59 @@ class _Array(_Node):
 
     def unpack(self, arriving: _Arriving) -> Any:
         return self.form.read(next(arriving.frames))
+
+
+class _Zstd:
+    """Compresses frames, and expands those that state the size that they should have."""
+
+    def __init__(self) -> None:
+        try:
+            zstd = import_module("zstandard")
+        except ImportError:
+            raise WireError(
+                "compression: zstd needs zstandard: pip install 'rlightning-aio[zstd]'"
+            ) from None
+        self._fault: type[Exception] = zstd.ZstdError
+        self._size_of = zstd.frame_content_size
+        self._expand = zstd.ZstdDecompressor().decompress
+        self.compress: Callable[[bytes], bytes] = zstd.ZstdCompressor(level=1).compress
+
+    def expanded(self, part: Part, size: int) -> bytes:
+        """Return the `size` bytes of a frame; nothing is allocated if it states another size.
+
+        Raises:
+            WireError: it does, or can't be expanded.
+        """
+        try:
+            if (stated := self._size_of(part)) != size:
+                raise WireError(f"a compressed frame states {stated} bytes, not {size}")
+            return self._expand(part, max_output_size=size, allow_extra_data=False)
+        except self._fault as error:
+            raise WireError(f"a compressed frame can't be read: {error}") from None
+
+
+_LEAST_BYTES: Final = 1024
+"""Of an array that is compressed."""
+
+
+class _Compressed(_Array):
+    """An array of bytes; a frame of its full size is not compressed."""
+
+    def __init__(self, space: gym.Space[Any], what: str, zstd: _Zstd) -> None:
+        super().__init__(space, what)
+        self._zstd = zstd
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        super().pack(value, packed)
+        small = self._zstd.compress(packed.frames[-1])
+        if len(small) < self.form.size:
+            packed.frames[-1] = small
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        part = next(arriving.frames)
+        if len(part) < self.form.size:
+            part = self._zstd.expanded(part, self.form.size)
+        return self.form.read(part)
 
 
 class _Number(_Array):
@@ -193,16 +255,21 @@ class _Tuple(_Parts):
         return tuple(node.unpack(arriving) for node in self._nodes.values())
 
 
-def _node_of(space: gym.Space[Any], what: str) -> _Node:
+def _node_of(space: gym.Space[Any], what: str, zstd: _Zstd | None) -> _Node:
     if isinstance(space, spaces.Dict):
         items = cast("spaces.Dict[Any]", space).spaces.items()
-        return _Dict({key: _node_of(s, f"{what}[{key!r}]") for key, s in items}, what)
+        return _Dict({key: _node_of(s, f"{what}[{key!r}]", zstd) for key, s in items}, what)
     if isinstance(space, spaces.Tuple):
         parts = enumerate(cast("spaces.Tuple[Any]", space).spaces)
-        return _Tuple({k: _node_of(s, f"{what}[{k}]") for k, s in parts}, what)
+        return _Tuple({k: _node_of(s, f"{what}[{k}]", zstd) for k, s in parts}, what)
     if isinstance(space, spaces.Text):
         return _Text(space, what)
-    return _Number(space, what) if isinstance(space, spaces.Discrete) else _Array(space, what)
+    if isinstance(space, spaces.Discrete):
+        return _Number(space, what)
+    shape = cast("tuple[int, ...]", space.shape)
+    if zstd is not None and space.dtype == np.uint8 and prod(shape) >= _LEAST_BYTES:
+        return _Compressed(space, what, zstd)
+    return _Array(space, what)
 
 
 class ResultFields(NamedTuple):
@@ -226,9 +293,13 @@ class ResultLayout:
     """
 
     def __init__(
-        self, observation_space: gym.Space[Any], num_envs: int, agents: Sequence[str]
+        self,
+        observation_space: gym.Space[Any],
+        num_envs: int,
+        agents: Sequence[str],
+        compression: Compression | None = None,
     ) -> None:
-        self._observation = SpaceLayout(observation_space, "observation")
+        self._observation = SpaceLayout(observation_space, "observation", compression)
         self._agents = tuple(agents)
         self._each = (num_envs,) if num_envs > 1 else ()
         self.head = (len(agents), *self._each) if agents else self._each

@@ -9,7 +9,7 @@ the order of messages (see `server_session` and `client_session`).
 from __future__ import annotations
 
 from math import prod
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, cast
 
 import msgspec
 import numpy as np
@@ -38,6 +38,7 @@ __all__ = [
     "Bye",
     "ClientHello",
     "ClientResult",
+    "Compression",
     "Failure",
     "FromClient",
     "FromServer",
@@ -84,6 +85,7 @@ _MAX_DEPTH: Final = 32
 """Levels of maps in which `portable` looks for what can't be sent."""
 
 Part: TypeAlias = bytes | memoryview
+Compression: TypeAlias = Literal["zstd"]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 
@@ -121,6 +123,8 @@ class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
     """The client reads columns that the policy attaches to the action."""
     hardware: bool = True
     """The env moves something real, which only its user's reset may set in motion."""
+    compression: Compression | None = None
+    """Of the observations' frames of bytes, such as images."""
 
 
 class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
