@@ -575,6 +575,10 @@ class FakeGroup:
     def read(self) -> None:
         """See `hosts.base.Driver`: there is nothing to read."""
 
+    def others(self) -> str:
+        """Name no other task."""
+        return ""
+
     def wake(self) -> None:
         """See `hosts.base.Driver.wake`."""
         for running in self.running:

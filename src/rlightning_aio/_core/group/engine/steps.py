@@ -234,35 +234,32 @@ class Steps:
                 is an action, hardware of the batch stops.
         """
         try:
-            return self._write(batch, now)
+            if self._completions:
+                self._intake.apply_completions()
+            answer = None if self._conditions.unusual else answer_of(batch, self._tables)
+            if answer is None:
+                return self._write_any(batch, now)
+            slots, columns = answer
+            if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
+                return self._write_any(batch, now)
+            if self._has_places and self._asks_a_place(slots):
+                return self._write_any(batch, now)
+            slab = self._layout.slabs[0]
+            rows: Rows = self._all_rows if slots is self._envs.local else slots
+            action = columns["action"]
+            fits = type(action) is np.ndarray and action.shape == (len(slots), *self._action_shape)
+            limit = self._limits.get(action.dtype, -1.0) if fits else -1.0
+            is_small = limit is not None and limit > 0 and action.size <= exchange.FEW_NUMBERS
+            if limit is None or (is_small and exchange.sum_of_squares(action) <= limit):
+                slab.action_columns[0][1][rows] = action
+            else:
+                write_column(action, slab, slots, rows, self._envs)
+            self._results.note_sent(slots, columns)
+            return slots, None
         except (BadAction, UnknownEnv, EnvBusy) as error:
             if isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
                 self._stop_hardware(batch.ids(), error)
             raise
-
-    def _write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
-        if self._completions:
-            self._intake.apply_completions()
-        answer = None if self._conditions.unusual else answer_of(batch, self._tables)
-        if answer is None:
-            return self._write_any(batch, now)
-        slots, columns = answer
-        if not len(slots) or len(self._requests.state[slots].nonzero()[0]):
-            return self._write_any(batch, now)
-        if self._has_places and self._asks_a_place(slots):
-            return self._write_any(batch, now)
-        slab = self._layout.slabs[0]
-        rows: Rows = self._all_rows if slots is self._envs.local else slots
-        action = columns["action"]
-        fits = type(action) is np.ndarray and action.shape == (len(slots), *self._action_shape)
-        limit = self._limits.get(action.dtype, -1.0) if fits else -1.0
-        is_small = limit is not None and limit > 0 and action.size <= exchange.FEW_NUMBERS
-        if limit is None or (is_small and exchange.sum_of_squares(action) <= limit):
-            slab.action_columns[0][1][rows] = action
-        else:
-            write_column(action, slab, slots, rows, self._envs)
-        self._results.note_sent(slots, columns)
-        return slots, None
 
     def _stop_hardware(self, ids: Sequence[str], error: RLightningError) -> None:
         """Stop the hardware of a batch that was refused, unless only because an env is busy."""
