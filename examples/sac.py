@@ -227,8 +227,9 @@ async def train(args: Args) -> Run:
                     with run.learning():
                         for _ in range(count):
                             figures = learner.learn(replay)
-                if batch.done.any():
-                    returns += batch.infos["episode"]["r"][batch.done].tolist()
+                ended = batch.done & ~batch.restarted  # A lost episode has no return.
+                if ended.any():
+                    returns += batch.infos["episode"]["r"][ended].tolist()
                 fresh += count
                 if fresh >= args.record_every:
                     run.record(fresh, returns, **figures)

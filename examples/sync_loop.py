@@ -12,5 +12,6 @@ with sync.build_env_group(config) as group:
     with group.auto_reset(max_episode_steps=100):
         for _ in range(250):
             batch, _ = group.step(batch.respond(action=rng.uniform(-1, 1, (8, 6))))
-            if batch.done.any():
-                print("returns:", batch.info("episode")["r"].round(1))
+            ended = batch.done & ~batch.restarted  # A lost episode has no return.
+            if ended.any():
+                print("returns:", batch.infos["episode"]["r"][ended].round(1))

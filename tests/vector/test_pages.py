@@ -47,3 +47,44 @@ def test_programs_run(
         program.write_text(block)
         outputs.append(output_of(program, folder=tmp_path))
     assert "".join(outputs).strip()
+
+
+DYING = """
+import os
+import gymnasium as gym
+
+
+class Dying(gym.Wrapper):
+    steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 250 and os.environ["DIES"] == "1":
+            os._exit(3)
+        return super().step(action)
+
+
+def make():
+    return Dying(gym.make("Pendulum-v1", max_episode_steps=200))
+
+
+gym.register("Dying-v0", make)
+"""
+
+
+@pytest.mark.parametrize("dies", [False, True])
+def test_cleanrls_loop_prints_no_return_of_a_lost_episode(
+    dies: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its end may be the only one of a step, where there is no return at all."""
+    monkeypatch.setenv("DIES", str(int(dies)))
+    text = (DOCS / "migrating.md").read_text().partition("\n## CleanRL\n")[2]
+    (block, *_) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    block = block.replace("Pendulum-v1", "Dying-v0").replace(
+        "range(0, 1000, 4)", "range(0, 1700, 4)"
+    )
+    (tmp_path / "program.py").write_text(DYING + block)
+    found = output_of(tmp_path / "program.py", folder=tmp_path).splitlines()
+    returns = [float(line.rpartition("=")[2]) for line in found if "episodic_return" in line]
+    assert len(returns) == (4 if dies else 8)
+    assert max(returns) < 0
