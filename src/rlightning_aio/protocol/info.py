@@ -111,11 +111,11 @@ class InfoSchema:
 
     @cached_property
     def _dtype(self) -> np.dtype[Any]:
-        """The layout as the dtype of a structured array."""
+        """The layout as the dtype of a structured array, whose fields can't have all names."""
         return np.dtype(
             [
-                (key, _SCALARS[kind]) if array is None else (key, array[1], array[0])
-                for key, kind, array in zip(self.keys, self.types, self.arrays, strict=True)
+                (str(k), _SCALARS[kind]) if array is None else (str(k), array[1], array[0])
+                for k, (kind, array) in enumerate(zip(self.types, self.arrays, strict=True))
             ]
         )
 
@@ -153,7 +153,7 @@ class InfoSchema:
     def fields(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Decode ``rows [n, bytes]`` to one column for each key, which are views of a copy."""
         values = np.ascontiguousarray(rows[:, : self.size]).view(self._dtype)[:, 0]
-        return {key: values[key] for key in self.keys}
+        return {key: values[str(k)] for k, key in enumerate(self.keys)}
 
     def decode(self, row: bytes | memoryview) -> dict[str, Any]:
         """Decode the info in `row`; its arrays are new and writable."""

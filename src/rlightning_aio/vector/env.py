@@ -435,7 +435,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             ResetNeeded, AlreadyPendingCallError: as of `call`.
         """
         env_ids = None if places is None else self._ids(places)
-        call = partial(self.group.call, name, *args, env_ids=env_ids, **kwargs)
+        call = partial(self.group.call_with, name, args, kwargs, env_ids)
         return self._called("call_async", call)
 
     def _called(self, what: str, call: Callable[[], T]) -> T:

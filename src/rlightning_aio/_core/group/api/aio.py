@@ -107,8 +107,17 @@ class EnvGroup(GroupInterface):
     async def call(
         self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
     ) -> list[Any]:
-        procedure = self._core.calls.call(time.monotonic(), env_ids, (name, args, kwargs))
-        return await self._driver.run(procedure)
+        return await self.call_with(name, args, kwargs, env_ids)
+
+    async def call_with(
+        self,
+        name: str,
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> list[Any]:
+        asked = name, tuple(args), dict(kwargs or {})
+        return await self._driver.run(self._core.calls.call(time.monotonic(), env_ids, asked))
 
     async def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))

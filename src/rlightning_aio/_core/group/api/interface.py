@@ -214,6 +214,16 @@ class GroupInterface(Facade):
         """
         raise NotImplementedError
 
+    def call_with(
+        self,
+        name: str,
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> Any:
+        """Call method `name` of envs as `call` does, also one with an argument ``env_ids``."""
+        raise NotImplementedError
+
     def snapshot(self, env_ids: Sequence[str] | None = None) -> Any:
         """Return the complete state of envs as bytes that can be stored.
 

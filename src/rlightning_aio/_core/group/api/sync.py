@@ -106,8 +106,17 @@ class EnvGroup(GroupInterface):
     def call(
         self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
     ) -> list[Any]:
-        procedure = self._core.calls.call(time.monotonic(), env_ids, (name, args, kwargs))
-        return self._driver.run(procedure)
+        return self.call_with(name, args, kwargs, env_ids)
+
+    def call_with(
+        self,
+        name: str,
+        args: Sequence[Any] = (),
+        kwargs: Mapping[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> list[Any]:
+        asked = name, tuple(args), dict(kwargs or {})
+        return self._driver.run(self._core.calls.call(time.monotonic(), env_ids, asked))
 
     def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return self._driver.run(self._core.snapshot(time.monotonic(), env_ids))

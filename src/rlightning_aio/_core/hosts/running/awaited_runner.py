@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.protocol.entries import answers_with_value
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
@@ -73,10 +74,7 @@ class AwaitedRunner(EnvRunner):
         """Return what to reset the env with, and remember it."""
         if arguments is None and self._slab.take_as_before(self._row):
             arguments = self.reset_with
-        if arguments is self.reset_with:  # After a hang, whose random numbers must not come again.
-            return self.reset_with
-        arguments = super()._seed_and_options(arguments)
-        options = arguments[1]
+        seed, options = chosen = super()._seed_and_options(arguments)
         if not (options and "reset_mask" in options):  # It begins no episode of the whole env.
-            self.reset_with = arguments
-        return arguments
+            self.reset_with = seed, copied(options)
+        return chosen

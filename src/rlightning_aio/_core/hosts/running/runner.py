@@ -44,6 +44,7 @@ from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.pickling import dumped
 from rlightning_aio.protocol.slab import RowLayout, Slab
+from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
@@ -339,8 +340,13 @@ class EnvRunner:
         return partial(bare or self.env.reset, seed=seed, options=options), finish
 
     def _seed_and_options(self, arguments: Any) -> tuple[int | None, dict[str, Any] | None]:
-        """Return what to reset the env with."""
-        return arguments or (self._slab.take_seed(self._row), None)
+        """Return what to reset the env with: a copy, as the env may change it, and it may be
+        needed again.
+        """
+        if not arguments:
+            return self._slab.take_seed(self._row), None
+        seed, options = arguments
+        return seed, copied(options)
 
     def _finish_reset(self, returned: Any, busy_ns: int, *, is_bare: bool) -> OutOfBand | None:
         if is_bare:
