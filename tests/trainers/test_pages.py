@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from run_python import output_of
 
+import rlightning_aio as rl
+
 pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -64,3 +66,34 @@ def test_a_grpo_update(tmp_path: Path) -> None:
     file.write_text(program("attempts", "torch"))
     first, last = map(float, output_of(file, folder=tmp_path, asyncio_debug=False).split())
     assert last > first + 0.5
+
+
+async def test_tinker_cookbook() -> None:
+    """Half of the attempts at each question are right; one at the second question has failed."""
+    names = names_of("migrating", "tinker_cookbook")
+    import tinker
+    from tinker_cookbook.completers import TokensWithLogprobs
+
+    asked: list[str] = []
+
+    async def policy(seen: Any, stop: Any) -> Any:
+        assert stop == ["\n"]
+        asked.append(bytes(seen.to_ints()).decode())
+        if asked.count("Is 3 odd?") == 4:
+            asked.append("")
+            raise rl.EnvError("no model", blame="policy")
+        text = b"Yes" if asked.count(asked[-1]) % 2 else b"No."
+        return TokensWithLogprobs(tokens=[*text], maybe_logprobs=[-1.0] * 3)
+
+    data, groups = await names["data_of_update"](
+        policy,
+        lambda text: tinker.ModelInput.from_ints([*text.encode()]),
+        lambda tokens: bytes(tokens).decode(),
+        ["\n"],
+        seeds=[1, 3],
+    )
+    assert len(data) == len(groups) == 7
+    advantages = [datum.loss_fn_inputs["advantages"].data for datum in data]
+    last = sorted(round(row[-1], 2) for row in advantages)
+    assert last == [-0.67, -0.5, -0.5, 0.33, 0.33, 0.5, 0.5]
+    assert all(row[:-3] == [0.0] * (len(row) - 3) for row in advantages)
