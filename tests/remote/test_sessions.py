@@ -133,7 +133,9 @@ def test_who_gets_which_place() -> None:
     world.settle()
     assert world.server.clients() == {"srv/0": "b", "srv/2": "a"}
     world.join_all()
-    assert world.clients["d"].refused == ["all 3 places are taken"]
+    assert world.clients["d"].refused == [
+        "all 3 places are taken; for more, set env_kwargs.clients of the entry"
+    ]
     world.clients["c"].leave()
     world.settle()
     world.clients["d"].connect()
@@ -146,8 +148,9 @@ def test_a_listed_name_has_its_own_place() -> None:
     world = World("abx", places="ba")
     world.join_all()
     assert world.server.clients() == {"srv/b": "b", "srv/a": "a"}
-    assert world.clients["x"].refused == ["the places of srv are for b, a"]
-    assert world.server.refused == {"x": "the places of srv are for b, a"}
+    why = "the places of srv are for b, a, as env_kwargs.clients says"
+    assert world.clients["x"].refused == [why]
+    assert world.server.refused == {"x": why}
 
 
 def test_a_key_is_for_the_names_that_it_was_made_for(world: World) -> None:

@@ -322,14 +322,19 @@ class ServerSessions:
             raise Rejection(f"its key was made for {names}, not for {hello.name!r}")
         listed = [place.name for place in self._places if place.name]
         if listed and hello.name not in listed:
-            raise Rejection(f"the places of {self._server_id} are for {', '.join(listed)}")
+            names = ", ".join(listed)
+            raise Rejection(
+                f"the places of {self._server_id} are for {names}, as env_kwargs.clients says"
+            )
         # Of a client that is refused for good, whether there is room doesn't matter.
         found = announced(hello, size, self._kind, self._num_envs, self._objection)
         if any(session.name == hello.name for session in self._by_route.values()):
             raise Rejection(f"a client named {hello.name!r} is here already", retry=True)
         place = self._place_for(hello.name)
         if place is None:
-            raise Rejection(f"all {len(self._places)} places are taken", retry=True)
+            count = len(self._places)
+            taken = "the only place is taken" if count == 1 else f"all {count} places are taken"
+            raise Rejection(f"{taken}; for more, set env_kwargs.clients of the entry", retry=True)
         self._kind = found.kind
         place.last = hello.name
         place.session = self._by_route[route] = ServerSession(hello.name, route, found, place)
