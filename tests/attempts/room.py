@@ -81,7 +81,8 @@ class AwaitedRoom(Awaitable):
         return await super().reset(seed=seed, options=options)
 
     async def pause(self, action: Any = None) -> None:
-        await asyncio.sleep(3600 if action == "hang" else 0)
+        seconds = action.get("seconds", 0) if isinstance(action, dict) else 0
+        await asyncio.sleep(3600 if action == "hang" else seconds)
 
     async def tool(self, number: int) -> int:
         """Something to call."""

@@ -907,3 +907,47 @@ async def test_a_group_is_played_once_at_a_time() -> None:
             with pytest.raises(EnvBusy, match="another play"):
                 await played(group, tasks(1), once)
         assert len(await played(group, tasks(3), once)) == 3
+
+
+# -- whose time it is -----------------------------------------------------------------
+
+
+async def test_time_in_which_the_trainer_blocks_the_loop_is_not_the_attempts() -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(5):
+            await asyncio.sleep(0.01)
+            await episode.step(1)
+
+    async with rooms(PLACES["loop"]) as group:
+        found: list[AttemptGroup] = []
+        async for attempts in play(group, tasks(6), agent, 2, Rules(attempt_timeout=1.0)):
+            time.sleep(1.2)  # noqa: ASYNC251  # The update of the weights.
+            found.append(attempts)
+    assert all(attempts.is_complete for attempts in found)
+
+
+async def test_time_in_the_queue_of_the_entry_is_not_the_attempts() -> None:
+    """Each step takes a twentieth of the limit, and eight wait for the one that is executed."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(5):
+            await episode.step({"reward": 1.0, "seconds": 0.1})
+
+    async with rooms(PLACES["loop"], 8, max_concurrency=1) as group:
+        (attempts,) = await played(group, tasks(1), agent, 8, Rules(attempt_timeout=2.0))
+    assert [attempt.outcome.kind for attempt in attempts] == ["terminated"] * 8
+
+
+@pytest.mark.parametrize(
+    ("steps", "deed", "kind"), [(0, "think", "timed_out"), (2, "hang", "env_hung")]
+)
+async def test_nothing_to_grade_is_no_end(steps: int, deed: str, kind: str) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(steps):
+            await episode.step(1)
+        await (asyncio.sleep(3600) if deed == "think" else episode.step(deed))
+
+    rules = Rules(attempt_timeout=2.0, on_timeout="end", retries=0)
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+    assert (attempt.outcome.kind, attempt.outcome.blame, attempt.reward) == (kind, "either", None)

@@ -354,7 +354,10 @@ class Attempts(InContext):
             require(outcome.kind == "truncated", "another end", played.end)
         elif played.end == "cancelled":
             own = ["cancelled"]
-            own += ["timed_out" if rules.on_timeout == "fail" else "truncated"] * is_timeout
+            if is_timeout and rules.on_timeout == "end":
+                own += ["truncated" if attempt.length else "timed_out", "env_hung"]
+            elif is_timeout:
+                own += ["timed_out"]
             require(outcome.kind in own, "another end", own)
         else:
             require(outcome.kind == played.end, "another failure", played.end)

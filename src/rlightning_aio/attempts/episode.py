@@ -7,6 +7,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, EnvRaised, RLightningError
 from rlightning_aio.outcomes import Outcome
@@ -38,8 +39,13 @@ class AttemptEpisode:
 
     first: Any = None
 
-    def __init__(self, episode: EnvEpisode, spec: EpisodeSpec, index: int) -> None:
-        self._episode = episode
+    def __init__(
+        self, episode: EnvEpisode, spec: EpisodeSpec, index: int, clock: Clock | None = None
+    ) -> None:
+        self._episode, self._clock = episode, clock or Clock()
+        self._queues = clock is not None and episode.queues
+        self._began, self._queued = self._clock.now(), 0.0
+        self._asked_at: float | None = None  # What is in flight, by the clock.
         self._over = ""  # Why it can't be stepped.
         self.spec, self.index = spec, index
         self.rewards: list[float] = []
@@ -141,6 +147,7 @@ class AttemptEpisode:
 
     async def _timed(self, answer: Any) -> Any:
         began = time.monotonic()
+        self._asked_at = asked_at = self._clock.now()
         try:
             found = await answer
         except EnvFault as fault:
@@ -151,6 +158,10 @@ class AttemptEpisode:
             raise
         finally:
             self.seconds += time.monotonic() - began
+            self._asked_at = None
+            if self._queues:
+                inside = self._episode.seconds_in_env or 0.0
+                self._queued += max(self._clock.now() - asked_at - inside, 0.0)
         self.fault = None
         return found
 
@@ -177,6 +188,23 @@ class AttemptInPlay(AttemptEpisode):
     def earned(self) -> float:
         """The reward: that of `finish`, or else the sum of `rewards`."""
         return sum(self.rewards) if self.graded is None else self.graded
+
+    def ran(self) -> float:
+        """Seconds for which it could run: not in a queue, nor while the loop was blocked."""
+        queued = self._queued
+        if self._asked_at is not None and self._queues:
+            inside = self._episode.seconds_in_env or 0.0
+            queued += max(self._clock.now() - self._asked_at - inside, 0.0)
+        return self._clock.now() - self._began - queued
+
+    @property
+    def in_step(self) -> float:
+        """Seconds for which the env executes a step that is in flight; 0 without."""
+        if self._asked_at is None:
+            return 0.0
+        if self._queues:
+            return self._episode.seconds_in_env or 0.0
+        return self._clock.now() - self._asked_at
 
     async def leave(self) -> None:
         """End what is in flight; the env is idle after that."""

@@ -15,6 +15,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakSet
 
+from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.queue import AttemptQueue
@@ -104,6 +105,7 @@ async def play(
             engine.news.clear()
     finally:
         running.cancel()
+        engine.stop_clock()
         await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
 
@@ -125,6 +127,7 @@ class _Engine:
     """The attempts in progress.
 
     Attributes:
+        clock: of the attempts, if they have a time limit.
         done: groups that the caller has not taken.
         news: is set when there is one, or nothing more will come.
     """
@@ -148,6 +151,10 @@ class _Engine:
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._health = Health()
+        self.clock: Clock | None = None
+        if rules.attempt_timeout is not None:
+            self.clock = Clock()
+            self.clock.start()
         self._queue.may_play = lambda env_id: not self._health.rests(env_id, time.monotonic())
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)
@@ -156,6 +163,10 @@ class _Engine:
         self._wake = asyncio.Event()
         self.done = deque[AttemptGroup]()
         self.news = asyncio.Event()
+
+    def stop_clock(self) -> None:
+        if self.clock is not None:
+            self.clock.stop()
 
     async def take(self) -> AttemptGroup:
         """Hand over a group of attempts that is in the file; others may take its place."""
@@ -244,7 +255,7 @@ class _Engine:
         (job,) = self._queue.take(env_id)
         options = self._queue.players.options(env_id, job.spec)
         episode = self._group.episode(env_id, job.spec.seed, options)
-        view = AttemptInPlay(episode, job.spec, job.index)
+        view = AttemptInPlay(episode, job.spec, job.index, self.clock)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         if self._health.is_slow:
             self._probes.append(one)

@@ -31,6 +31,8 @@ Agent: TypeAlias = "Callable[[AttemptEpisode], Awaitable[Any]]"
 
 _PATIENCE_SECONDS: Final = 0.5
 """How long a cancelled agent may take to end, before its env continues without it."""
+_SHORTEST_SECONDS: Final = 0.01
+"""Between looks whether its time is over, while it could not run."""
 _log = logging.getLogger("rlightning_aio")
 
 
@@ -90,7 +92,7 @@ class Try:
         limit = self._rules.attempt_timeout
         view, result = self._view, None
         begin = asyncio.ensure_future(view.begin())
-        await self._either(begin, limit)
+        await self._within(begin, limit)
         if not begin.done():
             begin.cancel()
             await surely({begin})
@@ -106,7 +108,7 @@ class Try:
         else:
             del begin  # A task keeps its coroutine.
             playing = asyncio.ensure_future(_awaited(self._agent, view))
-            await self._either(playing, limit and limit - (time.monotonic() - began))
+            await self._within(playing, limit)
             ended = self._end_of(playing)
             if not playing.done():
                 playing.cancel()
@@ -121,6 +123,15 @@ class Try:
             await surely({asyncio.ensure_future(view.renew())})
         self._has_ended = True
         return self._record(ended, result, time.monotonic() - began)
+
+    async def _within(self, task: asyncio.Task[Any], limit: float | None) -> None:
+        """Wait for a task, until this try is stopped, or has run for `limit` seconds."""
+        left = limit
+        while self._stopped is None and not task.done():
+            await self._either(task, left)
+            if limit is None or (left := limit - self._view.ran()) <= 0:
+                return
+            left = max(left, _SHORTEST_SECONDS)
 
     async def _either(self, task: asyncio.Task[Any], limit: float | None) -> None:
         """Wait for a task, until this try is stopped, or for `limit` seconds.
@@ -167,11 +178,16 @@ class Try:
         """The outcome of a try that did not end by itself."""
         if self._stopped is not None:
             return Outcome("cancelled", "caller", self._stopped, self.env_id)
+        assert self._rules.attempt_timeout is not None
         cause = f"its {self._rules.attempt_timeout:g} s were over"
         if not has_begun:
             return Outcome("timed_out", "env", f"{cause} before its reset was done", self.env_id)
         if self._rules.on_timeout == "end":
-            return Outcome("truncated", "policy", cause, self.env_id)
+            if self._view.in_step > self._rules.attempt_timeout / 2:
+                cause += ", most of them in a step"
+                return Outcome("env_hung", "either", cause, self.env_id)
+            if self._view.rewards:
+                return Outcome("truncated", "policy", cause, self.env_id)
         return Outcome("timed_out", "either", cause, self.env_id)
 
     def _end_of(self, playing: asyncio.Task[Any]) -> Outcome:

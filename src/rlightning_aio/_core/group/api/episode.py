@@ -62,6 +62,14 @@ class Agents:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
         return self._steps.loss(env_id)
 
+    def queues(self, env_id: str) -> bool:
+        """Return True if requests to an env may wait in a queue of `max_concurrency`."""
+        return self._steps.queues(env_id)
+
+    def seconds_in_env(self, env_id: str) -> float | None:
+        """Return what `AgentSteps` documents."""
+        return self._steps.seconds_in_env(env_id)
+
     def _on_end(self, task: asyncio.Task[None]) -> None:
         if task is self._serving and task.cancelled():
             self._steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
@@ -191,6 +199,19 @@ class EnvEpisode:
                 return value
             self._lose(lost)
         raise self._error(None)
+
+    @property
+    def queues(self) -> bool:
+        """Return True if steps may wait in a queue of `max_concurrency`."""
+        return self._agents.queues(self.env.env_id)
+
+    @property
+    def seconds_in_env(self) -> float | None:
+        """Seconds that the env has spent on the step in flight, or else on the newest one.
+
+        None while a step waits in a queue.
+        """
+        return self._agents.seconds_in_env(self.env.env_id)
 
     def _lose(self, lost: Outcome) -> None:
         self.lost, self.is_over = lost, True

@@ -9,6 +9,7 @@ one after another, results wait for a hundredth of a step's time, so that there 
 
 from __future__ import annotations
 
+import time
 from asyncio import CancelledError
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
@@ -161,6 +162,24 @@ class AgentSteps:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
         why = self._tables.episodes.why_lost(self._tables.envs.find_one(env_id))
         return None if why is None else why.outcome(env_id)
+
+    def seconds_in_env(self, env_id: str) -> float | None:
+        """Seconds that an env has spent on what is in flight, or else on its newest result.
+
+        None while a request waits in the queue of `max_concurrency`; only entries with one are
+        asked for what is in flight.
+        """
+        slot, layout = self._tables.envs.find_one(env_id), self._tables.layout
+        slab = layout.slabs[layout.slab.item(slot)]
+        ns = slab.busy_ns.item(layout.row.item(slot))
+        if slot in self._sent:
+            return (time.monotonic_ns() + ns) / 1e9 if ns < 0 else None
+        return max(ns, 0) / 1e9
+
+    def queues(self, env_id: str) -> bool:
+        """Return True if requests to an env may wait in a queue of `max_concurrency`."""
+        record = self._tables.record_of(self._tables.envs.find_one(env_id))
+        return record.config.max_concurrency is not None
 
     def serve(self, now: float) -> Procedure[None]:
         """Send the steps that agents ask for, and hand out their results, until none is left."""

@@ -132,6 +132,7 @@ class AwaitedEnvs:
         self._records: list[_EnvRecord] = []
         self._queue: deque[tuple[_EnvRecord, int, Any]] = deque()
         self.num_busy = 0
+        self._queues = order.config.max_concurrency is not None
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
         config = order.config
@@ -273,6 +274,8 @@ class AwaitedEnvs:
             record, entry, arguments = self._queue.popleft()
             self.num_busy += 1
             record.entry, record.arguments = entry, arguments
+            if self._queues:
+                record.runner.note_begin()
             if record.env is not None:
                 self._give(record, record.env)
             elif record.is_ending:

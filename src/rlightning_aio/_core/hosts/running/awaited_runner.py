@@ -47,6 +47,10 @@ class AwaitedRunner(EnvRunner):
         self.attach(other._slab, other._row, other._announce)
         self.reset_with = other.reset_with
 
+    def note_begin(self) -> None:
+        """Say in its row that its request has left the queue."""
+        self._writer.note_begin()
+
     async def answer(self, op: int, arguments: Any) -> Any:
         """Execute one request, as `execute` does."""
         call, finish = self.request(op, arguments)

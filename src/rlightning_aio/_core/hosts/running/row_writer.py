@@ -224,6 +224,10 @@ class RowWriter:
         self._times[0] = time.monotonic_ns()
         self._times[1] = busy_ns
 
+    def note_begin(self) -> None:
+        """Write that a request is executed now: the time of an env is negative until it ends."""
+        self._times[1] = -time.monotonic_ns()
+
     def _write_no_transition(self) -> None:
         self._reward[...] = 0.0
         self._flags[...] = False
