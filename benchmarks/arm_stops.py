@@ -1,18 +1,19 @@
-"""How far does a robot arm travel after the process that drives it is killed or stopped?
+"""How far does a robot arm travel after something goes wrong?
 
     python benchmarks/arm_stops.py
-    python benchmarks/arm_stops.py --signals HUP KILL --places client
+    python benchmarks/arm_stops.py --events HUP KILL --places client --during reset --speed 50
 
-Three simulated Piper arms, one for each kind of safe stop, are moving to a far target when one
-process gets a signal: the trainer whose arms are in workers, the workers, a trainer whose arms are
-inline, or the clients of another trainer. The arms listen on pseudo-terminals, and their own clocks
-give the times of their stops. Needs ``rlightning-aio[piper]``.
+Three simulated Piper arms, one for each kind of safe stop, are moving to a far target, by steps or
+by a reset, when a process gets a signal (the trainer of workers, the workers, a trainer whose arms
+are inline, `rollout` with such, clients, or their trainer), or an action or a picture is wrong. The
+arms are on pseudo-terminals; their clocks give the times. Needs ``rlightning-aio[piper]``.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -26,21 +27,35 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import psutil
 
-from rlightning_aio import BatchedData, PolicyResponse, sync
-from rlightning_aio.errors import EnvFault
+from rlightning_aio import sync
+from rlightning_aio.errors import BadAction, EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOPS = ("hold", "emergency_stop", "disable")
 SIGNALS = ("HUP", "INT", "TERM", "QUIT", "KILL", "STOP")
-PLACES = ("trainer", "worker", "inline", "client")
+EVENTS = ("beyond", "none", "raises", "no picture", "hangs")
+"""Of a step: an action outside its space, no action; a camera that raises, returns None, hangs."""
+PLACES = ("trainer", "worker", "inline", "rollout", "client", "server")
+DURING = ("step", "reset")
 FAR = [2.5, 3.0, -2.9, 1.7, 1.2, 2.0]
-SPEED = 10
-"""Percent; 17 degrees a second."""
 PATIENCE = 60.0
+TROUBLE = Path(os.environ.get("ARM_STOPS_TROUBLE", "/nowhere"))
+"""A file that holds the event, once it has happened."""
+
+
+def happened() -> str:
+    return TROUBLE.read_text() if TROUBLE.exists() else ""
+
+
+def read_picture() -> dict[str, Any]:
+    if (event := happened()) == "raises":
+        raise OSError("the camera was unplugged")
+    if event == "hangs":
+        time.sleep(PATIENCE)
+    return {"wrist": None if event == "no picture" else np.zeros((48, 64, 3), np.uint8)}
 
 
 def _default_signals() -> None:
@@ -48,65 +63,40 @@ def _default_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def options(stop: str, channel: str) -> dict[str, Any]:
-    return {
+def entry(stop: str, channel: str, placement: str, during: str, speed: int) -> dict[str, Any]:
+    options = {
         "can_interface": "slcan",
         "channel": channel,
-        "speed": SPEED,
+        "speed": speed,
         "gripper": False,
         "safe_stop": stop,
+        "reset_joints": FAR if during == "reset" else [0.0] * 6,
+        "cameras": {"read": "arm_stops:read_picture", "images": {"wrist": [48, 64, 3]}},
         # Long, because the machine may be busy; the watchdog's time is what is measured.
         "feedback_timeout": 20.0,
         "connect_timeout": 60.0,
     }
+    place = {"placement": placement, "env_kwargs": options}
+    return {"name": stop, "backend": "piper", "task": "stops", **place}
 
 
-def entry(stop: str, channel: str, placement: str) -> dict[str, Any]:
-    return {
-        "name": stop,
-        "backend": "piper",
-        "task": "stops",
-        "placement": placement,
-        "env_kwargs": options(stop, channel),
-    }
-
-
-def far(env_ids: list[str]) -> BatchedData[PolicyResponse]:
-    return BatchedData(env_ids, [PolicyResponse(env_id, FAR) for env_id in env_ids])
-
-
-def say(line: str) -> None:
-    print(line, flush=True)
-
-
-def drive(placement: str, channels: list[str]) -> None:
-    """Run a trainer with an arm on each channel; print when they move, and the outcome."""
-    entries = [entry(*pair, placement) for pair in zip(STOPS, channels, strict=True)]
+def drive(entries: list[dict[str, Any]], during: str) -> None:
+    """Run a trainer with these entries; print when its arms move, and the outcome."""
     with sync.build_env_group(entries) as group:
-        group.reset()
-        try:
-            while True:
-                group.step(far(group.env_ids))
-                say("moving")
-        except EnvFault as fault:
-            say(f"fault: {fault}")
-            sys.stdin.read()
-
-
-def serve() -> None:
-    """Run a trainer whose arms are clients."""
-    server = {"name": "arms", "backend": "env_server"}
-    server["env_kwargs"] = {"clients": len(STOPS), "connect_timeout": PATIENCE, "heartbeat": 30}
-    with sync.build_env_group(server) as group:
-        say(group["arms-0"].address)
+        if entries[0]["backend"] == "env_server":
+            print(group["arms-0"].address, flush=True)
+        if during == "reset":
+            print("moving", flush=True)
         batch, _ = group.reset()
-        while True:
+        while batch:
+            event, actions = happened(), np.array([FAR] * len(batch))
             try:
-                group.step_async(far([value.env_id for value in batch.values()]))
-                batch, _ = group.collect_async()
-                say("moving")
-            except EnvFault as fault:
-                say(f"fault: {fault}")
+                actions = None if event == "none" else actions * 9 if event == "beyond" else actions
+                batch, _ = group.step(batch.respond(action=actions))
+                print("moving", flush=True)
+            except (EnvFault, BadAction) as fault:
+                batch = getattr(fault, "results", None)  # The other arms go on.
+        sys.stdin.read()
 
 
 def arms() -> tuple[Any, Any]:
@@ -149,34 +139,31 @@ def arms() -> tuple[Any, Any]:
 
 @dataclass
 class Stopped:
-    """The outcome for one arm.
-
-    Attributes:
-        signal, place, stop: the signal, the processes that got it, and the kind of safe stop.
-        seconds: from the signal to standstill, by the arm's clock.
-        degrees: travel of its fastest joint in that time.
-        moved_again: travel in degrees after a stopped process was continued.
+    """The outcome for one arm: seconds from the event to standstill, by the arm's clock, travel of
+    its fastest joint in degrees, and after a stopped process was continued.
     """
 
-    signal: str
+    event: str
     place: str
+    during: str
     stop: str
     seconds: float
     degrees: float
     moved_again: float
 
 
-def measure(place: str, name: str) -> list[Stopped]:
-    """Send one signal and measure the travel of each arm."""
+def measure(place: str, event: str, during: str = "step", speed: int = 10) -> list[Stopped]:
+    """Let something happen and measure the travel of each arm."""
     timed_arm, sim = arms()
-    number = getattr(signal, f"SIG{name}")
     with contextlib.ExitStack() as cleanup:
         ports = [sim.SlcanPort() for _ in STOPS]
         moving = [timed_arm() for _ in STOPS]
         for port, arm in zip(ports, moving, strict=True):
             cleanup.callback(port.close)
             cleanup.enter_context(sim.running(arm, port))
-        targets = cleanup.enter_context(started(place, [port.path for port in ports]))
+        trouble = Path(cleanup.enter_context(tempfile.TemporaryDirectory())) / "trouble"
+        channels = [port.path for port in ports]
+        targets = cleanup.enter_context(started(place, channels, during, speed, trouble))
         for arm in moving:
             arm.wait_until(lambda arm=arm: arm.travelled > 2)
             assert not arm.is_stopped
@@ -185,20 +172,23 @@ def measure(place: str, name: str) -> list[Stopped]:
             with arm.moved:
                 arm.stopped_at = None
                 before.append((arm.clock, arm.travelled))
-        for target in targets:
-            target.send_signal(number)
+        if event in EVENTS:
+            trouble.write_text(event)
+        for target in targets if event not in EVENTS else ():
+            os.kill(target, getattr(signal, f"SIG{event}"))
         for arm in moving:
             arm.wait_until(lambda arm=arm: arm.stopped_at is not None)
         ends = [arm.travelled for arm in moving]
-        if name == "STOP":
+        if event == "STOP":
             for target in targets:
-                target.send_signal(signal.SIGCONT)
+                os.kill(target, signal.SIGCONT)
             for arm in moving:
                 arm.wait_until(lambda arm=arm: arm.clock > arm.stopped_at + 1.0)
         return [
             Stopped(
-                name,
+                event,
                 place,
+                during,
                 stop,
                 round(arm.stopped_at - clock, 3),
                 round(end - travelled, 2),
@@ -208,109 +198,118 @@ def measure(place: str, name: str) -> list[Stopped]:
         ]
 
 
+def children(pid: int) -> list[int]:
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for task in tasks for child in task.read_text().split()]
+
+
+def launched(
+    place: str, entries: list[dict[str, Any]], during: str, start: Any, folder: Path
+) -> tuple[list[Any], list[Any]]:
+    """Start the processes that drive the arms. Return the trainers, and who gets the signal."""
+
+    def command(name: str, one: dict[str, Any], *options: str) -> Any:
+        config = folder / f"{one['name']}.yaml"
+        config.write_text(json.dumps({"envs": [one]}))
+        run = "from rlightning_aio.cli import main; main()"
+        return start("-c", run, name, str(config), *options)
+
+    if place == "rollout":
+        return [], [command("rollout", one, "--steps", "100000") for one in entries]
+    groups = [entries]
+    if place == "inline":  # A reset moves one arm of a group after the other.
+        groups = [[one] for one in entries]
+    elif place in ("client", "server"):
+        # Such a long heartbeat at the server that its clients alone find out.
+        kwargs = {"clients": 3, "connect_timeout": 60, "heartbeat": 30 if place == "client" else 1}
+        groups = [[{"name": "arms", "backend": "env_server", "env_kwargs": kwargs}]]
+    trainers = [start(__file__, "--drive", during, json.dumps(group)) for group in groups]
+    if place not in ("client", "server"):
+        return trainers, trainers
+    options = ["--connect", trainers[0].stdout.readline().strip(), "--name"]
+    clients = [command("client", one, *options, one["name"]) for one in entries]
+    return trainers, clients if place == "client" else trainers
+
+
 @contextlib.contextmanager
-def started(place: str, channels: list[str]) -> Iterator[list[psutil.Process]]:
-    """Start the processes that drive the arms; yield those that get the signal."""
-    environment = {**os.environ, "CAN_CONFIG": '{"sleep_after_open": 0.0}'}
-    with contextlib.ExitStack() as cleanup:
+def started(
+    place: str, channels: list[str], during: str, speed: int, trouble: Path
+) -> Iterator[list[int]]:
+    """Have arms driven; yield the ids of the processes that get the signal."""
+    own = {"CAN_CONFIG": '{"sleep_after_open": 0.0}', "ARM_STOPS_TROUBLE": str(trouble)}
+    environment = {**os.environ, **own, "PYTHONPATH": str(Path(__file__).parent)}
+    placement = "inline" if place in ("inline", "rollout") else "process"
+    entries = [entry(*pair, placement, during, speed) for pair in zip(STOPS, channels, strict=True)]
+    processes: list[subprocess.Popen[str]] = []
+    drained: list[threading.Thread] = []
 
-        def start(*command: str) -> subprocess.Popen[str]:
-            process = subprocess.Popen(
-                [sys.executable, *command],
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                text=True,
-                start_new_session=True,
-                # The parent may ignore some of these signals, as nohup does.
-                preexec_fn=_default_signals,  # noqa: PLW1509  # Sets signals only.
-            )
-            cleanup.callback(process.stdin.close)
-            cleanup.callback(process.stdout.close)
-            processes.append(process)
-            return process
+    def start(*command: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, *command],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+            # The parent may ignore some of these signals, as nohup does.
+            preexec_fn=_default_signals,  # noqa: PLW1509  # Sets signals only.
+        )
+        processes.append(process)
+        return process
 
-        processes: list[subprocess.Popen[str]] = []
-        cleanup.callback(lambda: [process.wait() for process in processes])
-        cleanup.callback(lambda: [process.kill() for process in processes])
-
-        if place == "client":
-            trainer = start(__file__, "--serve")
-            address = trainer.stdout.readline().strip()
-            folder = cleanup.enter_context(tempfile.TemporaryDirectory())
-            clients: list[subprocess.Popen[str]] = []
-            for stop, channel in zip(STOPS, channels, strict=True):
-                config = Path(folder) / f"{stop}.yaml"
-                config.write_text(json.dumps({"envs": [entry(stop, channel, "process")]}))
-                run = "from rlightning_aio.cli import main; main()"
-                arguments = ["client", str(config), "--connect", address, "--name", stop]
-                clients.append(start("-c", run, *arguments))
-            targets = [psutil.Process(client.pid) for client in clients]
-        else:
-            placement = "inline" if place == "inline" else "process"
-            trainer = start(__file__, "--drive", placement, *channels)
-            targets = [psutil.Process(trainer.pid)]
-        if trainer.stdout.readline() != "moving\n":
+    try:
+        trainers, targets = launched(place, entries, during, start, trouble.parent)
+        if any(trainer.stdout.readline() != "moving\n" for trainer in trainers):
             raise RuntimeError(f"the trainer of {place} did not come to move its arms")
-        if place == "worker":
-            targets = [w for fork_server in targets[0].children() for w in fork_server.children()]
-        # Their further output must not fill a pipe.
-        drained = [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
+        found = [target.pid for target in targets]
+        while place == "worker" and len(found) < len(STOPS):  # A list may miss some.
+            found = [worker for server in children(trainers[0].pid) for worker in children(server)]
+        drained += [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
         for thread in drained:
             thread.start()
-        yield targets
+        yield found
+    finally:
         for process in processes:
             process.kill()
+            process.wait()
         # Their workers hold the pipes, too. A worker that outlives its port would stop the next
         # arm with that path.
         for thread in drained:
             thread.join()
+        for process in processes:
+            process.stdin.close()
+            process.stdout.close()
 
 
 def table(found: list[Stopped]) -> str:
-    """Return a Markdown table with the travel of each arm after the signal."""
-    lines = [
-        f"| signal | to | {' | '.join(f'`{stop}`' for stop in STOPS)} |",
-        f"|---|---|{'---|' * len(STOPS)}",
-    ]
-    cells = {(one.signal, one.place, one.stop): one for one in found}
-    for name, place in dict.fromkeys((one.signal, one.place) for one in found):
-        row = [cells[name, place, stop] for stop in STOPS]
-        ways = " | ".join(f"{one.degrees:.1f}° in {one.seconds:.2f} s" for one in row)
-        lines.append(f"| SIG{name} | {TITLES[place]} | {ways} |")
+    """Return a Markdown table with the travel of each arm after the event."""
+    lines = ["| event | where | during a | `hold` | `emergency_stop` | `disable` |"]
+    lines.append("|---|---|---|---|---|---|")
+    cells = {(one.event, one.place, one.during, one.stop): one for one in found}
+    for key in dict.fromkeys((one.event, one.place, one.during) for one in found):
+        ways = [f"{cells[*key, s].degrees:.1f}° in {cells[*key, s].seconds:.2f} s" for s in STOPS]
+        lines.append(f"| {' | '.join((*key, *ways))} |")
     return "\n".join(lines)
-
-
-TITLES = {
-    "trainer": "trainer of workers",
-    "worker": "worker",
-    "inline": "trainer, `inline`",
-    "client": "client",
-}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--signals", nargs="+", choices=SIGNALS, default=SIGNALS)
+    parser.add_argument("--events", nargs="+", choices=SIGNALS + EVENTS, default=SIGNALS + EVENTS)
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES)
-    parser.add_argument("--drive", nargs="+", help=argparse.SUPPRESS)
-    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.drive:
-        drive(arguments.drive[0], arguments.drive[1:])
-    elif arguments.serve:
-        serve()
-    else:
-        began = time.monotonic()
-        found = [
-            one
-            for place in arguments.places
-            for name in arguments.signals
-            for one in measure(place, name)
-        ]
-        print(table(found))
-        print(f"{len(found)} arms in {time.monotonic() - began:.0f} s", file=sys.stderr)
+    parser.add_argument("--during", nargs="+", choices=DURING, default=DURING)
+    parser.add_argument("--speed", type=int, default=10, help="percent: 10 is 17 degrees a second")
+    parser.add_argument("--drive", nargs=2, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.drive:
+        drive(json.loads(given.drive[1]), given.drive[0])
+        return
+    found: list[Stopped] = []
+    for place, event, during in itertools.product(given.places, given.events, given.during):
+        if event in SIGNALS or (during == "step" and place in ("trainer", "inline", "server")):
+            found += measure(place, event, during, given.speed)
+            print(table(found[-len(STOPS) :]).splitlines()[-1], file=sys.stderr, flush=True)
+    print(table(found))
 
 
 if __name__ == "__main__":

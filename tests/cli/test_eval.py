@@ -181,8 +181,6 @@ def test_wrong_options_are_refused_at_once(tmp_path: Path) -> None:
     """The message names the option and the fix."""
     config = write_config(tmp_path, POLE)
     assert "can't be written" in refused(config, "--resume", tmp_path / "absent" / "file")
-    server = write_config(tmp_path, {"name": "robots", "backend": "env_server"})
-    assert "no client has dialled in for robots-0/0" in refused(server)
 
 
 def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:

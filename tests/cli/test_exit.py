@@ -194,10 +194,11 @@ def test_an_exception_of_a_policy_shows_its_own_code(tmp_path: Path) -> None:
     assert ["stub_policies.py" in place for place in places] == [True]
 
 
-def test_missing_clients_are_one_message(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["rollout", "eval"])
+def test_missing_clients_are_one_message(tmp_path: Path, command: str) -> None:
     """It has the server, its address and the time waited."""
     server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
-    done = invoke("rollout", write_config(tmp_path, server))
+    done = invoke(command, write_config(tmp_path, server))
     assert (done.exit_code, done.stdout) == (1, "")
     assert "no client has dialled in for robots-0/0 within 0.01 s" in done.stderr
 

@@ -29,23 +29,39 @@ def load_harness() -> Any:
 arm_stops = load_harness()
 
 
+@pytest.mark.parametrize("during", arm_stops.DURING)
 @pytest.mark.parametrize("place", arm_stops.PLACES)
 @pytest.mark.parametrize("name", arm_stops.SIGNALS)
-def test_arms_stop_as_configured_when_their_process_ends(name: str, place: str) -> None:
+def test_arms_stop_as_configured_when_their_process_ends(
+    name: str, place: str, during: str
+) -> None:
     """Three arms under way, one for each kind of stop, come nowhere near their target.
 
     What was only stopped and goes on moves nothing: a late command doesn't reach the arm.
     """
-    found = arm_stops.measure(place, name)
+    check(arm_stops.measure(place, name, during))
+
+
+@pytest.mark.parametrize("place", ["trainer", "inline", "server"])
+@pytest.mark.parametrize("event", arm_stops.EVENTS)
+def test_arms_stop_when_an_action_or_a_picture_is_wrong(event: str, place: str) -> None:
+    """In a worker, in the trainer itself and at a client."""
+    check(arm_stops.measure(place, event))
+
+
+def check(found: list[Any]) -> None:
     assert [one.stop for one in found] == list(arm_stops.STOPS)
     for one in found:
         assert one.degrees < 100  # On their way were more than 170.
         assert one.moved_again < 1
 
 
-def test_the_table_has_a_row_for_each_place_and_signal() -> None:
+def test_the_table_has_a_row_for_each_place_and_event() -> None:
     """As on the page about faults."""
-    found = [arm_stops.Stopped("HUP", "client", stop, 0.25, 4.0, 0.0) for stop in arm_stops.STOPS]
-    assert arm_stops.table(found).splitlines()[2:] == [
-        "| SIGHUP | client | 4.0° in 0.25 s | 4.0° in 0.25 s | 4.0° in 0.25 s |"
+    rows = [
+        arm_stops.Stopped("HUP", "client", "reset", stop, 0.25, 4.0, 0.0)
+        for stop in arm_stops.STOPS
+    ]
+    assert arm_stops.table(rows).splitlines()[2:] == [
+        "| HUP | client | reset | 4.0° in 0.25 s | 4.0° in 0.25 s | 4.0° in 0.25 s |"
     ]

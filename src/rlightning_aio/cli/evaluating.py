@@ -26,7 +26,7 @@ from rlightning_aio.cli.options import (
     check_seed,
 )
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
-from rlightning_aio.cli.policies import Responder, load_policy
+from rlightning_aio.cli.policies import Responder, load_policy, servers_announced
 from rlightning_aio.cli.terminal import (
     Progress,
     count,
@@ -256,6 +256,8 @@ async def _evaluate(
     # The random actions of the saved episodes must not be drawn again.
     before = 0 if results is None else len(results)
     async with group:
+        if servers_announced(group, progress):
+            await group.reset()  # Clients tell their spaces when they dial in.
         respond = Responder(group, policy, None if order.seed is None else order.seed + before)
         try:
             played = evaluate(

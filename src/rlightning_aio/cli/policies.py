@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
+from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import ConfigError, RLightningError
@@ -31,8 +32,16 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio._core.group.api.aio import EnvGroup
+    from rlightning_aio.cli.terminal import Progress
 
-__all__ = ["PolicyRaised", "Responder", "load_policy", "respond_to_all", "steps_in"]
+__all__ = [
+    "PolicyRaised",
+    "Responder",
+    "load_policy",
+    "respond_to_all",
+    "servers_announced",
+    "steps_in",
+]
 
 Policy: TypeAlias = Callable[[BatchedData], Any]
 
@@ -41,6 +50,16 @@ _PACKAGE: Final = str(Path(__file__).parents[1])
 
 class PolicyRaised(RLightningError):
     """The user's policy raised an exception; the message has the traceback of its own code."""
+
+
+def servers_announced(group: EnvGroup, progress: Progress) -> bool:
+    """Say where the env_servers of a group listen; return True if it has any."""
+    found = False
+    for server_id in dict.fromkeys(one.partition("/")[0] for one in group.env_ids):
+        if isinstance(server := group[server_id], ServerHandle):
+            found = True
+            progress.say(f"{server_id} listens at {server.address}")
+    return found
 
 
 def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Policy | None] | None:

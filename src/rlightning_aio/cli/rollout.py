@@ -17,10 +17,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 import typer
 
 import rlightning_aio
-from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PolicyName, Seed, check_seed
-from rlightning_aio.cli.policies import Responder, load_policy, respond_to_all, steps_in
+from rlightning_aio.cli.policies import (
+    Responder,
+    load_policy,
+    respond_to_all,
+    servers_announced,
+    steps_in,
+)
 from rlightning_aio.cli.terminal import (
     Progress,
     connections_logged,
@@ -165,9 +170,7 @@ async def _collect(
     timeline = contextlib.nullcontext() if trace is None else group.trace(trace)
     async with group:
         with timeline:
-            for server_id in dict.fromkeys(one.partition("/")[0] for one in group.env_ids):
-                if isinstance(server := group[server_id], ServerHandle):
-                    progress.say(f"{server_id} listens at {server.address}")
+            servers_announced(group, progress)
             progress.begin("first reset")
             batch, _ = await group.reset(seed=done.seed)
             respond = Responder(group, policy, done.seed)

@@ -113,8 +113,8 @@ def watched(is_over: Callable[[], bool], due: Callable[[], Iterable[BaseEnv]]) -
 
 
 @contextlib.contextmanager
-def stopped_by_signals(env: BaseEnv) -> Generator[None]:
-    """Have signals that the program handles stop `env`, too, while the block is executed.
+def stopped_by_signals(envs: Iterable[BaseEnv]) -> Generator[None]:
+    """Have signals that the program handles stop `envs`, too, while the block is executed.
 
     An event loop only notes Ctrl-C, so nothing else would end a motion that blocks it.
     """
@@ -122,7 +122,8 @@ def stopped_by_signals(env: BaseEnv) -> Generator[None]:
     before: dict[int, Any] = {}
 
     def handle(number: int, frame: Any) -> None:
-        watched(is_over.is_set, lambda: [env])
+        for env in list(envs):  # Each in a thread of its own, as a stop takes some time.
+            watched(is_over.is_set, lambda env=env: [env])
         before[number](number, frame)
 
     try:

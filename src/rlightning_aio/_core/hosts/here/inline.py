@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+from weakref import WeakSet
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
@@ -37,12 +39,15 @@ if TYPE_CHECKING:
         StartOrder,
     )
     from rlightning_aio._core.hosts.running.runner import EnvRunner
+    from rlightning_aio.envs.base import BaseEnv
 
 __all__ = ["InlineHost"]
 
 _Waiting: TypeAlias = "tuple[int, NDArray[np.int64], Callable[[], Any]]"
 """An entry, by itself and as an array of one, and the function that executes it."""
 _STEP: Final = int(Operation.STEP)
+_HARDWARE: Final[WeakSet[BaseEnv]] = WeakSet()
+"""Envs of this process that move something real."""
 
 
 class InlineHost(Host):
@@ -73,6 +78,8 @@ class InlineHost(Host):
     def _built(self) -> list[EnvStarted]:
         for runner in built_envs(self._order, inline=True):
             self._runners.append(runner)
+            if self._order.is_hardware:
+                _HARDWARE.add(runner.env)
         return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
@@ -102,7 +109,8 @@ class InlineHost(Host):
     def stop(self, index: int, number: int) -> None:
         del number  # None is being executed now.
         if index < len(self._runners):
-            stop(self._runners[index].env)
+            # In a thread, as a stop takes some time, and other envs must stop, too.
+            Thread(target=stop, args=[self._runners[index].env], daemon=True).start()
 
     def execute_next(self) -> bool:
         if not self._queue:
@@ -112,7 +120,7 @@ class InlineHost(Host):
         runner = self._runners[slot_of(entry) - self.first_slot]
         try:
             if self._order.is_hardware:
-                with stopped_by_signals(runner.env):
+                with stopped_by_signals(_HARDWARE):
                     outcome = self._driver.interruptible(execute)
             else:
                 outcome = self._driver.interruptible(execute)
