@@ -10,6 +10,7 @@ from kit.driven import Driven
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.vector import VectorEnv
 
 
@@ -96,3 +97,25 @@ async def test_an_env_that_begins_anew_has_the_options_as_they_were_given(placem
             assert batch.restarted.tolist() == [True]
             assert batch.observation == [["system", "hello"]]
         assert options == {"messages": ["system"]}
+
+
+@pytest.mark.parametrize("wraps", [lambda env: env, gym.wrappers.OrderEnforcing])
+@pytest.mark.parametrize(
+    "fields", [{"placement": "inline"}, {"envs_per_process": 2}], ids=["inline", "worker"]
+)
+def test_one_object_behind_several_callables_is_refused(fields: Any, wraps: Any) -> None:
+    """As DummyVecEnv does; in workers of their own, each would have a copy."""
+    one = Named()
+    group = sync.build_env_group({**ENTRY, "task": lambda: wraps(one), **fields})
+    with pytest.raises(ConfigError, match=r"'e-0' and 'e-1' returned the same env object"):
+        group.init()
+    group.close()
+
+
+@pytest.mark.parametrize("fields", [{"placement": "loop"}, {"envs_per_process": 2}])
+async def test_one_awaitable_object_behind_several_callables_is_refused(fields: Any) -> None:
+    one = Conversation()
+    group = rl.build_env_group({**ENTRY, "task": lambda: one, **fields})
+    with pytest.raises(ConfigError, match="returned the same env object"):
+        await group.init()
+    await group.close()

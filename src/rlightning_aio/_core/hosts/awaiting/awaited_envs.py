@@ -36,7 +36,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
 )
 from rlightning_aio._core.hosts.limits import AWAITED_CLOSE_SECONDS, hung, limits_of
 from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raised
-from rlightning_aio._core.hosts.running.build_env import built_env
+from rlightning_aio._core.hosts.running.build_env import built_env, check_distinct
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvAway
@@ -176,6 +176,7 @@ class AwaitedEnvs:
                 if (error := await self._build(record)) is not None:
                     raise error
                 self._records.append(record)
+                check_distinct(self.runners)
             return [runner.started() for runner in self.runners]
         except BaseException as error:
             self._post(NotBuilt(self._host_id, index, ErrorText.of(error)))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
+
 from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
@@ -12,16 +14,17 @@ from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
 from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions
 from rlightning_aio.envs.results import is_awaitable
-from rlightning_aio.registry import ENVS, placement_of
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["build_env", "built_env", "built_envs", "not_built"]
+__all__ = ["build_env", "built_env", "built_envs", "check_distinct", "not_built"]
 
 
 def build_env(
@@ -60,8 +63,35 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
     if not inline:
         seed_generators()
         register_tasks(order.tasks)
+    built: list[EnvRunner] = []
     for index in range(len(order.worker_indices)):
-        yield built_env(order, index, inline=inline)
+        built.append(built_env(order, index, inline=inline))
+        check_distinct(built)
+        yield built[-1]
+
+
+def check_distinct(runners: Sequence[EnvRunner]) -> None:
+    """Check that the last of the envs of a host is an object of its own.
+
+    Raises:
+        ConfigError: its callable has returned what another one has; both would step one simulation.
+    """
+    env = runners[-1].env
+    if env.config.backend != CALLABLE:
+        return
+    for other in runners[:-1]:
+        if _simulation_of(other.env) is _simulation_of(env):
+            raise ConfigError(
+                f"the callables of envs {other.env.env_id!r} and {env.env_id!r} returned the same "
+                "env object; make an env in the callable, and return that: lambda: MyEnv()"
+            )
+
+
+def _simulation_of(env: BaseEnv) -> object:
+    made: Any = getattr(env, "env", None)
+    if made is None:
+        return env
+    return made.unwrapped if isinstance(made, gym.Env | gym.vector.VectorEnv) else made  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
 
 
 def not_built(
