@@ -329,6 +329,35 @@ def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None
         ResultsFile(path, {"policy": "other"})
 
 
+class Dark(Scripted):
+    """Can be reset while there is light."""
+
+    light: ClassVar[bool] = False
+
+    def observed(self) -> Any:
+        if not Dark.light:
+            raise ConnectionError("it is dark")
+        return np.zeros(1)
+
+
+def go(batch: rl.BatchedData) -> list[int]:
+    return [GO] * len(batch)
+
+
+def test_episodes_that_have_failed_are_played_again_when_it_resumes(tmp_path: Path) -> None:
+    """They failed by no fault of the policy; the others are not."""
+    entry = {"name": "e", "task": Dark, "placement": "inline", "max_episode_steps": 3}
+    queue, file = [EpisodeSpec("", seed) for seed in range(4)], tmp_path / "results.jsonl"
+    for light, failed in ((False, 4), (True, 0), (False, 0)):
+        Dark.light = light
+        with (
+            sync.build_env_group({**entry, "on_env_error": "restart"}) as group,
+            ResultsFile(file) as results,
+        ):
+            found = evaluate(group, go, queue, retries=0, results=results)
+        assert (len(found.attempts), len(found.failed)) == (4, failed)
+
+
 def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
     """An evaluation that was stopped continues within the same `with`."""
 
