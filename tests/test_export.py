@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import signal
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -203,6 +204,26 @@ def test_episodes_before_a_fault_are_saved_and_others_appended(
         named as writer,
     ):
         writer.add(next(rollouts_of(12, 1)))
+
+
+@pytest.mark.simulators
+def test_ctrl_c_while_an_episode_is_written_comes_after_it(
+    datasets: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half an episode would make the dataset unreadable."""
+    save = datasets.LeRobotDataset.save_episode
+
+    def interrupted(dataset: Any, **more: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        save(dataset, **more)
+
+    monkeypatch.setattr(datasets.LeRobotDataset, "save_episode", interrupted)
+    writer = LeRobotWriter("counting/half", tmp_path / "half", fps=10)
+    with pytest.raises(KeyboardInterrupt), writer:
+        writer.add(next(rollouts_of(12, 1)))
+    dataset = datasets.LeRobotDataset("counting/half", root=tmp_path / "half")
+    assert (dataset.num_episodes, len(dataset)) == (1, 3)
+    assert [frame["observation.state"][1].item() for frame in dataset] == [0, 1, 2]
 
 
 def test_a_dataset_without_an_episode_is_refused(tmp_path: Path) -> None:
