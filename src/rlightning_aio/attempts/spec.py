@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rlightning_aio._core.group.episodes.seeds import checked_seed
+from rlightning_aio._core.group.episodes.episodes import checked_seed
 
 __all__ = ["EpisodeKey", "EpisodeSpec", "plain", "spec_of", "written"]
 

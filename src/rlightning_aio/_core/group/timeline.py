@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio._core.group.drivers.scope import Scope
+from rlightning_aio._core.group.drivers.wait import Scope
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio._core.hosts.base import Executing
 from rlightning_aio.files import check_writable, write_file

@@ -9,9 +9,14 @@ from __future__ import annotations
 import select
 import selectors
 import socket
-from typing import Final, cast
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final, cast
 
-__all__ = ["READABLE", "WRITABLE", "WakeUp", "new_descriptor_set"]
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["READABLE", "WRITABLE", "Inbox", "WakeUp", "new_descriptor_set"]
 
 # The numbers that epoll has; those of selectors are different.
 READABLE: Final = select.POLLIN if hasattr(select, "epoll") else selectors.EVENT_READ
@@ -55,3 +60,43 @@ class WakeUp:
     def close(self) -> None:
         self._reader.close()
         self._writer.close()
+
+
+class Inbox:
+    """A queue of tasks that other threads leave for the trainer's, with a descriptor."""
+
+    def __init__(self) -> None:
+        self._wake_up = WakeUp()
+        self._tasks: deque[Callable[[], None]] = deque()
+        self._lock = threading.Lock()
+        self._is_open = True
+
+    def fileno(self) -> int:
+        """Return a descriptor that is readable while there are tasks; level-triggered."""
+        return self._wake_up.fileno()
+
+    def put(self, task: Callable[[], None]) -> None:
+        """Add a task, from any thread; it is dropped if the inbox is closed."""
+        with self._lock:
+            if self._is_open:
+                if not self._tasks:
+                    self._wake_up.set()
+                self._tasks.append(task)
+
+    def pop_all(self) -> list[Callable[[], None]]:
+        """Remove and return all tasks, oldest first."""
+        with self._lock:
+            if not self._tasks:
+                return []
+            self._wake_up.clear()
+            tasks = list(self._tasks)
+            self._tasks.clear()
+            return tasks
+
+    def close(self) -> None:
+        """Drop all tasks, now and later, and close the descriptor."""
+        with self._lock:
+            if self._is_open:
+                self._is_open = False
+                self._tasks.clear()
+                self._wake_up.close()

@@ -91,9 +91,7 @@ async def outcome_of(reply: asyncio.Future[Any]) -> Any:
 
 
 def _cancel_again(task: asyncio.Task[Any] | None) -> None:
-    if (
-        task is not None and task.cancelling()
-    ):  # Else whoever cancelled it has thought better of it.
+    if task is not None and task.cancelling():  # Else the cancellation was taken back.
         task.uncancel()
         task.cancel()
 

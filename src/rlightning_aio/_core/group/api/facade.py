@@ -11,8 +11,7 @@ from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.group.drivers.scope import Scope
-from rlightning_aio._core.group.drivers.wait import this_process
+from rlightning_aio._core.group.drivers.wait import Scope, this_process
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.conditions import NO_SPAN
@@ -356,7 +355,7 @@ class Facade:
         Never waits; other tasks may be waiting for results or for `init`.
 
         Keys: ``entry``; ``env_ids``; ``client`` (its name, of a place that has one); ``given_up``
-        (ids of envs that no request reaches any more: all of a failed worker, or an awaitable one
+        (ids of envs that no request reaches: all of a failed worker, or an awaitable one
         that is not rebuilt); ``pid`` (of a process on this machine, else None); ``state``
         (``"new"`` before `init`, ``"starting"``, ``"up"``, ``"down"`` before a replacement,
         ``"empty"`` of a place without a client, ``"failed"``, ``"closed"``); ``owed`` (ids of envs

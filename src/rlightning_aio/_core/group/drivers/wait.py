@@ -1,14 +1,16 @@
 """`Wait` and `Procedure`: how the core, which never waits, asks its driver to wait.
 
-`GroupDriver` is what a group asks of whoever waits for it.
+`GroupDriver` is what a group asks of its driver. `Scope` is a context manager that never
+waits, so it serves both kinds of group.
 """
 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeAlias, TypeVar
 
 from rlightning_aio._core.hosts.base import Driver
 from rlightning_aio.errors import RLightningError
@@ -22,6 +24,7 @@ __all__ = [
     "GroupDriver",
     "Patient",
     "Procedure",
+    "Scope",
     "Wait",
     "earliest",
     "forked_from",
@@ -112,3 +115,28 @@ def earliest(*times: float | None) -> float | None:
         if time is not None and (first is None or time < first):
             first = time
     return first
+
+
+class Scope(ABC):
+    """A context manager that never waits, so it supports both kinds of ``with``."""
+
+    @abstractmethod
+    def _enter(self) -> None:
+        """Enter the context."""
+
+    @abstractmethod
+    def _leave(self) -> None:
+        """Leave the context, also after an error."""
+
+    def __enter__(self) -> Self:
+        self._enter()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._leave()
+
+    async def __aenter__(self) -> Self:
+        return self.__enter__()
+
+    async def __aexit__(self, *error: object) -> None:
+        self._leave()

@@ -261,7 +261,7 @@ class Waiting:
         self._requests.settle(ticket)
 
     def leave(self, slot: int) -> None:
-        """Give up one request of the call of `serve`, for which nobody waits any more."""
+        """Give up one request of the call of `serve`, whose caller was cancelled."""
         if self._served is not None:
             self._give_up(self._requests.split(self._served, slot))
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.completion_frames import completion_in
-from rlightning_aio._core.hosts.inbox import Inbox
+from rlightning_aio._core.hosts.descriptors import Inbox
 from rlightning_aio._core.hosts.limits import limits_of
 from rlightning_aio._core.hosts.messages import (
     Attached,
