@@ -22,6 +22,7 @@ from kit.counting import ClientThread, CountingEnv
 from patience import HANG
 
 import rlightning_aio as rl
+from rlightning_aio import sync
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
@@ -602,6 +603,8 @@ async def test_attempts_are_played_in_the_order_of_their_tasks() -> None:
         ({"size": 0}, "size must be at least 1"),
         ({"tasks": [EpisodeSpec("other", 0)]}, "no entry of this group can play"),
         ({"tasks": [7]}, "episodes should be EpisodeSpec"),
+        ({"rules": {"retries": 1}}, r"rules should be Rules\(\.\.\.\)"),
+        ({"results": "a.jsonl"}, r"should be an open ResultsFile\(path\)"),
     ],
 )
 async def test_bad_arguments(wrong: dict[str, Any], message: str) -> None:
@@ -951,3 +954,16 @@ async def test_nothing_to_grade_is_no_end(steps: int, deed: str, kind: str) -> N
     async with rooms(PLACES["loop"]) as group:
         ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
     assert (attempt.outcome.kind, attempt.outcome.blame, attempt.reward) == (kind, "either", None)
+
+
+async def test_what_is_not_asynchronous_is_refused() -> None:
+    def agent(episode: AttemptEpisode) -> int:
+        return 7
+
+    wrong: Any = agent
+    refused = pytest.raises(TypeError, match=r"needs an asynchronous group.*not EnvGroup of .*sync")
+    with sync.build_env_group(CountedRoom, num_workers=1, placement="inline") as group, refused:
+        await played(group, tasks(1), earner)
+    async with rooms(PLACES["loop"]) as group:
+        with pytest.raises(rl.RLightningError, match="returned 7; it must be a coroutine function"):
+            await played(group, tasks(1), wrong)

@@ -17,6 +17,7 @@ from weakref import WeakSet
 
 from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
+from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable
 
     from rlightning_aio._core.group.api.aio import EnvGroup
-    from rlightning_aio.attempts.file import ResultsFile
     from rlightning_aio.attempts.queue import Job, TaskInPlay
     from rlightning_aio.attempts.tries import Agent
 
@@ -76,20 +76,20 @@ async def play(
         agent: a coroutine function, which gets an `AttemptEpisode`.
         size: number of attempts at each task.
         rules: see `Rules`.
-        results: a file; attempts are added, and a run continues from it. Attempts come from it
-            without observations.
+        results: a file to add attempts to, and to continue from; it has no observations.
 
     Groups come in the order of their ends. When the iterator ends, is closed
     (`contextlib.aclosing`) or cancelled, every env is idle or being replaced.
 
     Raises:
+        TypeError: the group is synchronous, or an argument has another type.
         EnvBusy: an env has a request in flight or a result to be collected, or plays already.
         ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
             is a file, and a task is twice there.
         WorkerDied, EnvHung: all envs that could play a task are gone for good.
-        RLightningError: all attempts at the first task, or more than `rules` allow, have failed.
+        RLightningError: too many attempts have failed: all at the first task, or by `rules`.
     """
-    _check(group, size)
+    _check(group, rules, results, size)
     engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
     running = asyncio.create_task(engine.run())
     _in_play.add(group)
@@ -110,7 +110,16 @@ async def play(
         _ = running.cancelled() or running.exception()
 
 
-def _check(group: EnvGroup, size: int) -> None:
+def _check(group: Any, rules: Any, results: Any, size: int) -> None:
+    if not hasattr(group, "episode"):
+        raise TypeError(
+            f"play() needs an asynchronous group, as rlightning_aio.build_env_group makes it, not "
+            f"{type(group).__name__} of {type(group).__module__}"
+        )
+    if not isinstance(rules, Rules | None):
+        raise TypeError(f"rules should be Rules(...), not {rules!r}")
+    if not isinstance(results, ResultsFile | None):
+        raise TypeError(f"results should be an open ResultsFile(path), not {results!r}")
     if size < 1:
         raise ValueError(f"size must be at least 1, not {size!r}")
     if group in _in_play:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 import time
 import traceback
@@ -247,7 +248,10 @@ class Try:
 
 
 async def _awaited(agent: Agent, view: AttemptEpisode) -> Any:
-    return await agent(view)
+    answer: Any = agent(view)
+    if not inspect.isawaitable(answer):
+        raise TypeError(f"the agent returned {answer!r}; it must be a coroutine function")
+    return await answer
 
 
 async def surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:
