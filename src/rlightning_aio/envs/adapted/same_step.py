@@ -8,6 +8,7 @@ import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.envs.wrappers import metadata_of
+from rlightning_aio.trees import copied
 
 __all__ = ["SameStep"]
 
@@ -39,7 +40,8 @@ class SameStep(gym.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated or truncated:
-            final = {"final_info": info, "final_obs": observation}
+            # Copies: an env may use its arrays again in the reset. Its own keys don't replace ours.
+            final = {"final_info": copied(info), "final_obs": copied(observation)}
             observation, info = self.env.reset()
-            info = {**final, **info}
+            info = {**info, **final}
         return observation, reward, terminated, truncated, info
