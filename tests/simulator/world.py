@@ -54,7 +54,7 @@ from rlightning_aio import sharing
 from rlightning_aio._core.group.drivers import sync_driver
 from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import hint, overdue
-from rlightning_aio._core.hosts import inbox
+from rlightning_aio._core.hosts import descriptors
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
@@ -199,7 +199,7 @@ class World:
             (time, "sleep", self.sleep),
             (select, "epoll", lambda: Epoll(self)),
             (socket, "socketpair", self.sockets.pair),
-            (inbox, "WakeUp", partial(WakeUp, self.sockets)),
+            (descriptors, "WakeUp", partial(WakeUp, self.sockets)),
             (subprocess, "Popen", partial(ForkServer, self)),
             (spares, "_spares", {}),
             (os, "close", self.sockets.close_descriptor),
