@@ -159,12 +159,12 @@ class _Engine:
         self._ended = deque[asyncio.Task[Attempt]]()
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
-        self._health = Health()
+        self._health = health = Health()
         self.clock: Clock | None = None
         if rules.attempt_timeout is not None:
             self.clock = Clock()
             self.clock.start()
-        self._queue.may_play = lambda env_id: not self._health.rests(env_id, time.monotonic())
+        self._queue.may_play = lambda env_id: not health.rests(env_id, time.monotonic())
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)
         self._has_played = False
