@@ -198,7 +198,7 @@ def measure(place: str, event: str, during: str = "step", speed: int = 10) -> li
         ]
 
 
-def children(pid: int) -> list[int]:
+def children(pid: int) -> list[int]:  # Incomplete while processes come and go.
     tasks = Path(f"/proc/{pid}/task").glob("*/children")
     return [int(child) for task in tasks for child in task.read_text().split()]
 
@@ -263,8 +263,9 @@ def started(
         if any(trainer.stdout.readline() != "moving\n" for trainer in trainers):
             raise RuntimeError(f"the trainer of {place} did not come to move its arms")
         found = [target.pid for target in targets]
-        while place == "worker" and len(found) < len(STOPS):  # A list may miss some.
-            found = [worker for server in children(trainers[0].pid) for worker in children(server)]
+        while place == "worker" and len(found) != len(STOPS):
+            forked = [one for server in children(trainers[0].pid) for one in children(server)]
+            found = [one for one in forked if children(one)]
         drained += [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
         for thread in drained:
             thread.start()
