@@ -41,6 +41,7 @@ NAMES = {
     *("steps", "results", "episodes", "episode_returns", "episode_lengths", *SECONDS),
     *(f"outcomes_{kind}" for kind in get_args(OutcomeKind)),
     *("envs", "idle", "busy", "uncollected", "restarts"),
+    *("recycled", "recycle_waits", "largest_resident_mb"),
 }
 COMPUTING = "seconds_computing"
 

@@ -135,6 +135,7 @@ def host_loss(
     requests: Requests,
     record: HostRecord,
     death: Death,
+    slots: Sequence[int],
     owed: NDArray[np.intp],
     then: str,
     *,
@@ -155,7 +156,7 @@ def host_loss(
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     return HostLoss(
         host_id=record.host.host_id,
-        slots=record.slots,
+        slots=slots,
         owed=owed,
         death=death,
         replaced=replaced,

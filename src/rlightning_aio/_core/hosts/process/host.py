@@ -34,7 +34,7 @@ from rlightning_aio._core.hosts.process.fork_messages import (
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
 from rlightning_aio._core.hosts.process.spares import RunningForkServer
-from rlightning_aio._core.hosts.process.system import processor_ns
+from rlightning_aio._core.hosts.process.system import processor_ns, resident_mb
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
@@ -424,6 +424,9 @@ class ProcessHost(Host):
 
     def current_request(self) -> tuple[int, int]:
         return (0, 0) if self._link is None else self._link.current_request()
+
+    def resident_mb(self) -> float:
+        return 0.0 if self.pid is None else resident_mb(self.pid)
 
     def processor_ns(self) -> int | None:
         return None if self.pid is None else processor_ns(self.pid)

@@ -38,7 +38,7 @@ from rlightning_aio.envs.results import (
     reads_extras,
     step_of,
 )
-from rlightning_aio.envs.state import versions_of
+from rlightning_aio.envs.state import load_generators, save_generators, versions_of
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
@@ -332,8 +332,24 @@ class EnvRunner:
 
     # -- resets -------------------------------------------------------------------
 
+    def handed_on(self, arguments: Any) -> bytes:
+        """Return the arguments of a reset that the env of another worker executes, packed: seed and
+        options, and the state of this env's generators, if it can be read.
+        """
+        generators = None
+        try:
+            if not self._is_spent:
+                generators = save_generators(self.env)
+        except Exception as error:  # It may hold anything.
+            _log.warning("env %r gets a fresh generator: %s", self.env.env_id, error)
+        return dumped((*self._seed_and_options(arguments), generators), "its reset")
+
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
         """Start a new episode."""
+        if arguments is not None and len(arguments) > 2:  # Of `handed_on`.
+            *arguments, generators = arguments
+            if generators is not None:
+                load_generators(self.env, generators)
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
