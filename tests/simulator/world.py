@@ -58,8 +58,7 @@ from rlightning_aio._core.hosts import descriptors
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
-from rlightning_aio._core.hosts.running import build_env
-from rlightning_aio._core.hosts.running import renewal
+from rlightning_aio._core.hosts.running import build_env, renewal
 from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
 if TYPE_CHECKING:

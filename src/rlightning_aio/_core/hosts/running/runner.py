@@ -105,11 +105,16 @@ class EnvRunner:
         fast_path: what the env offers to save time.
         step: steps with the action in the row.
         is_awaitable: its requests are awaited, together with those of other envs.
+    <<<<<<< HEAD
         is_spent: another env takes its place before the next request.
+    =======
+        is_abandoned: the env was replaced and may not write to its row any more.
+    >>>>>>> d6fa9d36 (Renew workers: pages, check --steps measures growth and proposes the setting)
 
     """
 
     is_awaitable: ClassVar[bool] = False
+    is_abandoned = False
 
     def __init__(
         self,
@@ -338,8 +343,8 @@ class EnvRunner:
         """
         generators = None
         try:
-            if not self._is_spent:
-                generators = save_generators(self.env)
+            if not (self.is_spent or self.is_abandoned):
+                generators = pickle.dumps(save_generators(self.env))
         except Exception as error:  # It may hold anything.
             _log.warning("env %r gets a fresh generator: %s", self.env.env_id, error)
         return dumped((*self._seed_and_options(arguments), generators), "its reset")
@@ -349,7 +354,7 @@ class EnvRunner:
         if arguments is not None and len(arguments) > 2:  # Of `handed_on`.
             *arguments, generators = arguments
             if generators is not None:
-                load_generators(self.env, generators)
+                load_generators(self.env, loaded(generators))
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
