@@ -183,8 +183,9 @@ def evaluated(group: Any) -> list[Any]:
 
 async def attempted(config: EnvConfig) -> tuple[Any, dict[str, float]]:
     async def agent(episode: Any) -> None:
-        while not episode.done:
-            await episode.step(1)
+        while True:  # It is left at the end of the env's episode.
+            if (await episode.step(1)).last_terminated:
+                return
 
     async with aio.build_env_group(config) as group:
         tasks = [EpisodeSpec("", seed=k) for k in range(8)]
