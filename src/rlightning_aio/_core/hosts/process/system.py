@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["check_system", "processor_ns", "resident_mb"]
-
-_PAGE_MB: Final = os.sysconf("SC_PAGE_SIZE") / 1e6
+__all__ = ["check_system", "processor_ns"]
 
 
 def check_system(config: EnvConfig) -> None:
@@ -45,17 +42,3 @@ def processor_ns(pid: int) -> int | None:
     except (OSError, ValueError):
         return None  # A thread has ended meanwhile, or the accounts have another form.
     return ran or None
-
-
-def resident_mb(pid: int) -> float:
-    """Return the resident memory of a process and its descendants in MB; 0 if it has ended."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-        children = [
-            int(child)
-            for thread in Path(f"/proc/{pid}/task").iterdir()
-            for child in (thread / "children").read_text().split()
-        ]
-    except (OSError, ValueError):  # It has ended meanwhile, or this isn't Linux.
-        return 0.0
-    return pages * _PAGE_MB + sum(map(resident_mb, children))

@@ -13,8 +13,8 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.hosts.completion_frames import SENDER
+from rlightning_aio._core.hosts.memory import resident_mb
 from rlightning_aio._core.hosts.messages import Due, Moved
-from rlightning_aio._core.hosts.process.system import resident_mb
 from rlightning_aio._core.hosts.running.runner import loaded
 from rlightning_aio.protocol.entries import Operation, op_of
 
