@@ -28,6 +28,7 @@ from rlightning_aio.protocol.entries import (
     OP_BITS_ARRAY,
     SLOT_MASK_ARRAY,
     Operation,
+    answers_with_value,
     slot_of,
 )
 
@@ -520,6 +521,9 @@ class Requests:
         slots = slots[~calls]
         ready = self.ready(slots)
         self.collector.num_awaited += len(self.owed(slots)) + len(ready)
+        for slot in [*ticket.errors]:
+            if answers_with_value(self.numbering.op(slot)):
+                del ticket.errors[slot]
         for fault, its in ticket.failures(slots):
             self.collector.keep(its, fault)
         if len(ready):
