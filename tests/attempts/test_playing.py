@@ -570,6 +570,7 @@ async def test_it_continues_from_a_file(tmp_path: Path) -> None:
     assert before >= known >= 5
     assert count - before == 12 - known
     lines = [json.loads(line) for line in path.read_text().splitlines()][1:]
+    lines = [line for line in lines if "seed" in line]  # Others say what was handed out.
     assert sorted((line["seed"], line["index"]) for line in lines) == [
         (seed, index) for seed in range(6) for index in range(2)
     ]
@@ -795,7 +796,7 @@ async def test_a_broken_env_costs_no_group() -> None:
     assert all(attempts.is_complete for attempts in found)
     failures = [one for attempts in found for attempt in attempts for one in attempt.failures]
     assert {one.env_id for one in failures} == {"box-3"}
-    assert len(failures) <= 5
+    assert len(failures) <= 20  # Of 480; it rests for longer each time.
     assert max(len(attempt.failures) for attempts in found for attempt in attempts) == 1
 
 

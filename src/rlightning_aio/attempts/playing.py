@@ -197,10 +197,11 @@ class _Engine:
                     continue
                 self._check_envs()
                 lacking = self._num_lacking()
-                if not self._playing and not lacking and self._source.is_at_end:
+                waiting = len(self._queue)  # Some may wait until an env has rested.
+                if not (self._playing or waiting or lacking) and self._source.is_at_end:
                     return
                 looks = lacking or self._has_clients
-                seconds = self._health.seconds_left(time.monotonic()) if len(self._queue) else None
+                seconds = self._health.seconds_left(time.monotonic()) if waiting else None
                 if looks:
                     seconds = min(seconds or _LOOK_SECONDS, _LOOK_SECONDS)
                 with contextlib.suppress(TimeoutError):
