@@ -42,7 +42,7 @@ def test_recurrent_state_belongs_to_one_episode() -> None:
     """It follows its env through batches of other envs, and is lost with its episode."""
     fields = {"env_kwargs": {"breaks": True}}
     with group_of(3, **fields) as group, group.auto_reset(100):
-        check(evaluate(group, Recurrent(), QUEUE, min_results=1, max_attempts=4))
+        check(evaluate(group, Recurrent(), QUEUE, min_results=1, retries=5))
 
 
 def test_sub_environments_have_a_state_each() -> None:
