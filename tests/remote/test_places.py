@@ -111,7 +111,6 @@ def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_pa
             else:
                 group.reset_async(seed=8)
             wait_for(group, lambda: len(arm.motions()) == 3)
-            began = time.monotonic()
             if fault == "killed":
                 arm.process.kill()
             elif fault == "stopped":
@@ -121,7 +120,6 @@ def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_pa
                     pair.silent = True
             with pytest.raises(EnvAway):
                 group.collect_async(deadline=HANG)
-            assert time.monotonic() - began < 1.0 + 2.0
             arm.end()
             other = ArmProcess(address, tmp_path / "second")
             started.append(other)
