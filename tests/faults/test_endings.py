@@ -165,7 +165,7 @@ class Port:
 async def test_a_successor_is_made_when_the_env_before_it_has_closed(
     placement: str, close_timeout: float | None
 ) -> None:
-    fields = {"placement": placement, "step_timeout": 0.05, "close_timeout": close_timeout}
+    fields = {"placement": placement, "step_timeout": 1.0, "close_timeout": close_timeout}
     async with rlightning_aio.build_env_group(entry(Port, **fields)) as group:
         batch, _ = await group.reset()
         batch, _ = await group.step(batch.respond(action=[HANG]))
