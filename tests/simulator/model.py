@@ -89,18 +89,11 @@ class Host:
 
     Attributes:
         struck: it was killed from outside; aborted: perhaps by an abort, for which it is replaced.
-        renewed: some of its envs may be in the next process already, and live on.
     """
 
     def __init__(
-        self,
-        *,
-        mortal: bool,
-        count: Callable[[], int] | None = None,
-        knows: bool = True,
-        renewed: bool = False,
+        self, *, mortal: bool, count: Callable[[], int] | None = None, knows: bool = True
     ) -> None:
-        self.renewed = renewed
         self.mortal = mortal
         self.knows = knows
         self._count = count
@@ -187,7 +180,6 @@ class State:
         for sub in self.scripts.subs:
             twin = object.__new__(type(sub))
             vars(twin).update(vars(sub))
-            twin.draws = copy.copy(sub.draws)
             found.scripts.subs.append(twin)
         for name in ("returns", "lengths", "counted"):
             setattr(found, name, list(getattr(self, name)))
@@ -813,7 +805,7 @@ class Model:
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
             require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
             for other in self.envs.values():
-                if other is env or (other.host is host and not host.renewed):
+                if other.host is host:
                     other.gone = True
 
 

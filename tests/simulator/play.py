@@ -277,8 +277,6 @@ class Play(Session):
         envs, named = self.model.envs, fault.env_ids
         hosts = [envs[env_id].host for env_id in named[:1]]
         own = [env_id for env_id in requests if envs[env_id].host in hosts]
-        if hosts and hosts[0].renewed:
-            own = [env_id for env_id in own if env_id in named]
         require(named and sorted(named) == sorted(own), "a refusal of others", repr(fault))
         for env_id in named:
             self.model.gone(envs[env_id], fault)

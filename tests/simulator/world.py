@@ -58,7 +58,7 @@ from rlightning_aio._core.hosts import descriptors
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
-from rlightning_aio._core.hosts.running import build_env, renewal
+from rlightning_aio._core.hosts.running import build_env
 from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -211,8 +211,6 @@ class World:
             (process_hosts, "processor_ns", nothing_known),
             (spares, "kill_below", nothing_known),
             (build_env, "register_tasks", nothing_known),  # The registry is this process's.
-            (process_hosts, "resident_mb", lambda _: 100.0),
-            (renewal, "resident_mb", lambda _: 100.0),
             # Some steps are timed by the kernel, which has a clock of its own.
             (hint, "_ENOUGH_RESULTS", math.inf),
             # Each process has a heap of its own, so these would act on one that is small.

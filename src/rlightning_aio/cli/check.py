@@ -9,7 +9,6 @@ observations of another shape.
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import pickle
 from dataclasses import asdict, dataclass, field
@@ -37,7 +36,7 @@ from rlightning_aio.json_text import json_of
 from rlightning_aio.policies.masks import allowed_action
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.registry import ENVS, load, placement_of
+from rlightning_aio.registry import ENVS, load
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -74,8 +73,7 @@ class _Finding:
         offers: what the envs' own server says of them.
         is_played: with ``--steps``; episodes: number that have ended then; step_us: median time of
             a step in its env.
-        problems: in words, each with what to do; leaks: memory grows; is_random: a seed does not
-            repeat its results.
+        problems: in words, each with what to do.
     """
 
     name: str
@@ -93,8 +91,6 @@ class _Finding:
     episodes: int = 0
     step_us: float | None = None
     problems: list[str] = field(default_factory=list[str])
-    leaks: bool = False
-    is_random: bool = False
 
 
 def check(
@@ -147,8 +143,8 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
 
 async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
     """Build one env of the entry and step it."""
-    one = config.model_copy(update={"num_workers": 1, "recycle": {}})
-    async with rlightning_aio.build_env_group([one]) as group:
+    one = [config.model_copy(update={"num_workers": 1})]
+    async with rlightning_aio.build_env_group(one) as group:
         (meta,) = group.metas
         found.observation_space = str(meta.observation_space)
         found.action_space = str(meta.action_space)
@@ -168,8 +164,6 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
                 await _repeat(group, min(steps, _REPEATED), found)
         if steps:
             await _compare_spaces(group, min(steps, _LOOKED_AT), found)
-    if steps and (config.recycle or found.leaks) and not found.is_random:
-        await _renew(one, found)
 
 
 def _has_no_samples(space: Any) -> bool:
@@ -203,8 +197,7 @@ async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
     found.step_us = float(np.median(times)) / 1e3 if times else None
     if bad:
         found.problems.append(f"{bad} of {rewards} rewards are NaN or infinite")
-    leaks = _leaks(samples)
-    found.problems, found.leaks = found.problems + leaks, any("recycle" in text for text in leaks)
+    found.problems += _leaks(samples)
 
 
 def _held(pid: int | str) -> dict[str, float]:
@@ -234,39 +227,13 @@ def _leaks(samples: list[dict[str, float]]) -> list[str]:
                 f"{more:.0f} more {name} after {count} episodes: close or drop in reset what the "
                 "episode before has opened"
             )
-            if name == "MB of memory":
-                # Room for a hundred such episodes.
-                limit = 100 * math.ceil((before + 100 * more / count) / 100)
-                found[-1] += (
-                    f"; an episode leaves {more / count:.2g} MB: recycle: {{memory_mb: {limit}}} "
-                    "has a worker with one env replaced in time"
-                )
     return found
-
-
-async def _renew(config: EnvConfig, found: _Finding) -> None:
-    """Look whether an env's random numbers go on in the next worker."""
-    place = placement_of(config.backend, config.placement)
-    if "recycle" in place.refuses or ENVS.is_hardware(config.backend):
-        return
-    played: list[list[bytes]] = []
-    for recycle in ({}, {"episodes": 1}):
-        one = config.model_copy(update={"recycle": recycle})
-        async with rlightning_aio.build_env_group([one]) as group:
-            batches = [(await group.reset(seed=seed))[0] for seed in (1, None, None)]
-        played.append([_contents(batch) for batch in batches])
-    if played[0] != played[1]:
-        found.problems.append(
-            "its random numbers begin anew when its worker is replaced (recycle): keep generators "
-            "in attributes of the env or its wrappers, or define save_state() and load_state()"
-        )
 
 
 async def _repeat(group: EnvGroup, steps: int, found: _Finding) -> None:
     """Play twice with the same seed and actions."""
     first, again = [await _played(group, steps) for _ in range(2)]
     differs = next((k for k in range(steps + 1) if first[k] != again[k]), None)
-    found.is_random = differs is not None
     if differs is not None:
         where = "the reset" if differs == 0 else f"step {differs}"
         found.problems.append(

@@ -36,8 +36,6 @@ class FrameKind(IntEnum):
     CLOSED = 12  # worker: errors of close(), by env
     ABORT = 13  # trainer; the request's entry
     LOST = 14  # worker; index of an env: why it is gone, and the entry of its request
-    DUE = 15  # worker: memory, when its next one should be started
-    MOVED = 16  # worker; the request's entry: arguments of a reset for the next worker, and memory
 
 
 class Frame(NamedTuple):

@@ -179,10 +179,6 @@ class Host(Protocol):
             number: of its current or last request; later ones may move it again.
         """
 
-    def resident_mb(self) -> float:
-        """Return the resident memory of its worker and its descendants; 0 if it isn't known."""
-        return 0.0
-
     def processor_ns(self) -> int | None:
         """Return for how long its living threads have run or waited for a core, if known."""
         return None

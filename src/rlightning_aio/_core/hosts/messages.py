@@ -38,12 +38,10 @@ __all__ = [
     "Completions",
     "Death",
     "Died",
-    "Due",
     "EnvStarted",
     "EnvState",
     "ErrorText",
     "Lost",
-    "Moved",
     "NewSchema",
     "NotBuilt",
     "OutOfBand",
@@ -275,28 +273,6 @@ class Lost(NamedTuple):
     answered: int = 0
 
 
-class Due(NamedTuple):
-    """The worker will soon have to be replaced, see `EnvConfig.recycle`: its next one may start."""
-
-    host_id: int
-    resident_mb: float
-
-
-class Moved(NamedTuple):
-    """A reset was not executed, because the worker is to be replaced: its env begins in the next.
-
-    Attributes:
-        entry: of the reset.
-        arguments: packed, of the same reset there: seed, options, and the env's generators.
-        resident_mb: memory of the worker.
-    """
-
-    host_id: int
-    entry: int
-    arguments: bytes
-    resident_mb: float
-
-
 class Withdrawn(NamedTuple):
     """A request that was aborted will not be answered: it had not begun."""
 
@@ -321,7 +297,7 @@ class Taken(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Lost | Due | Moved | Withdrawn | Taken
+    | Reported | Result | Value | Raised | Lost | Withdrawn | Taken
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

@@ -27,7 +27,6 @@ __all__ = [
     "LOST_EPISODE",
     "NO_SPAN",
     "OF_HOSTS",
-    "RENEWAL",
     "UNLIKE_ENVS",
     "Conditions",
     "Lifetime",
@@ -48,8 +47,6 @@ BESIDE_ROWS: Final = 1 << 4
 """A result that is ready is not, or not only, what its row holds."""
 FAULT: Final = 1 << 5
 """An error waits for the collector."""
-RENEWAL: Final = 1 << 6
-"""The next worker of some envs starts, or the one before closes (`EnvConfig.recycle`)."""
 CLIENTS: Final = 1 << 7
 """A client is in session. A place that is empty sets nothing."""
 OF_HOSTS: Final = ~(UNLIKE_ENVS | BESIDE_ROWS | CLIENTS)

@@ -49,10 +49,7 @@ class Stage(Enum):
     REBUILDING = auto()
     """A replacement is starting."""
     GIVEN_UP = auto()
-    CLOSING = auto()
-    """All its envs have begun in its next worker."""
     CLOSED = auto()
-    """It has no worker; one may be started where the entry is recycled."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +57,7 @@ class HostLoss:
     """The loss of the states of a host's envs, described when it was found.
 
     Attributes:
-        host_id, slots: of the host, and of the envs that it had.
+        host_id, slots: of the host.
         owed: its slots with a request in flight.
         death: of its worker, with the cause as the group knows it.
         replaced: a replacement is started; else the host is given up.
@@ -75,7 +72,7 @@ class HostLoss:
     """
 
     host_id: int
-    slots: Sequence[int]
+    slots: range
     owed: NDArray[np.intp]
     death: Death
     replaced: bool
@@ -147,12 +144,6 @@ class HostRecord:
         rebuild_error: the error of its replacement while rebuilding the envs.
         gone: by slot, the errors of envs that are not replaced though their host goes on.
         last_loss: its last death.
-        peer: takes its envs over when its worker is to be replaced, and gives them back when its
-            own is; None unless the entry is recycled. The two have the same slots.
-        is_due: its worker will soon be replaced; is_leaving: the next one has been started in the
-            peer; close_by: when it must have closed.
-        recycled: its workers that were replaced so; resident_mb: the most that one had at the end;
-            waits: resets that waited for the start of the next one.
         killable: the host, if it can be killed; place: if its worker starts itself.
         was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
             user may set it in motion again.
@@ -186,13 +177,6 @@ class HostRecord:
     rebuild_error: ErrorText | None = None
     gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     last_loss: HostLoss | None = None
-    peer: HostRecord | None = field(default=None, repr=False, compare=False)
-    is_due: bool = False
-    is_leaving: bool = False
-    close_by: float | None = None
-    recycled: int = 0
-    resident_mb: float = 0.0
-    waits: int = 0
     killable: Killable | None = field(init=False)
     place: SelfStarting | None = field(init=False)
     was_shown: bool = False
@@ -228,8 +212,8 @@ class HostRecord:
 
     @property
     def is_down(self) -> bool:
-        """Its worker has died or closes, and the next is not up yet: it holds requests."""
-        return self.stage in (Stage.DOWN, Stage.REBUILDING, Stage.CLOSING)
+        """Its worker has died, and its replacement is not up yet: it holds requests."""
+        return self.stage in (Stage.DOWN, Stage.REBUILDING)
 
     @property
     def is_starting(self) -> bool:

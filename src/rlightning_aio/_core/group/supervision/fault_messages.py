@@ -135,7 +135,6 @@ def host_loss(
     requests: Requests,
     record: HostRecord,
     death: Death,
-    slots: Sequence[int],
     owed: NDArray[np.intp],
     then: str,
     *,
@@ -156,7 +155,7 @@ def host_loss(
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     return HostLoss(
         host_id=record.host.host_id,
-        slots=slots,
+        slots=record.slots,
         owed=owed,
         death=death,
         replaced=replaced,

@@ -35,7 +35,6 @@ from rlightning_aio._core.group.supervision.hang_detector import HangDetector, r
 from rlightning_aio._core.group.supervision.hint import Hint
 from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.places import Places
-from rlightning_aio._core.group.supervision.renewals import Renewals
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
 from rlightning_aio._core.hosts.limits import restart_pause
@@ -85,8 +84,7 @@ class Supervisor:
         places: the hosts whose workers start themselves.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hint: on settings; crash_log: of
-            restarts; losses: of single envs; overdue: names envs that owe a result for long;
-            renewals: replaces workers before they fail.
+            restarts; losses: of single envs; overdue: names envs that owe a result for long.
         metas: one for each env; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
             step yet.
@@ -119,21 +117,15 @@ class Supervisor:
         self.hint = Hint(tables)
         self.overdue = Overdue(tables)
         self.crash_log = CrashLog()
-        self.renewals = Renewals(tables, self._launch_again)
         self.losses = EnvLosses(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False
 
-    def add(self, host: Host, config: EnvConfig, peer: HostRecord | None = None) -> None:
-        """Add a host before the start; its slots follow those of the previous host.
-
-        That of a `peer` has the slots of that one, and is started when it has to replace it.
-        """
+    def add(self, host: Host, config: EnvConfig) -> None:
+        """Add a host before the start; its slots follow those of the previous host."""
         self.hosts.append(host)
-        record = HostRecord(host, config, peer=peer)
-        if peer is not None:
-            peer.peer, record.stage = record, Stage.CLOSED
+        record = HostRecord(host, config)
         self.records.append(record)
         self.detector.add(record)
         if record.place is not None:
@@ -149,12 +141,11 @@ class Supervisor:
             return self.metas
         try:
             self._now = now
-            first = [record for record in self.records if record.stage is Stage.NEW]
-            for record in first:
+            for record in self.records:
                 self._launch_first(record)
             yield from self._until(Stage.BUILT)
             self._lay_out_rows()
-            for record in first:
+            for record in self.records:
                 if record.place is not None:
                     self.places.leave(record)
                     record.host.attach(
@@ -258,17 +249,15 @@ class Supervisor:
                 self._on_attached(record)
         else:
             was_built = record.stage not in (Stage.BUILDING, Stage.REBUILDING)
+            record.stage = Stage.CLOSED
             # The start error of a host that was killed while it started is known already.
-            owed = self._requests.owed(self._tables.slots_of(record))
+            owed = self._requests.owed(np.array(record.slots, np.intp))
             for index, error in completion.errors if was_built else ():
                 if len(owed) and error.type_name == "WorkerDied":
                     late = self._envs.env_ids[owed.item(0)]
                     error = replace(error, text=f"{error.text}; {late} owed a reply")  # noqa: PLW2901
                 env_id = self._envs.env_ids[record.slots[index]]
                 self.close_errors.append((env_id, error))
-            record.stage = Stage.CLOSED
-            if self._lifetime.open:
-                self.renewals.note_closed(record)
 
     def _on_built(self, record: HostRecord, started: list[Any]) -> None:
         if record.stage is Stage.BUILDING:
@@ -283,15 +272,12 @@ class Supervisor:
         record.stage = Stage.UP
         record.start_by = None
         record.idle = ()
-        self.renewals.note_change()
         if 0 in record.deaths.values():
             record.deaths = {slot: count for slot, count in record.deaths.items() if count}
             self._update_any_deaths()
         held, record.held = record.held, []
         for entries, arguments in held:
             record.host.submit(entries, arguments)
-        if record.peer is not None:
-            self.renewals.close_if_left(record.peer)
 
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
         if self._lifetime.open:
@@ -321,7 +307,7 @@ class Supervisor:
             return
         for record in self.records:
             if record.stage is Stage.GIVEN_UP and record.last_loss is not None:
-                asked = slots[np.isin(slots, self._tables.slots_of(record))]
+                asked = slots[np.isin(slots, record.slots)]
                 if len(asked):
                     raise record.last_loss.refusal(asked)
 
@@ -345,9 +331,8 @@ class Supervisor:
         times = [until, self.patient.until]
         if self.detector.any_ending:
             times += self.detector.expiries()
-        if self.any_deaths or self.renewals.in_progress:
-            each = ((r.start_by, r.restart_at, r.close_by) for r in self.records)
-            times += [due for own in each for due in own]
+        if self.any_deaths:
+            times += [due for r in self.records for due in (r.start_by, r.restart_at)]
         return min((time for time in times if time is not None), default=None)
 
     def watch(self, now: float) -> None:
@@ -366,13 +351,10 @@ class Supervisor:
         if not self._lifetime.open:
             raise GroupClosed("the group was closed while this call was waiting")
         self.look_by = now + LOOK_SECONDS
-        if self.any_deaths or self.renewals.in_progress:
+        if self.any_deaths:
             self._check_start_times()
             for record in self.records:
                 self._restart(record, now)
-                if record.close_by is not None and now >= record.close_by:
-                    record.close_by = None
-                    self.detector.kill(record, dump=False)
         if now >= self.detector.due or self.detector.any_ending:
             self.detector.check(now)
         if now >= self.overdue.due:
@@ -395,17 +377,14 @@ class Supervisor:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
             return None
-        if death.refused and not self.renewals.is_first_start(record):
+        if death.refused:
             record.restarts -= 1  # It has not started.
-        owed = self._requests.owed(self._tables.slots_of(record))
+        owed = self._requests.owed(np.array(record.slots, np.intp))
         if record.place is not None:
             return self._lose_client(record, death, owed)
         was_up = record.stage is Stage.UP
         loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None
-        if not loss.replaced and not was_up and self.renewals.gives_back(record):
-            self._update_any_deaths()
-            return None
         if not loss.replaced:
             record.stage, record.held = Stage.GIVEN_UP, []
             self._any_given_up = True
@@ -413,7 +392,6 @@ class Supervisor:
             return loss
         record.stage = Stage.DOWN
         record.restart_at = self.clock() + restart_pause(record.deaths[record.culprit])
-        self.renewals.note_change()
         if was_up:
             return loss
         self.replace(record.host.host_id)
@@ -457,28 +435,15 @@ class Supervisor:
         """Return the reason why the env of a client doesn't fit the group, or None."""
         return self.places.objection(meta, self.metas)
 
-    def replace(self, host_id: int) -> int:
-        """Start the replacement of a host at once, if it needn't pause: `check` starts others.
-
-        Returns the host that has its envs now: the next worker may have been started already.
-        """
-        record = self.records[host_id]
-        if self.renewals.inherits(record):
-            assert record.peer is not None
-            record.restart_at = None
-            return record.peer.host.host_id
-        self._restart(record, self.clock())
-        return host_id
+    def replace(self, host_id: int) -> None:
+        """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
+        self._restart(self.records[host_id], self.clock())
 
     def _restart(self, record: HostRecord, now: float) -> None:
         if record.restart_at is None or record.restart_at > now:
             return
         record.restart_at = None
         record.restarts += 1
-        self._launch_again(record)
-
-    def _launch_again(self, record: HostRecord) -> None:
-        record.is_due = record.is_leaving = False
         try:
             self._launch(record, Stage.REBUILDING)
         except OSError as error:
@@ -509,8 +474,7 @@ class Supervisor:
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
-        slots: list[int] = self._tables.slots_of(record).tolist()
-        loss = host_loss(self._envs, requests, record, death, slots, owed, then, replaced=replaced)
+        loss = host_loss(self._envs, requests, record, death, owed, then, replaced=replaced)
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:

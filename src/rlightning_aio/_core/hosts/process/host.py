@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
-from rlightning_aio._core.hosts.memory import resident_mb
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -425,9 +424,6 @@ class ProcessHost(Host):
 
     def current_request(self) -> tuple[int, int]:
         return (0, 0) if self._link is None else self._link.current_request()
-
-    def resident_mb(self) -> float:
-        return 0.0 if self.pid is None else resident_mb(self.pid)
 
     def processor_ns(self) -> int | None:
         return None if self.pid is None else processor_ns(self.pid)

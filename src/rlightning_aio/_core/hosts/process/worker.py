@@ -18,7 +18,7 @@ import sys
 import time
 import traceback
 import weakref
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
@@ -26,7 +26,6 @@ from rlightning_aio._core.hosts.logs import log_like
 from rlightning_aio._core.hosts.messages import Built, Closed
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
-from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
 from rlightning_aio._core.hosts.spinner import Spinner
 from rlightning_aio.envs.hardware import watched
@@ -39,7 +38,6 @@ from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, ri
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
     from rlightning_aio._core.hosts.messages import (
         AttachOrder,
         Completion,
@@ -53,7 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Worker", "main"]
 
-_STEP, _RESET = int(Operation.STEP), int(Operation.RESET)
+_STEP: Final = int(Operation.STEP)
 
 
 class TrainerGone(Exception):
@@ -90,9 +88,9 @@ class Worker:
         self._attached = False
         self._closing = False
         self._awaits = False
-        self._awaited: AwaitedEnvs
+        self._submit: Callable[[int, Any], None]
+        self._abort_awaited: Callable[[int], None]
         self._order: StartOrder
-        self._renewal: Renewal
         self._shared = list(shared)
         self._is_child = False
 
@@ -129,7 +127,7 @@ class Worker:
             self._post,
             lambda entry: rings.begin(entry, time.monotonic_ns()),
         )
-        self._awaited = awaiting.envs
+        self._submit, self._abort_awaited = awaiting.envs.submit, awaiting.envs.abort
         try:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:
@@ -142,24 +140,11 @@ class Worker:
         while not self._closing:
             self._receive(socket.MSG_DONTWAIT)
             for request in rings.requests():
-                self._give(request, None)
+                self._submit(request, None)
             # From now on the trainer sends a wake-up for each request, even if envs are busy.
             if rings.fall_asleep() and not self._closing:
                 return True
         return False
-
-    def _give(self, request: int, arguments: Any) -> None:
-        """Begin to execute a request of an awaitable env."""
-        runner = self._awaited.runners[slot_of(request) - self._first_slot]
-        if not self._passes_on(runner, request, arguments):
-            self._awaited.submit(request, arguments)
-
-    def _passes_on(self, runner: EnvRunner, request: int, arguments: Any) -> bool:
-        """Give a reset back that the next worker executes; return True if it does."""
-        moved = self._renewal.passed_on(runner, request, arguments)
-        if moved is not None:
-            self._post(moved)
-        return moved is not None
 
     def run_requests(self) -> None:
         """Execute the requests in the ring, and frames as they arrive."""
@@ -189,8 +174,6 @@ class Worker:
         try:  # As `exchange.serve` does; `execute` would take a microsecond more.
             if op == _STEP:
                 outcome = self._steps[index]()
-            elif op == _RESET and self._passes_on(runner, request, None):
-                return False
             else:
                 outcome = runner.execute(op, None)
                 self._steps[index] = runner.step  # Perhaps of an env that was rebuilt.
@@ -289,7 +272,6 @@ class Worker:
             self._order = order
             if order.logs is not None:
                 log_like(order.logs, _name_of(order))
-            self._renewal = Renewal(order, self._post)
             for runner in built_envs(order):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
@@ -332,12 +314,10 @@ class Worker:
         request = frame.number
         self._begin(request)
         if self._awaits:
-            self._give(request, frame.payload)
+            self._submit(request, frame.payload)
             return
         index = slot_of(request) - self._first_slot
         runner = self._runners[index]
-        if self._passes_on(runner, request, frame.payload):
-            return
         completion = execute(SENDER, runner, request, frame.payload, self._on_end)
         self._steps[index] = runner.step  # A call may start or stop filming.
         if completion is None:
@@ -349,8 +329,8 @@ class Worker:
         """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
         if self._awaits:
             for request in self._rings.requests():  # It may be the newest.
-                self._give(request, None)
-            self._awaited.abort(frame.number)
+                self._submit(request, None)
+            self._abort_awaited(frame.number)
 
     def _close(self, frame: Frame) -> None:
         del frame

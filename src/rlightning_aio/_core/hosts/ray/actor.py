@@ -20,7 +20,6 @@ from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
-from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import close_all, give_rows
 from rlightning_aio.protocol.entries import slot_of
 from rlightning_aio.protocol.frames import FrameKind
@@ -114,7 +113,6 @@ class EnvActor:
             places = list(_placed_here(self._runners))
             give_rows(places, SENDER, self._post)
             self._table = RowTable(self._first_slot, [(slab, row) for _, slab, row in places])
-            self._renewal = Renewal(given, self._post)
             return frame_of(Built(SENDER, [runner.started() for runner in self._runners]))
         except BaseException as error:
             return frame_of(not_built(SENDER, given, len(self._runners), error))
@@ -127,8 +125,7 @@ class EnvActor:
         for position, entry in enumerate(entries.tolist()):
             runner = self._runners[slot_of(entry) - self._first_slot]
             given = None if arguments is None else arguments[position]
-            completion = self._renewal.passed_on(runner, entry, given)
-            completion = completion or execute(SENDER, runner, entry, given)
+            completion = execute(SENDER, runner, entry, given)
             if completion is None:
                 in_rows.append(entry)
             else:

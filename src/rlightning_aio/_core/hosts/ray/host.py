@@ -189,7 +189,6 @@ class RayHost(Host):
         self._pid = os.getpid()
         self._life: _Life | None = None
         self._started: list[EnvStarted] = []
-        self._order: AttachOrder | None = None
         self._table: RowTable | None = None
         self._closing = False
         # Only Ray knows the progress of a transfer.
@@ -213,17 +212,13 @@ class RayHost(Host):
 
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""
-        self._order = order
-        # A replacement is not built yet.
-        if self._life is not None and self._life.is_built:
-            self._attached(order)
-
-    def _attached(self, order: AttachOrder) -> None:
         if self._table is None:
             found = placed(self._started, order, self._wiring.arena.map)
             places = [(slab, row) for _, slab, row in found]
             self._table = RowTable(self.first_slot, places)
-        self._post(Attached(self.host_id))
+        # A replacement is not built yet.
+        if self._life is not None and self._life.is_built:
+            self._post(Attached(self.host_id))
 
     def kill(self, *, dump: bool) -> None:
         """Kill the actor, which writes no stacks."""
@@ -353,8 +348,8 @@ class RayHost(Host):
             return
         self._started = completion.started
         life.is_built = True
-        if self._order is not None:  # A replacement has its order already.
-            self._attached(self._order)
+        if self._table is not None:  # A replacement has its rows already.
+            self._post(Attached(self.host_id))
 
     def _on_reply(self, sent: _Sent, life: _Life, outcome: Reply | Exception) -> None:
         """Apply replies in the order of execution: results need the schemas of earlier ones.

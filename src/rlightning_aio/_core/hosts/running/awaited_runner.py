@@ -29,11 +29,13 @@ class AwaitedRunner(EnvRunner):
     """See the module.
 
     Attributes:
+        is_abandoned: the env was replaced and may not write to its row any more.
         reset_with: seed and options of the reset that began the episode, of this env, of the one
             before it, or of the one whose snapshot was restored.
     """
 
     is_awaitable = True
+    is_abandoned = False
     reset_with: tuple[Any, Any] = (None, None)
 
     def _stepper(self) -> Execute:

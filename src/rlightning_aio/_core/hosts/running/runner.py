@@ -38,7 +38,7 @@ from rlightning_aio.envs.results import (
     reads_extras,
     step_of,
 )
-from rlightning_aio.envs.state import load_generators, save_generators, versions_of
+from rlightning_aio.envs.state import versions_of
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
@@ -105,16 +105,11 @@ class EnvRunner:
         fast_path: what the env offers to save time.
         step: steps with the action in the row.
         is_awaitable: its requests are awaited, together with those of other envs.
-    <<<<<<< HEAD
         is_spent: another env takes its place before the next request.
-    =======
-        is_abandoned: the env was replaced and may not write to its row any more.
-    >>>>>>> d6fa9d36 (Renew workers: pages, check --steps measures growth and proposes the setting)
 
     """
 
     is_awaitable: ClassVar[bool] = False
-    is_abandoned = False
 
     def __init__(
         self,
@@ -337,24 +332,8 @@ class EnvRunner:
 
     # -- resets -------------------------------------------------------------------
 
-    def handed_on(self, arguments: Any) -> bytes:
-        """Return the arguments of a reset that the env of another worker executes, packed: seed and
-        options, and the state of this env's generators, if it can be read.
-        """
-        generators = None
-        try:
-            if not (self.is_spent or self.is_abandoned):
-                generators = pickle.dumps(save_generators(self.env))
-        except Exception as error:  # It may hold anything.
-            _log.warning("env %r gets a fresh generator: %s", self.env.env_id, error)
-        return dumped((*self._seed_and_options(arguments), generators), "its reset")
-
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
         """Start a new episode."""
-        if arguments is not None and len(arguments) > 2:  # Of `handed_on`.
-            *arguments, generators = arguments
-            if generators is not None:
-                load_generators(self.env, loaded(generators))
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
