@@ -50,6 +50,10 @@ class AgentFailed(Exception):
         self.blame = blame
 
 
+_ENDS = {"stopped": "agent_stopped", "finished": "truncated"}
+"""The kinds of outcomes, by the ends of agents that end before their envs do."""
+
+
 @dataclass
 class Played:
     """What an agent did.
@@ -343,22 +347,21 @@ class Attempts(InContext):
         sizes = {len(column) for column in attempt.columns.values()}
         require(sizes <= {len(rewards)}, "columns of another length", sizes)
         cut |= len(rewards) >= (self.limit or math.inf)
-        is_timeout = rules.attempt_timeout is not None
+        # An agent may end by itself in the moment in which its time is over or it is a surplus.
+        cut_short = ["cancelled"] * (rules.first is not None or played.end == "cancelled")
+        if rules.attempt_timeout is not None and rules.on_timeout == "end":
+            cut_short += ["truncated" if attempt.length else "timed_out", "env_hung"]
+        elif rules.attempt_timeout is not None:
+            cut_short += ["timed_out"]
         if played.end == "over":
             kind = "terminated" if ended else "truncated"
             require(ended or cut, "over, and nothing has ended it")
-            require(outcome.kind == kind, "another end", kind)
-        elif played.end == "stopped":
-            require(outcome.kind == "agent_stopped", "another end", played.end)
-        elif played.end == "finished":
-            require(outcome.kind == "truncated", "another end", played.end)
-        elif played.end == "cancelled":
-            own = ["cancelled"]
-            if is_timeout and rules.on_timeout == "end":
-                own += ["truncated" if attempt.length else "timed_out", "env_hung"]
-            elif is_timeout:
-                own += ["timed_out"]
+            require(outcome.kind in (kind, *cut_short), "another end", kind)
+        elif played.end in _ENDS:
+            own = [_ENDS[played.end], *cut_short]
             require(outcome.kind in own, "another end", own)
+        elif played.end == "cancelled":
+            require(outcome.kind in cut_short, "another end", cut_short)
         else:
             require(outcome.kind == played.end, "another failure", played.end)
         if outcome.kind not in _LOST and "zero_copy" not in self.features:
