@@ -23,7 +23,7 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("migrating#RL Zoo", ["rl_zoo3"]),
         ("migrating#skrl", ["skrl"]),
         ("migrating#Tianshou", ["tianshou"]),
-        ("migrating#Trainers of language models", ["skyrl_gym"]),
+        ("migrating#SkyRL", ["skyrl_gym"]),
         ("metrics", ["wandb", "prometheus_client"]),
     ],
 )
@@ -38,7 +38,7 @@ def test_programs_run(
     name, _, section = page.partition("#")
     text = (DOCS / f"{name}.md").read_text()
     if section:
-        text = text.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+        text = re.split(r"\n##", text.partition(f"# {section}\n")[2])[0]
     outputs = []
     for index, block in enumerate(
         re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
