@@ -599,7 +599,8 @@ class Play(Session):
         options = None
         if rng.random() < 0.3:
             options = {"token": rng.randrange(TOKENS)}
-            if "raise" in self.features and rng.random() < 0.3:
+            raises = "raise" in self.features and rng.random() < 0.3
+            if raises and all(map(self.may_raise_in_reset, envs)):
                 options["effect"] = rng.choice(["raise", "raise oddly"])
         seed: Any = None
         kind = rng.choice(["none", "int", "list", "mapping"])
