@@ -305,6 +305,32 @@ async def test_a_handle_whose_task_is_cancelled_leaves_its_result_to_collect() -
         assert (await group.collect_async())[0].ids() == group.env_ids[:1]
 
 
+@pytest.mark.parametrize("action", [GO, RAISE], ids=["result", "error"])
+async def test_what_ends_in_the_turn_of_a_cancellation_is_left_to_collect(action: int) -> None:
+    """The call of all handles finds it before the cancelled task runs again."""
+    async with rl.build_env_group(Counter, placement="inline") as group:
+        await group.reset()
+        task = asyncio.ensure_future(group[group.env_ids[0]].step(action))
+        ended = group._core.agent_steps._hand_out
+
+        def cancelled_first(ticket: Any) -> bool:
+            if ticket.ended:
+                task.cancel()
+            return ended(ticket)
+
+        group._core.agent_steps._hand_out = cancelled_first  # type: ignore[method-assign]
+        await asyncio.wait([task])
+        assert task.cancelled()
+        assert group.pending == group.env_ids
+        if action == RAISE:
+            with pytest.raises(EnvRaised):
+                await group.collect_async()
+        else:
+            batch, _ = await group.collect_async()
+            assert batch.info()[0]["count"] == 1
+        assert group.pending == []
+
+
 @pytest.mark.parametrize("is_timeout", [False, True])
 async def test_a_reply_that_is_there_before_a_cancellation_is_returned(is_timeout: bool) -> None:
     """The cancellation comes where the task waits next, unless a timeout has taken it back."""

@@ -52,6 +52,7 @@ class Agents:
     async def asked(self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
         """Ask for something and return its outcome; cancelled, leave a result to the collector."""
         step, reply = self.ask(env_id, what)
+        step.is_collectable = True
         try:
             return await outcome_of(reply)
         except asyncio.CancelledError:

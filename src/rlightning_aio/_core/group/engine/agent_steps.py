@@ -98,9 +98,10 @@ class AgentStep:
     Attributes:
         env_id, what, reply: as given.
         is_outstanding: it was sent, and has not ended.
+        is_collectable: if its caller is cancelled, its result is for the collector.
     """
 
-    __slots__ = ("env_id", "is_outstanding", "reply", "what")
+    __slots__ = ("env_id", "is_collectable", "is_outstanding", "reply", "what")
 
     def __init__(
         self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall, reply: _Reply
@@ -108,7 +109,7 @@ class AgentStep:
         self.env_id = env_id
         self.what = what
         self.reply = reply
-        self.is_outstanding = False
+        self.is_outstanding = self.is_collectable = False
 
     @property
     def kind(self) -> object:
@@ -262,6 +263,10 @@ class AgentSteps:
         """Give each agent whose request has ended its result or error; False if there is none."""
         if not ticket.errors and not ticket.ended:
             return False
+        for slot in [slot for slots in ticket.ended for slot in slots.tolist()]:
+            step = self._sent[slot]
+            if step.is_collectable and step.reply.done():  # Its caller has yet to leave it.
+                self.leave(step)
         for slot, fault in ticket.errors.items():
             if not (reply := self._ended(slot)).done():
                 reply.set_exception(fault)
