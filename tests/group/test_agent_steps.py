@@ -331,6 +331,26 @@ async def test_what_ends_in_the_turn_of_a_cancellation_is_left_to_collect(action
         assert group.pending == []
 
 
+@pytest.mark.parametrize("place", [{"placement": "loop"}, {}], ids=["loop", "workers"])
+async def test_a_step_that_is_aborted_as_its_task_is_cancelled_is_for_nobody(
+    place: dict[str, Any],
+) -> None:
+    """The task runs again only after the abort has ended its step."""
+    async with rl.build_env_group(Long, num_workers=3, **place) as group:
+        await group.reset()
+        steps = [asyncio.ensure_future(group[env_id].step(0)) for env_id in group.env_ids]
+        while len(group.pending) < 3:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        steps[0].cancel()
+        await group.abort(group.env_ids[:1])
+        rets = await asyncio.gather(*steps[1:])
+        assert [ret.env_id for ret in rets] == group.env_ids[1:]
+        assert group.pending == []
+        group.reset_async()
+        batch, _ = await group.collect_async(wait_all=True)
+        assert batch.ids() == group.env_ids
+
+
 @pytest.mark.parametrize("is_timeout", [False, True])
 async def test_a_reply_that_is_there_before_a_cancellation_is_returned(is_timeout: bool) -> None:
     """The cancellation comes where the task waits next, unless a timeout has taken it back."""

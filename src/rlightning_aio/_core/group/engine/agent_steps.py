@@ -155,7 +155,8 @@ class AgentSteps:
     def leave(self, step: AgentStep) -> None:
         """Leave the result of a step or a reset to the collector, as its caller was cancelled."""
         slot = self._tables.envs.find_one(step.env_id)
-        if self._sent.get(slot) is step:
+        is_own = self._requests.owner.item(slot) > 0  # It was not aborted.
+        if is_own and self._sent.get(slot) is step:
             self._ended(slot)
             self._waiting.leave(slot)
 
