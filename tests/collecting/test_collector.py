@@ -537,3 +537,29 @@ def test_sub_environments_of_a_vector_env_without_resets_wait_for_the_others(
     for one in episodes:
         assert one.terminated.tolist() == [False] * (len(one.reward) - 1) + [True]
     assert sum(len(rollout) for rollout in rollouts) == 900
+
+
+class EndsForGood(gym.Env[Any, Any]):
+    """An episode has some steps; one more is an error."""
+
+    observation_space = gym.spaces.Discrete(50)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.left = int(self.np_random.integers(1, 30))
+        return self.left, {}
+
+    def step(self, action: int) -> Any:
+        assert self.left > 0, "a step after the end"
+        self.left -= 1
+        return self.left, 1.0, self.left == 0, False, {}
+
+
+async def test_no_rollout_begins_with_a_step_after_the_end_of_an_episode() -> None:
+    """Each has a context of its own, and knows what the last one has left to be reset."""
+    async with rl.build_env_group(EndsForGood, num_workers=6, placement="inline") as group:
+        policy = lambda batch: np.zeros(len(batch), int)  # noqa: E731
+        collector = Collector(group, policy, num_transitions=64, min_results=3, seed=0)
+        for _ in range(20):
+            await collector.collect()

@@ -83,11 +83,13 @@ class AutoResetContext(Scope):
         on_done: bool,
         *,
         needs_limits: bool = True,
+        forgets: bool = True,
     ) -> None:
         self._core = core
         self._limit = max_episode_steps
         self._on_done = on_done
         self._needs_limits = needs_limits
+        self._forgets = forgets
 
     def _enter(self) -> None:
         self._core.episodes.begin(
@@ -95,19 +97,20 @@ class AutoResetContext(Scope):
         )
 
     def _leave(self) -> None:
-        self._core.episodes.end()
+        self._core.episodes.end(forgets=self._forgets)
 
 
 def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     """The context in which an `EnvGroup`, or one that is wrapped, resets envs at their ends.
 
     If the caller has one open, nothing is added to that. Otherwise each env's own step limit
-    applies, if it has one.
+    applies, if it has one, and the next context continues what this one leaves: a `Collector` opens
+    one for each rollout.
     """
     core: Core = group._core  # noqa: SLF001
     if core.episodes.auto_reset_is_open:
         return nullcontext()
-    return AutoResetContext(core, None, on_done=True, needs_limits=False)
+    return AutoResetContext(core, None, on_done=True, needs_limits=False, forgets=False)
 
 
 def is_resettable(group: Any, env_id: str) -> bool:

@@ -188,11 +188,16 @@ class Episodes:
         limits = self._envs.step_limits[slots]
         return np.where((limits == 0) | self._envs.resets_itself[slots], _NO_LIMIT, limits)
 
-    def end(self) -> None:
-        """Close the context: steps are plain again, and no env is due for a reset."""
+    def end(self, *, forgets: bool = True) -> None:
+        """Close the context: steps are plain again, and no env is due for a reset.
+
+        Unless it `forgets` them, envs whose episodes are over are due again in the next context.
+        """
         self._limits = None
         self.auto_reset_is_open = False
-        self.due[:] = self._cut[:] = self._ended[:] = False
+        self.due[:] = False
+        if forgets:
+            self._cut[:] = self._ended[:] = False
 
     def _update_due(self) -> None:
         if self._resets_ended:
