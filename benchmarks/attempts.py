@@ -151,7 +151,8 @@ async def played(
         async for attempts in play(group, tasks, agent, SIZE, rules):
             groups.append(attempts)
             for attempt in attempts:
-                for outcome in attempt.failures:
+                last = [attempt.outcome] if attempt.outcome.is_failure else []
+                for outcome in [*attempt.failures, *last]:
                     found[f"{outcome.kind} ({outcome.blame})"] += 1
         watching.cancel()
         left = len(group.pending)
