@@ -2,8 +2,8 @@
 
 64 tasks are attempted 8 times each, on 256 awaitable envs, and on 16 envs in worker processes. Of
 the attempts, 5 % each meet an env that raises, one that hangs, one whose process dies (in workers),
-a reset that fails, an agent that is stuck, and a model's server that is away. `play` tries those
-again. The report counts outcomes against what was injected.
+a reset that fails, an agent that is stuck, and a model's server that is away. `play` tries all but
+stuck agents again. The report counts outcomes against what was injected.
 
 Then 2,000 attempts of ten steps in flight, whose steps wait for a second on average on the event
 loop, or for a tenth of it in worker processes (log-normal): how late the event loop is, with the
