@@ -62,6 +62,7 @@ def entry(backend: str, task: str, assets: Path, **fields: Any) -> dict[str, Any
         "max_episode_steps": LENGTH,
         "interpreter": PYTHON,
         "start_timeout": 300.0,
+        "close_timeout": 30.0,
         "env_vars": {"ISAACSIM_ASSET_ROOT": str(assets)},
         "env_kwargs": {"device": "cpu"},
         **fields,

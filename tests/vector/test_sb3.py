@@ -497,8 +497,10 @@ def test_workers_do_not_import_the_classes_that_are_looked_for() -> None:
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecMonitor
 
+    from rlightning_aio._core.hosts.process import spares
     from rlightning_aio.sb3 import VecEnv
 
+    spares.end_all()  # Envs of other tests have imported more into theirs.
     env = VecMonitor(VecEnv([Counting] * 2))
     assert not any(env.env_method("loaded", "stable_baselines3"))
     assert not any(env.env_method("loaded", "torch"))
