@@ -88,6 +88,9 @@ def arm(log: Path) -> Iterator[Callable[..., dict[str, Any]]]:
         return {"name": "arm", "backend": "test arm", "task": "any", **place}
 
     yield entry
+    for thread in threading.enumerate():
+        if thread.name == "stops hardware":  # It may still write to the log.
+            thread.join(HANG)
     del ENVS._classes["test arm"]  # noqa: SLF001
     ENVS._hardware.pop("test arm", None)  # noqa: SLF001
 

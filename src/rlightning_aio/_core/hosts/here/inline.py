@@ -110,7 +110,8 @@ class InlineHost(Host):
         del number  # None is being executed now.
         if index < len(self._runners):
             # In a thread, as a stop takes some time, and other envs must stop, too.
-            Thread(target=stop, args=[self._runners[index].env], daemon=True).start()
+            env = self._runners[index].env
+            Thread(target=stop, args=[env], name="stops hardware", daemon=True).start()
 
     def execute_next(self) -> bool:
         if not self._queue:
