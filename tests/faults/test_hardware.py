@@ -60,8 +60,9 @@ class Arm(BaseEnv):
         return self._ret({"joints": np.zeros(2, np.float32)})
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        if self.is_stopped.is_set():
-            raise RuntimeError("stopped; reset() starts it again")
+        with self.stopping:  # A stop that is in the log has been carried out.
+            if self.is_stopped.is_set():
+                raise RuntimeError("stopped; reset() starts it again")
         self.note(f"step {np.asarray(policy_resp.action).tolist()}")
         return self._ret(self.kwargs.get("result", {"joints": np.ones(2, np.float32)}))
 
