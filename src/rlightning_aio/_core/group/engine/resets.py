@@ -63,7 +63,7 @@ class Resets:
         env_ids: Sequence[str] | None,
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
-        if env_ids is None and self._places.any:
+        if env_ids is None and self._places.servers:
             now = yield from self._await_clients(now)
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         return (yield from self._reset(now, seed, options, slots))

@@ -111,7 +111,7 @@ class Steps:
     def begin(self) -> None:
         """Note what kind of envs were started."""
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
-        self._has_places = envs.num_local < len(envs)
+        self._has_places = bool(self._supervisor.places.servers)
         # Places are empty as yet; `_asks_a_place` finds requests to them.
         local = [host for host in hosts if host.first_slot < envs.num_local]
         is_inline = len(local) == 1 and isinstance(local[0], Executing)

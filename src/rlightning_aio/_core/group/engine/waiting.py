@@ -221,7 +221,7 @@ class Waiting:
         ticket = self._requests.tickets.open(slots)
         try:
             send(ticket)
-            if self._supervisor.places.any:
+            if self._supervisor.places.servers:
                 self.poll()  # A client may turn out to be gone as it is asked.
             while ticket.remaining > 0:
                 now = yield from self.turn(ticket.remaining, None)

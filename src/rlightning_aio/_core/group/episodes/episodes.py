@@ -3,8 +3,7 @@
 For every env it counts steps, up to the limits of `auto_reset`, and remembers whether the last
 returned result ended the episode; these are arrays, updated when a batch is returned. For the few
 envs that lost an episode it runs the transition table `LEGAL`. `seeds_for` reads the seeds of a
-reset. Left out: hosts, time and I/O;
-callers say what was sent, answered and returned.
+reset. Left out: hosts, time and I/O; callers say what was sent, answered and returned.
 """
 
 from __future__ import annotations

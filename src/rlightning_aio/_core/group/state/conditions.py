@@ -47,7 +47,7 @@ BESIDE_ROWS: Final = 1 << 4
 """A result that is ready is not, or not only, what its row holds."""
 FAULT: Final = 1 << 5
 """An error waits for the collector."""
-CLIENTS: Final = 1 << 7
+CLIENTS: Final = 1 << 6
 """A client is in session. A place that is empty sets nothing."""
 OF_HOSTS: Final = ~(UNLIKE_ENVS | BESIDE_ROWS | CLIENTS)
 """All that say something of hosts: while one is set, a waiting call looks at them at each turn."""

@@ -172,7 +172,7 @@ def _sharing(turn: _Turn) -> list[Advice]:
 
 
 def _inline(turn: _Turn) -> Advice:
-    """Have them in this process, one after the other; whoever answers them has all wait."""
+    """Have them in this process, one after the other, while the caller waits."""
     batch, env = _INLINE
     steps = turn.num_envs * turn.step
     why = (

@@ -34,8 +34,7 @@ class Places:
     """See the module.
 
     Attributes:
-        any: the group has places.
-        servers: the listeners, in order.
+        servers: the listeners, in order; none if the group has no places.
         num_held: the number of requests that wait for clients.
     """
 
@@ -44,7 +43,6 @@ class Places:
         self._envs = tables.envs
         self._requests = tables.requests
         self._records: list[HostRecord] = []
-        self.any = False
         self.servers: list[Server] = []
         self.num_held = 0
 
@@ -52,7 +50,6 @@ class Places:
         """Add a place before the start."""
         assert record.place is not None
         self._records.append(record)
-        self.any = True
         if record.place.server not in self.servers:
             self.servers.append(record.place.server)
 
@@ -103,12 +100,8 @@ class Places:
     def away(self, empty: Sequence[HostRecord]) -> EnvAway:
         """Return the error for a call that has waited for empty places for too long."""
         names = [self._envs.env_ids[record.slots.start] for record in empty]
+        servers = dict.fromkeys(r.place.server for r in empty if r.place is not None)
         texts: list[str] = []
-        servers: list[Server] = []
-        for record in empty:
-            assert record.place is not None
-            if record.place.server not in servers:
-                servers.append(record.place.server)
         for server in servers:
             here = [f"{client} ({env_id})" for env_id, client in server.clients().items()]
             texts.append(f"{server.address()} has {', '.join(here) or 'no client'}")
