@@ -26,7 +26,6 @@ from rlightning_aio.plugins.piper.arm import (  # noqa: E402
 pytestmark = pytest.mark.simulators
 
 ON = CanFrame(0x471, bytes([7, 2, 0, 0, 0, 0, 0, 0]))
-OFF = CanFrame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
 STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
 RESUME = CanFrame(0x150, bytes([2, 0, 0, 0, 0, 0, 0, 0]))
 

@@ -607,7 +607,6 @@ class Running:
         self.procedure = procedure
         self.until: float | None = None
         self.woken = False
-        self.num_turns = 0
         self.done = False
         self.error: Exception | None = None
         self.value: Any = None
@@ -619,7 +618,6 @@ class Running:
 
     def resume(self, now: float | None) -> None:
         self.woken = False
-        self.num_turns += 1
         try:
             wait = self.procedure.send(now)  # type: ignore[arg-type]
             self.until = wait.until

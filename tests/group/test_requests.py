@@ -181,7 +181,6 @@ METHODS: dict[Situation, list[Event]] = {
     (State.SPENT, Owner.TICKET): [Event.SENT_FOR_CALL, Event.VALUE],
     (State.BUSY, Owner.NOBODY): [Event.SENT_FOR_CALL, Event.METHOD_GIVEN_UP],
 }
-UNCOLLECTED: Situation = (State.READY, Owner.COLLECTOR)
 ALL: list[Combination] = list(itertools.product(State, Owner, Event))
 NOT_EXPRESSIBLE: dict[Combination, str] = {
     (State.BUSY, Owner.COLLECTOR, Event.VALUE): "only methods have values; each has a ticket",

@@ -157,9 +157,8 @@ class Recorder:
         self.answers: list[RemoteResult | ErrorText] = []
         self.since: float | None = None
 
-    def on_taken(self, client: str, announced: Announcement) -> None:
-        del announced
-        self.taken.append(client)
+    def on_taken(self, announced: Announcement) -> None:
+        self.taken.append(announced.meta.env_id)
 
     def on_answer(self, answer: RemoteResult | ErrorText) -> None:
         self.answers.append(answer)

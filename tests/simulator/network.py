@@ -392,8 +392,6 @@ class _Context:
         assert kind == zmq.DEALER
         return _Dealer(self._network)
 
-    def term(self) -> None: ...
-
     def destroy(self, linger: int) -> None: ...
 
 

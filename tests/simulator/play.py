@@ -134,7 +134,7 @@ class Play(Session):
         # env whose worker has died takes no further part in a restore.
         nested = {env.env_id for env in owed if env.env_id in self.nested or self.is_lost(env)}
         found = set(self.group.pending) - nested
-        pending = {env.env_id for env in self.model.pending()} - nested
+        pending = {env.env_id for env in owed} - nested
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
 
     def is_lost(self, env: Env) -> bool:
@@ -532,8 +532,6 @@ class Play(Session):
         require({*batch.env_ids()} <= there, "a result that nobody asked for", batch.env_ids())
         most = min(rules.get("max_results") or len(there), len(there))
         need = most if rules.get("wait_all") else min(rules.get("min_results", 1), most)
-        most = len(there.union(batch.env_ids()))
-        most = min(rules.get("max_results") or most, most)
         require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
         order = list(self.model.envs)
         places = [order.index(env_id) for env_id in batch.env_ids()]
@@ -1043,10 +1041,6 @@ class Play(Session):
         for env in envs:
             if env.env_id not in pending:
                 self.model.abort(env)
-            elif env.client is not None and env.request is not None and env.client.may_be_back:
-                # It has come back while the abort waited for others.
-                self.model.abort(env)
-                env.client.note_pending(is_pending=True)
 
     async def op_task(self, rng: Random) -> None:
         if not self.is_async or len(self.tasks) > 3:

@@ -38,8 +38,6 @@ class Vectors(Session):
         is_cut_off: the last call has not returned, so that only a reset may follow.
     """
 
-    envs_: Any
-
     def build(self) -> None:
         """Nothing: making the envs starts them."""
 

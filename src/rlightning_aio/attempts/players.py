@@ -15,8 +15,8 @@ __all__ = ["Players"]
 
 class _Player(NamedTuple):
     entry: str
-    task: str = ""
-    switches_task: bool = False
+    task: str
+    switches_task: bool
 
 
 class Players:
@@ -30,10 +30,18 @@ class Players:
 
     def __init__(self, group: Any) -> None:
         self._group = group
-        self._metas = {meta.env_id: meta for meta in group.metas}
+        self.entry_of: dict[str, str] = {
+            env_id: worker["entry"]
+            for worker in group.get_workers()
+            for env_id in worker["env_ids"]
+        }
         self._players: dict[str, _Player] = {}
-        self._kinds: dict[_Player, None] = {}  # All that differ, the newest last.
-        self.entry_of: dict[str, str] = {}
+        self._kinds: dict[_Player, None] = {}  # All that differ, the last of the envs last.
+        for meta in group.metas:
+            player = _Player(self.entry_of[meta.env_id], meta.task, meta.switches_task)
+            self._players[meta.env_id] = player
+            self._kinds.pop(player, None)
+            self._kinds[player] = None
         self.gone: set[str] = set()
         self.present: set[str] = set()
         self.refresh()
@@ -42,19 +50,8 @@ class Players:
         """Look which envs are there now; return those that are."""
         present: set[str] = set()
         for worker in self._group.get_workers():
-            for env_id in worker["env_ids"]:
-                if worker["state"] != "empty":
-                    present.add(env_id)
-                if env_id in self._players:
-                    continue
-                meta = self._metas.get(env_id)
-                player = _Player(worker["entry"])
-                if meta is not None:
-                    player = _Player(worker["entry"], meta.task, meta.switches_task)
-                self._players[env_id] = player
-                self._kinds.pop(player, None)
-                self._kinds[player] = None
-                self.entry_of[env_id] = player.entry
+            if worker["state"] != "empty":
+                present.update(worker["env_ids"])
             self.gone.update(worker["given_up"])
         self.present = present - self.gone
         return self.present

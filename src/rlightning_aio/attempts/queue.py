@@ -93,8 +93,7 @@ class AttemptQueue:
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
         self._rules, self._results = rules, results
         self.players = Players(group)
-        present = self.players.refresh()
-        self.free = {id_: None for id_ in self.players.entry_of if id_ in present}
+        self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
         self.fault: WorkerDied | None = None
         self.may_play: Callable[[str], bool] = lambda _: True
         self._waiting: dict[str, deque[Job]] = {}

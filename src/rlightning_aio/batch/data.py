@@ -58,7 +58,7 @@ __all__ = [
 
 _MISSING: Any = object()
 _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
-"""The end of an env's id: its number in the entry, and the name of a client."""
+"""The end of an env's id: its number in the entry, and the name of a place."""
 
 
 class Issuer(Protocol):
@@ -127,7 +127,7 @@ class BatchedData:
     # -- ids and values -----------------------------------------------------------
 
     def ids(self) -> list[str]:
-        """Ids, in order. All clients of an env_server have its id.
+        """Ids, in order.
 
         The batch owns the list: don't change it.
         """
@@ -137,7 +137,7 @@ class BatchedData:
         return self._ids
 
     def env_ids(self) -> list[str]:
-        """Env id of each value, in order; that of a client is ``<server id>/<client name>``."""
+        """Env id of each value, in order; that of a client is ``<server id>/<place>``."""
         if self._origin is not None:
             return self._origin.names.ids(self._origin.slots)
         if self._env_ids is not None:
@@ -245,7 +245,7 @@ class BatchedData:
         """True for the first observation of an episode, where no transition ends.
 
         These are results of a requested reset, of a reset that `auto_reset` or the simulator did
-        in place of a step, of a new client, and of a replaced worker or a lost client.
+        in place of a step, and of a replaced worker or a lost client.
         ``[n]`` bool, ``[n, num_envs]`` with sub-environments.
 
         Raises:
@@ -283,9 +283,8 @@ class BatchedData:
     def index(self) -> NDArray[np.int64]:
         """Position of each row in the group: ``[n]``, ``[n, num_envs]`` with sub-environments.
 
-        It counts sub-environments in the order of `EnvGroup.env_ids`. Clients come after the local
-        envs, and those of an env_server after those of one that was joined earlier. Each keeps
-        its position during the life of the group.
+        It counts sub-environments in the order of `EnvGroup.env_ids`: the places of env_servers
+        come after the local envs. Each keeps its position during the life of the group.
         """
         return _by_row(self, lambda part: part.index).astype(np.int64, copy=False)
 

@@ -76,7 +76,7 @@ class Sent:
 
     A column has the form that was sent: an array, a tensor, a dict or tuple of such, or a list with
     one value for each row. If its rows were sent in several forms, it is a list of their values.
-    Rows that answer no response (a requested reset, a first result) hold NaN, or 0 if the dtype has
+    Rows that answer no response (of a reset or a restore) hold NaN, or 0 if the dtype has
     no NaN, or None in a list; their `BatchedData.is_reset` is True. They have the shapes and dtypes
     that were sent last to their config entry. In a batch of only such rows, a name that was never
     sent is a column of NaN.

@@ -130,7 +130,7 @@ def exit_code_of(command: Callable[[], None]) -> int:
     except RLightningError as error:
         typer.echo(f"error: {in_words(error)}", err=True)
         return 2 if isinstance(error, ConfigError) else 1
-    except TimeoutError as error:  # A group's clients have not connected in time.
+    except TimeoutError as error:  # Such as of an arm.
         typer.echo(f"error: {error}", err=True)
         return 1
     except BrokenPipeError:

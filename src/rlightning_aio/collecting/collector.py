@@ -365,14 +365,13 @@ class Collector(Generic[G, R]):
         return self._kinds[name]
 
     def _action_space_of(self, env_id: str) -> gym.Space[Any] | None:
-        meta = self._meta_of(env_id)
-        return None if meta is None else meta.action_space
+        return self._meta_of(env_id).action_space
 
-    def _meta_of(self, env_id: str) -> EnvMeta | None:
-        group = self._group
-        if not self._metas:
-            self._metas = {meta.env_id: meta for meta in group.metas}
-        return self._metas.get(env_id)
+    def _meta_of(self, env_id: str) -> EnvMeta:
+        """Return the metadata of an env; a place has spaces once a client has dialled in."""
+        if env_id not in self._metas or self._metas[env_id].action_space is None:
+            self._metas = {meta.env_id: meta for meta in self._group.metas}
+        return self._metas[env_id]
 
     # -- after errors -----------------------------------------------------------------
 

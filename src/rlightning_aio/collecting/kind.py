@@ -83,7 +83,7 @@ class EnvKind:
     Args:
         policy: acts in these envs.
         quota: maximum number of transitions of a rollout.
-        meta_of: returns the meta of an env, or None of one that has already left.
+        meta_of: returns the meta of an env.
         infos: names of numbers in infos that become columns.
 
     Attributes:
@@ -95,7 +95,7 @@ class EnvKind:
         self,
         policy: Callable[[BatchedData], Any],
         quota: int,
-        meta_of: Callable[[str], EnvMeta | None],
+        meta_of: Callable[[str], EnvMeta],
         infos: Sequence[str],
     ) -> None:
         self.policy = policy
@@ -126,8 +126,6 @@ class EnvKind:
         for row in newcomers:
             self._env_ids[int(results.index[row])] = env_ids[row // results.num_sub_envs]
             meta = self._meta_of(env_ids[row // results.num_sub_envs])
-            if meta is None:
-                continue
             space = meta.action_space
             self._action_space = space
             self._acts_in_arrays = space is not None and is_array(space)

@@ -200,8 +200,7 @@ class Trace(Scope):
             host = {"pid": record.host.host_id + 2}
             yield from _named("process", host, _title(record), host["pid"])
         for place, env_id in zip(places, env_ids, strict=True):
-            if env_id:  # A place may be empty.
-                yield from _named("thread", place, env_id, place["tid"])
+            yield from _named("thread", place, env_id, place["tid"])
         oldest = self._slices[0].ended if len(self._slices) == KEPT else 0
         since = max(self._began, oldest, self._results.complete_since)
         yield from self._of_trainer(since, len(env_ids) + 1)

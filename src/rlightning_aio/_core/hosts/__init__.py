@@ -5,6 +5,6 @@ is a way to carry requests to envs, except `running`, the code that runs an env 
 No module outside this package knows where an env runs; none here imports `group`.
 
 Which host can do what, beside what all can (`base`): `process` and `ray` are `Killable`,
-`here.inline` is `Executing`, `env_server` has `Membership`. Requests are aborted by `here`, by
-`process` where envs are awaitable, and by `env_server`, which ends the session.
+`here.inline` is `Executing`, `env_server` is `Killable` and `SelfStarting`. Requests are aborted by
+`here`, and by `process` where envs are awaitable.
 """

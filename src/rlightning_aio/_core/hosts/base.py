@@ -319,7 +319,6 @@ class Wiring:
         busy_since: when the request was sent that a slot has not answered; None if it has.
         resources: shared by hosts of one kind, and made by the first of them; released by
             `release(seconds)` after the hosts.
-        shares_thread: other tasks run in the trainer's thread while a procedure waits.
     """
 
     completions: Completions
@@ -333,7 +332,6 @@ class Wiring:
     objection: Callable[[EnvMeta], str | None]
     busy_since: Callable[[int], float | None]
     resources: dict[object, Shared]
-    shares_thread: bool = False
 
 
 class Shared(Protocol):

@@ -86,7 +86,7 @@ class RemoteResult:
 class PlaceEvents(Protocol):
     """What learns of the events at a place."""
 
-    def on_taken(self, client: str, announced: Announcement) -> None:
+    def on_taken(self, announced: Announcement) -> None:
         """Note that a client has taken the place; it gets nothing until it is asked."""
         ...
 
@@ -343,7 +343,7 @@ class ServerSessions:
             heartbeat = HARDWARE_HEARTBEAT if hello.hardware else DEFAULT_HEARTBEAT
         self._post(route, Welcome(env_id=place.env_id, heartbeat=heartbeat))
         LOG.info("%s: the client %r has taken %s", self._server_id, hello.name, place.env_id)
-        place.events.on_taken(hello.name, found)
+        place.events.on_taken(found)
 
     def _place_for(self, name: str) -> ClientPlace | None:
         """Return the empty place that a client gets; None if there is none."""
@@ -395,10 +395,10 @@ class ServerSessions:
 
     # -- ends of sessions -----------------------------------------------------------
 
-    def disconnected(self, route: bytes, cause: str = "its connection broke") -> None:
+    def disconnected(self, route: bytes) -> None:
         """Record that a connection is gone, after all of its messages have been received."""
         if (session := self._by_route.get(route)) is not None:
-            self._lose(session, cause)
+            self._lose(session, "its connection broke")
 
     def dismiss(self, place: ClientPlace, cause: str) -> None:
         """Send the client at a place away, with the reason."""

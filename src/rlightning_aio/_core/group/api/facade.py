@@ -62,7 +62,7 @@ def response_to(env_id: str, response: PolicyResponse | Any) -> PolicyResponse:
     """Return the response to an env, given it or an action; `BadAction` if it is another env's."""
     if not isinstance(response, PolicyResponse):
         return PolicyResponse(env_id, response)
-    if response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
+    if response.env_id != env_id:
         raise BadAction(
             f"the response is for env {response.env_id!r}, and this is the handle of {env_id!r}; "
             "step that env, or the group; nothing was sent"

@@ -379,7 +379,7 @@ class EnvHandleInterface:
             EnvBusy: the env has a reply outstanding; nothing was sent.
             TypeError: the arguments can't be sent to a worker; nothing was sent.
             WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
-            UnknownEnv: the env was a client's that has gone, and another has its place.
+            NotImplementedError: the env is a client's; nothing was sent.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError

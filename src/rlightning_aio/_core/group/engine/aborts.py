@@ -46,7 +46,6 @@ class Aborts:
         self._episodes = tables.episodes
         self._supervisor = supervisor
         self._results = results
-        self._intake = waiting.intake
         self._waiting = waiting
         self._sums = tables.sums
 

@@ -145,7 +145,6 @@ class Core:
         with self.observed.call("abort", now):
             self.lifetime.check_open()
             slots = self._all_slots if env_ids is None else self.envs.find(env_ids)
-            self.intake.now = now
             self.waiting.poll()
             self._aborts.drop(slots)
             yield from self._aborts.end(slots, now)
@@ -168,7 +167,6 @@ class Core:
         end = None if deadline is None else now + deadline
         self.waiting.collecting = True
         try:
-            self.intake.now = now
             now = yield from self.waiting.until(
                 now, lambda: collector.num_awaited + len(unwanted), end
             )

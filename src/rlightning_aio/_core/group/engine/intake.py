@@ -52,11 +52,7 @@ _ASKED_AGAIN: Final = (int(Operation.STEP), int(Operation.RESET))
 
 
 class Intake:
-    """See the module; the arguments are the group's parts.
-
-    Attributes:
-        now: when the driver last looked at sources (monotonic seconds).
-    """
+    """See the module; the arguments are the group's parts."""
 
     def __init__(
         self,
@@ -64,7 +60,6 @@ class Intake:
         supervisor: Supervisor,
         results: Results,
     ) -> None:
-        self.now = 0.0
         self._completions = tables.completions
         self._conditions = tables.conditions
         self._envs = tables.envs

@@ -84,7 +84,7 @@ class Resets:
     ) -> None:
         """Send resets, whose results the collector gets."""
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-        seeds = self._seeds_for(slots, seed, now)
+        seeds = self._seeds_for(slots, seed)
         self._dispatch.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
         self._send(slots, seeds, options, packed, COLLECTOR, now)
@@ -110,7 +110,7 @@ class Resets:
     def _prepared(
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
     ) -> Callable[[Ticket], None]:
-        seeds = self._seeds_for(slots, seed, now)
+        seeds = self._seeds_for(slots, seed)
         self._dispatch.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
 
@@ -119,9 +119,8 @@ class Resets:
 
         return send
 
-    def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
+    def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds) -> NDArray[np.int64]:
         """Apply completions, and return the seeds of resets that are about to be sent."""
-        self._intake.now = now
         self._intake.apply_completions()
         return seeds_for(self._envs, seed, slots)
 

@@ -60,7 +60,7 @@ class Results:
         self._sent_columns = np.full(len(envs), None, object)
         self._sent_rows = np.zeros(len(envs), np.intp)
         self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any]] | None = None
-        # The columns sent last to each entry: examples for rows that answer no request. Batches
+        # The columns sent last to each entry: examples for rows that answer no response. Batches
         # refer to these dicts, so they are replaced and never changed.
         self._examples: list[dict[str, Any]] = [{} for _ in envs.names.entry_names]
         self._any_unasked = False
@@ -100,10 +100,6 @@ class Results:
         if out_of_band:
             self._out_of_band[slot] = out_of_band
             self._conditions.note(BESIDE_ROWS, True)
-
-    def drop(self, slot: int) -> None:
-        """Nobody will ask for the result of `slot`."""
-        self._out_of_band.pop(slot, None)
 
     def begin_schemas(self, slots: range) -> None:
         """The host of `slots` announces its ways of holding infos (anew, after a restart)."""

@@ -273,7 +273,6 @@ class Steps:
     def _write_any(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Do the same for any batch."""
         slots = self._slots_of(batch)
-        self._intake.now = now
         self._dispatch.check_sendable(now, slots, "step")
         self._supervisor.places.check_step(slots)
         if not len(slots):
@@ -420,7 +419,7 @@ def _answered(batch: BatchedData) -> list[str]:
     """Return the ids of the envs that a batch of the user's own values answers."""
     env_ids = batch.env_ids()
     for id_, env_id in zip(batch.ids(), env_ids, strict=True):
-        if env_id != id_ and not env_id.startswith(f"{id_}/"):
+        if env_id != id_:
             raise BadAction(
                 f"under the id {id_!r} there is a response of {env_id!r}; give each under its own "
                 "env's id; nothing was sent"

@@ -110,7 +110,6 @@ class Waiting:
 
     def check(self, now: float) -> None:
         """Check all hosts for deaths and hangs, and apply the outcome."""
-        self.intake.now = now
         if now >= self._supervisor.due:
             self.poll()  # An env that has replied is not hung, and owes nothing.
         self._supervisor.check(now)

@@ -87,7 +87,6 @@ def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core
         objection=supervisor.objection,
         busy_since=tables.requests.busy_since,
         resources=tables.resources,
-        shares_thread=tables.shares_thread,
     )
     first_slot = 0
     for host_id, order in enumerate(orders):

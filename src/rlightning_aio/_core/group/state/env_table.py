@@ -18,7 +18,6 @@ from rlightning_aio.registry import name_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.messages import EnvStarted
@@ -48,7 +47,6 @@ class EnvTable:
         num_sub_envs: sub-environments of each slot; seed_offset: the number of seeds before its
             own.
         resets_itself: True where envs need no reset after an end; any_resets_itself: for any slot.
-        observation_spaces: of the local envs.
     """
 
     def __init__(
@@ -83,7 +81,6 @@ class EnvTable:
         self.seed_offset = np.zeros(size, np.int64)
         self.resets_itself = np.zeros(size, np.bool_)
         self.any_resets_itself = False
-        self.observation_spaces: list[gym.Space[Any] | None] = []
 
     def __len__(self) -> int:
         return len(self.configs)
@@ -97,7 +94,6 @@ class EnvTable:
 
     def note_started(self, started: Sequence[EnvStarted]) -> None:
         """Record the properties of the local envs, in the order of their slots."""
-        self.observation_spaces = [env.meta.observation_space for env in started]
         for slot, env in enumerate(started):
             self.actions_beside_rows[slot] = env.actions_beside_row
             self.reads_extras[slot] = env.reads_extras

@@ -99,11 +99,6 @@ class HostLoss:
         names = ", ".join(self._ids(asked))
         return self._error(f"{self.message}; nothing was sent to {names}", asked)
 
-    def silent(self, lost: NDArray[np.intp]) -> EnvFault:
-        """The error for `lost`, slots that had replied, but whose states are gone."""
-        names = ", ".join(self._ids(lost))
-        return self._error(f"{self.message}; lost with it: {names}", lost)
-
     def _message(self, owed: NDArray[np.intp]) -> str:
         names = ", ".join(self._ids(owed)) or "none"
         return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.then}"

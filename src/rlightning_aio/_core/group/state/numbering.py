@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -38,10 +38,6 @@ class Numbering:
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""
         return int(self.entry[slot]) >> NUMBER_SHIFT
-
-    def numbers(self, slots: Any = ...) -> NDArray[np.int64]:
-        """Numbers of the current requests."""
-        return self.entry[slots] >> NUMBER_SHIFT
 
     def op(self, slot: int) -> int:
         """Operation of the current request; 0 before the first."""

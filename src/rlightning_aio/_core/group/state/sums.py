@@ -257,12 +257,11 @@ class Sums:
         """Return what `EnvGroup.get_env_stats` documents."""
         found: dict[str, dict[str, Any]] = {}
         for slot, env_id in enumerate(self._envs.env_ids):
-            if env_id:
-                own: dict[str, Any] = self.added(np.array([slot]))
-                episodes = own["episodes"]
-                for what in ("return", "length"):
-                    own[f"mean_{what}"] = own[f"episode_{what}s"] / episodes if episodes else None
-                found[env_id] = own
+            own: dict[str, Any] = self.added(np.array([slot]))
+            episodes = own["episodes"]
+            for what in ("return", "length"):
+                own[f"mean_{what}"] = own[f"episode_{what}s"] / episodes if episodes else None
+            found[env_id] = own
         return found
 
     def summary(self) -> dict[str, Any]:

@@ -263,8 +263,7 @@ class EnvServerHost(Host):
 
     # -- events of the place -------------------------------------------------------------
 
-    def on_taken(self, client: str, announced: Announcement) -> None:
-        del client
+    def on_taken(self, announced: Announcement) -> None:
         self._num_taken += 1
         meta = announced.meta.model_copy(update={"env_id": self.env_id})
         slab, is_new = self.server.slab_for(meta)
