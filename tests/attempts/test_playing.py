@@ -865,6 +865,21 @@ async def test_a_bug_in_the_agent_ends_the_run(tmp_path: Path) -> None:
     assert [attempt.outcome.kind for attempt in found[0]] == ["agent_raised", "terminated"]
 
 
+async def test_a_model_that_is_away_at_first_is_no_bug_in_the_agent() -> None:
+    """Whatever the first group comes to, the others are played."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if episode.spec.seed == 0:
+            raise ConnectionError("the model is away")
+        await once(episode)
+
+    async with sandboxes(1) as group:
+        found = await played(group, tasks(2), agent, 1, Rules(retries=0))
+    (first,), (second,) = found
+    assert (first.outcome.kind, first.outcome.blame) == ("agent_raised", "infrastructure")
+    assert second.outcome.kind == "terminated"
+
+
 async def mistaken(episode: AttemptEpisode) -> None:
     raise NameError("a typo")
 

@@ -129,7 +129,7 @@ def _check(group: Any, rules: Any, results: Any, size: int) -> None:
 
 
 def _is_bug(outcome: Outcome) -> bool:
-    return outcome.kind == "agent_raised" and outcome.blame != "policy"
+    return outcome.kind == "agent_raised" and outcome.blame == "caller"
 
 
 class _Engine:
