@@ -24,6 +24,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 
@@ -751,11 +752,34 @@ async def test_an_agent_finishes(reward: float | None, steps: int) -> None:
         assert episode.is_over
         with pytest.raises(rl.RLightningError, match="has ended"):
             await episode.step(1)
+        with pytest.raises(rl.RLightningError, match="has finished this attempt"):
+            episode.finish(0.0)
 
     async with rooms(PLACES["loop"]) as group:
         ((attempt,),) = await played(group, tasks(1), agent)
     assert attempt.outcome.kind == ("terminated" if steps == 5 else "truncated")
     assert attempt.reward == (2.0 if reward is None else reward)
+
+
+@pytest.mark.parametrize(("steps", "kind"), [(0, "truncated"), (2, "truncated"), (5, "terminated")])
+@pytest.mark.parametrize("on_timeout", ["fail", "end"])
+async def test_an_agent_that_has_finished_has_its_reward_when_its_time_is_over(
+    steps: int, kind: str, on_timeout: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has something to do after that, which takes too long."""
+    ran = lambda attempt: math.inf if attempt.is_finished else 0.0
+    monkeypatch.setattr(AttemptInPlay, "ran", ran)
+
+    async def agent(episode: AttemptEpisode) -> None:
+        for _ in range(steps):
+            await episode.step(1)
+        episode.finish(7)
+        await asyncio.Event().wait()
+
+    rules = Rules(attempt_timeout=0.05, on_timeout=on_timeout)
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+    assert (attempt.outcome.kind, attempt.reward, attempt.length) == (kind, 7.0, steps)
 
 
 # -- what is lost ---------------------------------------------------------------------

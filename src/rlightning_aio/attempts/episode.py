@@ -80,9 +80,13 @@ class AttemptEpisode:
 
         Raises:
             ValueError: `reward` is not a finite number.
-            RLightningError: the attempt is over.
+            RLightningError: the attempt is over, or was finished before.
         """
         self._check_open()
+        if self.is_finished:
+            raise RLightningError(
+                f"the agent has finished this attempt on env {self.env_id!r} before"
+            )
         if reward is not None and not _is_finite(reward):
             raise ValueError(f"the reward of an attempt must be a finite number, not {reward!r}")
         self.is_finished = True

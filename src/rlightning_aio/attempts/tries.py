@@ -179,6 +179,8 @@ class Try:
         """The outcome of a try that did not end by itself."""
         if self._stopped is not None:
             return Outcome("cancelled", "caller", self._stopped, self.env_id)
+        if self._view.is_finished:
+            return self._own_end()
         assert self._rules.attempt_timeout is not None
         cause = f"its {self._rules.attempt_timeout:g} s were over"
         if not has_begun:
@@ -202,15 +204,19 @@ class Try:
             return self._view.fault
         if self.error is not None:
             return self._raised(self.error)
+        if self._view.is_over:
+            return self._own_end()
+        cause = "the agent returned before the end, without episode.finish()"
+        return Outcome("agent_stopped", "caller", cause, self.env_id)
+
+    def _own_end(self) -> Outcome:
+        """The outcome of a try that its env has ended, or else its agent."""
         last = self._view.last
         if self._view.has_ended:
             terminated = bool(np.all(all_agents(last.last_terminated)))
             cut = "its env or the step limit cut it"
             return own_end(self.env_id, last.info, terminated=terminated, cut=cut)
-        if self._view.is_finished:
-            return Outcome("truncated", "policy", "the agent finished it", self.env_id)
-        cause = "the agent returned before the end, without episode.finish()"
-        return Outcome("agent_stopped", "caller", cause, self.env_id)
+        return Outcome("truncated", "policy", "the agent finished it", self.env_id)
 
     def _raised(self, error: BaseException) -> Outcome:
         """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
