@@ -25,6 +25,7 @@ import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.episode import AttemptInPlay
+from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 
@@ -767,7 +768,10 @@ async def test_an_agent_that_has_finished_has_its_reward_when_its_time_is_over(
     steps: int, kind: str, on_timeout: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It has something to do after that, which takes too long."""
-    ran = lambda attempt: math.inf if attempt.is_finished else 0.0
+
+    def ran(attempt: AttemptInPlay) -> float:
+        return math.inf if attempt.is_finished else 0.0
+
     monkeypatch.setattr(AttemptInPlay, "ran", ran)
 
     async def agent(episode: AttemptEpisode) -> None:
@@ -854,6 +858,33 @@ async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFix
     said = [one.getMessage() for one in caplog.records]
     assert len([one for one in said if "most attempts fail" in one]) == 1
     assert len([one for one in said if "succeed again" in one]) == 1
+
+
+async def test_an_attempt_that_goes_well_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However long the pause would be: others begin when there is something to begin."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        number = episode.spec.seed or 0
+        if number < 4:
+            raise ConnectionError("the model is away")
+        await once(episode)
+        if number == 4:
+            goes_well.set()
+            await has_begun.wait()
+        has_begun.set()
+
+    async def stream() -> AsyncIterator[EpisodeSpec]:
+        for spec in tasks(5):
+            yield spec
+        await goes_well.wait()
+        yield EpisodeSpec("", 5)
+
+    goes_well, has_begun = asyncio.Event(), asyncio.Event()
+    monkeypatch.setattr(Health, "note_begin", lambda self, now: setattr(self, "_next", now + 1e6))
+    async with sandboxes(2) as group, asyncio.timeout(HANG):
+        found = await played(group, stream(), agent, 1, Rules(retries=0))
+    kinds = Counter(attempt.outcome.kind for (attempt,) in found)
+    assert kinds == {"agent_raised": 4, "terminated": 2}
 
 
 async def test_too_many_failures_end_the_run() -> None:

@@ -106,6 +106,6 @@ class Health:
     def seconds_left(self, now: float) -> float | None:
         """Seconds until more may begin than now; None if nothing waits for that."""
         times = [time for time in self._rests.values() if time > now]
-        if self.is_slow:
-            times.append(max(self._next, now))
+        if self.is_slow and self._next > now:
+            times.append(self._next)
         return min(times) - now if times else None

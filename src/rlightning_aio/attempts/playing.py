@@ -253,13 +253,11 @@ class _Engine:
 
     def _may_begin(self) -> bool:
         now, health = time.monotonic(), self._health
-        if len(self._playing) >= self._most or not health.may_begin(now):
-            return False
         if health.is_slow and any(probe.goes_well for probe in self._probes):
             health.recover(now)
         if not health.is_slow:
             self._probes.clear()
-        return True
+        return len(self._playing) < self._most and health.may_begin(now)
 
     def _start(self, env_id: str) -> None:
         (job,) = self._queue.take(env_id)

@@ -1,0 +1,27 @@
+"""How fast attempts begin while most fail."""
+
+from __future__ import annotations
+
+from rlightning_aio.attempts.health import Health
+from rlightning_aio.outcomes import Outcome
+
+
+def in_an_outage(env_id: str = "") -> Health:
+    """Slow from second 10 on."""
+    health = Health()
+    kind = "env_died" if env_id else "agent_raised"
+    for _ in range(4):
+        health.note(Outcome(kind, "infrastructure", "away", env_id or "box-0"), 4, 10.0)
+    assert health.is_slow
+    return health
+
+
+def test_nothing_is_waited_for_once_the_pause_is_over() -> None:
+    """Then an attempt begins as soon as an env is free."""
+    health = in_an_outage()
+    assert health.seconds_left(10.25) == 0.25
+    assert not health.may_begin(10.25)
+    assert health.may_begin(10.5)
+    assert health.seconds_left(10.5) is None
+    health.note_begin(10.5)
+    assert health.seconds_left(10.5) == 1.0
