@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.outcomes import Outcome
+
+if TYPE_CHECKING:
+    import pytest
 
 
 def in_an_outage(env_id: str = "") -> Health:
@@ -25,3 +30,11 @@ def test_nothing_is_waited_for_once_the_pause_is_over() -> None:
     assert health.seconds_left(10.5) is None
     health.note_begin(10.5)
     assert health.seconds_left(10.5) == 1.0
+
+
+def test_an_outage_names_an_env_only_if_envs_fail(caplog: pytest.LogCaptureFixture) -> None:
+    in_an_outage()
+    in_an_outage("box-1")
+    of_model, of_envs = [one.getMessage() for one in caplog.records]
+    assert "most attempts fail (3 agent_raised): others" in of_model
+    assert "most attempts fail (3 env_died, such as on env 'box-1'): others" in of_envs

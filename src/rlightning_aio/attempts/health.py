@@ -33,12 +33,10 @@ class Health:
     """See the module; times are monotonic seconds.
 
     Attributes:
-        failures: of each env, so far.
         is_slow: most of the last tries have failed.
     """
 
     def __init__(self) -> None:
-        self.failures = Counter[str]()
         self.is_slow = False
         self._in_a_row = Counter[str]()
         self._rests: dict[str, float] = {}
@@ -53,7 +51,6 @@ class Health:
             self._note_recent("", num_playing, now)
             return
         if is_of_env(outcome):
-            self.failures[outcome.env_id] += 1
             self._in_a_row[outcome.env_id] += 1
             if (more := self._in_a_row[outcome.env_id] - _BORNE) > 0:
                 rest = min(_REST * 2.0 ** min(more - 1, 10), _LONGEST_REST)
@@ -75,11 +72,12 @@ class Health:
             self.is_slow, self._since, self._pause = True, now, _PAUSE
             self._next = now + _PAUSE
             self._recent.clear()
+            env_id = next(iter(self._in_a_row), "")
             _log.warning(
-                "most attempts fail (%s, such as on env %r): others begin one at a time, after "
+                "most attempts fail (%s%s): others begin one at a time, after "
                 "pauses of up to %g s, until one succeeds",
                 ", ".join(f"{count} {kind}" for kind, count in failed.items()),
-                next(iter(self._in_a_row), ""),
+                f", such as on env {env_id!r}" if env_id else "",
                 _LONGEST_PAUSE,
             )
 
