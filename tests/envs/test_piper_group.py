@@ -21,10 +21,12 @@ pytest.importorskip("serial")
 from envs.closing_table import closing_table, steps
 from envs.watched_arm import WatchedArm
 from kit.counting import ClientThread
+from kit.processes import fork_server_pid, kill
 from patience import HANG
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
-from rlightning_aio.errors import BadAction, EnvRaised
+from rlightning_aio.errors import BadAction, EnvRaised, WorkerDied
+from rlightning_aio.plugins.piper.arm import CanFrame
 from rlightning_aio.plugins.piper.env import PiperEnv
 from rlightning_aio.plugins.piper.sim import SlcanPort, running
 
@@ -163,6 +165,25 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
         while trainer.stdout.readline():
             pass
         assert np.abs(arm.joints - arm.targets).max() == 0
+
+
+@pytest.mark.parametrize("killed", ["worker", "fork server"])
+def test_the_whole_stop_is_sent_when_a_worker_is_killed(
+    monkeypatch: pytest.MonkeyPatch, killed: str
+) -> None:
+    """What is killed with the worker leaves out the arm's watchdog, which sends it three times."""
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.0}')
+    arm, stop = WatchedArm(), CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+    with contextlib.closing(SlcanPort()) as port, running(arm, port):
+        slcan = {"can_interface": "slcan", "channel": port.path, "safe_stop": "emergency_stop"}
+        with sync.build_env_group(entry(env_kwargs=slcan)) as group:
+            batch, _ = group.reset()
+            group.step(batch.respond(action=np.array([[*READY, 0.0]], np.float32)))
+            assert stop not in arm.commands
+            kill(fork_server_pid(group) if killed != "worker" else group.get_workers()[0]["pid"])
+            assert arm.wait_for(lambda: arm.commands.count(stop) == 3)
+            with pytest.raises(WorkerDied):
+                group.step(batch.respond(action=np.array([[*READY, 0.0]], np.float32)))
 
 
 def test_the_dry_run_ends_with_its_table() -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 ABORT, HANG, SLEEP = 0, 1, 2
@@ -47,15 +48,21 @@ class Leaving(gym.Env[int, int]):
 class Starting(gym.Env[int, int]):
     """It has started a browser, so to speak: in a session of its own, with a process below it, and
     in the background of a shell that has ended.
+
+    Args:
+        environment: of what it has started, in addition.
     """
 
     observation_space: Any = gym.spaces.Discrete(2)
     action_space: Any = gym.spaces.Discrete(3)
 
-    def __init__(self) -> None:
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         script = "sleep 1000000 & echo $! $$; wait"
         browser = subprocess.Popen(
-            ["sh", "-c", script], start_new_session=True, stdout=subprocess.PIPE
+            ["sh", "-c", script],
+            start_new_session=True,
+            stdout=subprocess.PIPE,
+            env={**os.environ, **(environment or {})},
         )
         assert browser.stdout is not None
         script = "setsid sleep 1000000 >/dev/null 2>&1 & echo $!"

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import os
+import select
+import signal
 import weakref
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
@@ -84,6 +87,28 @@ def test_what_an_env_has_started_is_killed_with_its_worker(kill: str) -> None:
             group.collect_async()
         ended()
     group.close()
+
+
+@pytest.mark.parametrize("kill", ["crash", "abort"])
+def test_what_outlives_a_worker_is_not_killed_with_it(kill: str) -> None:
+    """An arm's watchdog, say, with what is below it; all else that the env has started is."""
+    task = partial(Starting, {"RLIGHTNING_AIO_OUTLIVES": "1"})
+    with rl.build_env_group(entry(task, on_worker_death="restart")) as group:
+        batch, _ = group.reset()
+        below, watchdog, other = (int(pid) for pid in batch.info("started")[0])
+        with watched({other}) as ended, watched({watchdog, below}) as left_ended:
+            group.step_async(batch.respond(action=[KILLS[kill]]))
+            if kill == "abort":
+                group.abort()
+            else:
+                group.collect_async()
+            ended()
+            watches = [os.pidfd_open(pid) for pid in (watchdog, below)]
+            assert not select.select(watches, [], [], 0)[0]
+            for watch in watches:
+                signal.pidfd_send_signal(watch, signal.SIGTERM)
+                os.close(watch)
+            left_ended()
 
 
 SLOW = """

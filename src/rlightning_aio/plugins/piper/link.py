@@ -161,6 +161,8 @@ class ArmLink:
                 pass_fds=[theirs.fileno(), lock.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
+                # A killed worker doesn't take it along: it stops the arm, and then ends.
+                env={**os.environ, "RLIGHTNING_AIO_OUTLIVES": "1"},
                 # Protects it from Ctrl-C, Ctrl-Z and the end of the terminal's session.
                 start_new_session=True,
             )

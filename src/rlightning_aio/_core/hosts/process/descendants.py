@@ -17,9 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
 __all__ = ["adopt_orphans", "children", "kill_below"]
+
+_OUTLIVES: Final = b"\0RLIGHTNING_AIO_OUTLIVES=1\0"
+"""In the environment of a process that is not killed: the watchdog of an arm has to stop the arm
+then, and ends by itself.
+"""
 
 _PR_SET_CHILD_SUBREAPER: Final = 36
 _MOST_ROUNDS: Final = 100
@@ -54,18 +59,30 @@ def children() -> dict[int, list[int]]:
 def kill_below(process: int, but: Collection[int] = ()) -> None:
     """Kill all descendants of a process, except children in `but` and what is below those.
 
-    Whatever is started meanwhile is found in another round, for its parent dies before it or is
-    found with it.
+    Those that outlive a worker (`_OUTLIVES`) are left out, too, with what is below them. Whatever
+    is started meanwhile is found in another round, for its parent dies before it or is found with
+    it.
     """
     killed: set[int] = set()
     for _ in range(_MOST_ROUNDS):
         of = children()
-        below = [pid for pid in of.get(process, []) if pid not in but]
+        below = _killable(pid for pid in of.get(process, []) if pid not in but)
         for pid in below:
-            below += of.get(pid, [])
+            below += _killable(of.get(pid, []))
         if killed.issuperset(below):
             return
         for pid in below:
             with contextlib.suppress(OSError):
                 os.kill(pid, signal.SIGKILL)
         killed.update(below)
+
+
+def _killable(pids: Iterable[int]) -> list[int]:
+    return [pid for pid in pids if _OUTLIVES not in _variables(pid)]
+
+
+def _variables(pid: int) -> bytes:
+    try:
+        return b"\0" + Path(f"/proc/{pid}/environ").read_bytes()
+    except OSError:  # It has ended meanwhile, or it is another user's.
+        return b""
