@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
+from kit.counting import ClientThread, CountingEnv, look
+from patience import HANG
+
+from rlightning_aio import sync
 from rlightning_aio.attempts.players import Players
+from rlightning_aio.attempts.queue import AttemptQueue
+from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.types import EnvMeta
 
 
@@ -26,3 +33,33 @@ def test_clients_may_come_whatever_other_envs_are_gone() -> None:
     players = Players(Group())
     assert players.can_play(["robots"])
     assert not players.can_play(["robots", "a"])
+
+
+def until_it_is(state: str, group: Any) -> None:
+    until = time.monotonic() + HANG
+    while group.get_workers()[0]["state"] != state:
+        assert time.monotonic() < until
+        look(group)
+
+
+def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more() -> None:
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    with sync.build_env_group(server) as group:
+        address: str = group["robots-0"].address
+        client = ClientThread(address, "a", CountingEnv(), hardware=False)
+        batch, _ = group.reset()
+        queue = AttemptQueue(group, Rules())
+        assert [*queue.free] == ["robots-0/0"]
+        client.env.finished = True  # It leaves after this step.
+        group.step(batch.respond(action=[[0.0, 0.0]]))
+        client.join()
+        until_it_is("empty", group)
+        queue.look(())
+        assert not queue.free
+        client = ClientThread(address, "a", CountingEnv(), hardware=False)
+        until_it_is("up", group)
+        queue.look(["robots-0/0"])
+        assert not queue.free
+        queue.look(())
+        assert [*queue.free] == ["robots-0/0"]
+    client.join()

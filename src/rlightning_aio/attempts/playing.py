@@ -354,10 +354,8 @@ class _Engine:
         queue.check_players()
 
     def _look(self) -> None:
-        """Look for clients that have come, or come back, a few times in a second."""
+        """Look for clients that have come, come back or left, a few times in a second."""
         if time.monotonic() < self._look_at:
             return
         self._look_at = time.monotonic() + _LOOK_SECONDS
-        busy = {one.env_id for _, one in self._playing.values()}
-        for env_id in self._queue.players.refresh() - busy:
-            self._queue.free.setdefault(env_id)
+        self._queue.look(one.env_id for _, one in self._playing.values())

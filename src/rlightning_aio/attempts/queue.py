@@ -275,6 +275,15 @@ class AttemptQueue:
     def _pinned_to(self) -> list[str]:
         return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
 
+    def look(self, busy: Iterable[str]) -> None:
+        """Look which envs are there: those that are not `busy` are free."""
+        present = self.players.refresh().difference(busy)
+        for env_id in self.free.keys() - present:
+            del self.free[env_id]
+        for env_id in self.players.entry_of:  # In their order.
+            if env_id in present:
+                self.free.setdefault(env_id)
+
     def check_players(self) -> None:
         """Raise the last fault if attempts wait that no env is left for.
 
