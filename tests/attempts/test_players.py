@@ -63,3 +63,24 @@ def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more() -> No
         queue.look(())
         assert [*queue.free] == ["robots-0/0"]
     client.join()
+
+
+def test_what_moves_something_real_and_was_lost_is_left_alone_until_its_user_resets_it() -> None:
+    """It was lost while it was idle, and came back."""
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    with sync.build_env_group(server) as group:
+        address: str = group["robots-0"].address
+        client = ClientThread(address, "arm", CountingEnv(), hardware=True)
+        batch, _ = group.reset()
+        assert Players(group).present == {"robots-0/0"}
+        client.env.finished = True  # It leaves after this step.
+        group.step(batch.respond(action=[[0.0, 0.0]]))
+        client.join()
+        until_it_is("empty", group)
+        client = ClientThread(address, "arm", CountingEnv(), hardware=True)
+        until_it_is("up", group)
+        assert not Players(group).present
+        assert client.env.resets == 0
+        group.reset()
+        assert Players(group).present == {"robots-0/0"}
+    client.join()

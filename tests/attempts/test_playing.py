@@ -28,6 +28,7 @@ from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -844,6 +845,41 @@ async def test_an_env_that_raises_is_rebuilt(place: dict[str, Any]) -> None:
         ((attempt,),) = await played(group, tasks(1), agent)
         assert [one.kind for one in attempt.failures] == ["env_raised"] * 2
         assert (marks, attempt.result) == ([7, 7], 0)
+
+
+@pytest.fixture
+def moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All envs move something real."""
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+
+
+@pytest.mark.usefixtures("moving")
+@pytest.mark.parametrize(("deed", "kind"), [("raise", "env_raised"), ("die", "env_died")])
+async def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
+    deed: str, kind: str
+) -> None:
+    """The others go on without it; if nobody is left, the error says what to do."""
+
+    async def agent(episode: AttemptEpisode) -> str:
+        if episode.env_id not in broken:
+            broken.append(episode.env_id)
+            await episode.step(deed)
+        await earner(episode)
+        return episode.env_id
+
+    broken = ["room-1", "room-2", "room-3"]
+    asks = r"'room-\d'.*group\.reset\(env_ids=\['room-\d'\]\)"
+    async with rooms(PLACES["workers"], on_worker_death="restart") as group:
+        found = await played(group, tasks(12), agent)
+        failed = [one for (attempt,) in found for one in attempt.failures]
+        assert [(one.kind, one.env_id) for one in failed] == [(kind, "room-0")]
+        assert {attempt.result for (attempt,) in found} <= {"room-1", "room-2", "room-3"}
+        for rules, source in [(Rules(), tasks(12)), (Rules(retries=0), iter(tasks(12)))]:
+            broken.clear()
+            await group.reset()
+            with pytest.raises(rl.RLightningError, match=asks):
+                await played(group, source, agent, 1, rules)
+            assert sorted(broken) == [f"room-{k}" for k in range(4)]
 
 
 async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFixture) -> None:

@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+from rlightning_aio._core.group.api.facade import is_lost, is_resettable
+from rlightning_aio.attempts.rules import is_from_env
 from rlightning_aio.attempts.spec import EpisodeSpec
+from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from rlightning_aio.outcomes import Outcome
 
 __all__ = ["Players"]
 
@@ -25,7 +30,8 @@ class Players:
     Attributes:
         entry_of: the name of the config entry of each env.
         gone: envs whose worker is not replaced.
-        present: envs that are there and not gone.
+        left_alone: what moves something real and was lost or has raised: only its user resets it.
+        present: envs that are there, and neither gone nor left alone.
     """
 
     def __init__(self, group: Any) -> None:
@@ -43,6 +49,7 @@ class Players:
             self._kinds.pop(player, None)
             self._kinds[player] = None
         self.gone: set[str] = set()
+        self.left_alone: set[str] = set()
         self.present: set[str] = set()
         self.refresh()
 
@@ -53,8 +60,18 @@ class Players:
             if worker["state"] != "empty":
                 present.update(worker["env_ids"])
             self.gone.update(worker["given_up"])
-        self.present = present - self.gone
+            if worker.get("client"):  # One that was lost while its env was idle, too.
+                self.left_alone.update(
+                    id_ for id_ in worker["env_ids"] if is_lost(self._group, id_)
+                )
+        self.present = present - self.gone - self.left_alone
         return self.present
+
+    def note(self, outcome: Outcome) -> None:
+        """Leave what moves something real alone after a failure of it."""
+        if is_from_env(outcome) and not is_resettable(self._group, outcome.env_id):
+            self.left_alone.add(outcome.env_id)
+            self.present.discard(outcome.env_id)
 
     def assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
         """Return an episode with the entry that plays it.
@@ -96,13 +113,26 @@ class Players:
             return {"task": spec.task, **(spec.options or {})}
         return None if spec.options is None else {**spec.options}
 
-    def can_play(self, entries: Iterable[str]) -> bool:
-        """Return True unless all envs of one of these entries are gone."""
-        if not self.gone:
+    def can_play(self, entries: Iterable[str], *, alone: bool = False) -> bool:
+        """Return True unless all envs of one of these entries are gone, or left alone."""
+        out = self.gone | self.left_alone if alone else self.gone
+        if not out:
             return True
-        left = {entry for env_id, entry in self.entry_of.items() if env_id not in self.gone}
-        lost = {self.entry_of[env_id] for env_id in self.gone} - left
+        left = {entry for env_id, entry in self.entry_of.items() if env_id not in out}
+        lost = {self.entry_of[env_id] for env_id in out} - left
         return lost.isdisjoint(entries)
+
+    def is_nobody_left(self) -> bool:
+        """Return True if all envs are gone, or left alone."""
+        return self.entry_of.keys() <= self.gone | self.left_alone
+
+    def refusal(self) -> RLightningError:
+        """The error for attempts that only envs which are left alone could play."""
+        env_id = min(self.left_alone)
+        return RLightningError(
+            f"env {env_id!r} was lost or has raised an error, and may move something real, so it "
+            f"is reset only if you ask for it: group.reset(env_ids=[{env_id!r}]), and then play on"
+        )
 
 
 def _can_play(player: _Player, task: str) -> bool:

@@ -87,7 +87,8 @@ async def play(
         ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
             is a file, and a task is twice there.
         WorkerDied, EnvHung: all envs that could play a task are gone for good.
-        RLightningError: too many attempts have failed: all at the first task, or by `rules`.
+        RLightningError: too many attempts have failed: all at the first task, or by `rules`; or
+            only envs are left that move something real and have failed: only you reset them.
     """
     _check(group, rules, results, size)
     engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
@@ -285,9 +286,10 @@ class _Engine:
         attempt = ended.result()
         if isinstance(one.error, WorkerDied):
             queue.fault = one.error
+        queue.players.note(attempt.outcome)
         if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
             queue.free[one.env_id] = None
-        for env_id in queue.players.gone:
+        for env_id in queue.players.gone | queue.players.left_alone:
             queue.free.pop(env_id, None)
         self._health.note(attempt.outcome, self._most, time.monotonic())
         if queue.end(job, attempt):
@@ -349,9 +351,16 @@ class _Engine:
     def _check_envs(self) -> None:
         """Raise the last fault if attempts wait for an env that won't come."""
         queue = self._queue
-        if not (queue.free or self._playing or self._has_clients or self._source.is_at_end):
-            raise queue.fault or RLightningError("no env of this group is left that could play")
         queue.check_players()
+        if self._playing:
+            return
+        queue.check_left_alone()
+        if queue.free or self._source.is_at_end:
+            return
+        if queue.players.left_alone and queue.players.is_nobody_left():
+            raise queue.players.refusal()
+        if not self._has_clients:
+            raise queue.fault or RLightningError("no env of this group is left that could play")
 
     def _look(self) -> None:
         """Look for clients that have come, come back or left, a few times in a second."""

@@ -294,3 +294,14 @@ class AttemptQueue:
         gone = not self.players.gone.isdisjoint(self._pinned_to())
         if gone or not self.players.can_play(self._entries()):
             raise self.fault or RLightningError("no env of this group is left that could play")
+
+    def check_left_alone(self) -> None:
+        """Raise an error if attempts wait for envs that only their user resets.
+
+        Raises:
+            RLightningError: that is so.
+        """
+        players = self.players
+        is_pinned = not players.left_alone.isdisjoint(self._pinned_to())
+        if is_pinned or not players.can_play(self._entries(), alone=True):
+            raise players.refusal()

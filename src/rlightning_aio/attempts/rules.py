@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Rules", "is_final", "is_of_env", "is_retried", "needed", "tries_again"]
+__all__ = ["Rules", "is_final", "is_from_env", "is_of_env", "is_retried", "needed", "tries_again"]
 
 
 _OF_ENVS: Final = ("env_raised", "env_died", "env_hung", "env_away", "not_started")
@@ -32,7 +32,12 @@ def is_final(outcome: Outcome) -> bool:
 
 def is_of_env(outcome: Outcome) -> bool:
     """Return True for a failure of the env itself, and not of a neighbour in its worker."""
-    return outcome.kind in _OF_ENVS and not is_bystanders(outcome)
+    return is_from_env(outcome) and not is_bystanders(outcome)
+
+
+def is_from_env(outcome: Outcome) -> bool:
+    """Return True for a failure that the env has not survived, whoever is at fault."""
+    return outcome.kind in _OF_ENVS
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ __all__ = [
     "Facade",
     "default_min_results",
     "ensure_auto_reset",
+    "is_lost",
     "is_resettable",
     "only_result",
     "response_to",
@@ -117,6 +118,12 @@ def is_resettable(group: Any, env_id: str) -> bool:
     """Return False if an env moves something real."""
     core = group._core  # noqa: SLF001
     return not core.tables.record_of(core.envs.find_one(env_id)).is_hardware
+
+
+def is_lost(group: Any, env_id: str) -> bool:
+    """Return True if an env moves something real whose client was lost since its last result."""
+    core = group._core  # noqa: SLF001
+    return core.tables.record_of(core.envs.find_one(env_id)).lost_client
 
 
 def default_min_results(group: Any) -> int:

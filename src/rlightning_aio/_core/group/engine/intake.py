@@ -105,7 +105,7 @@ class Intake:
         if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
         record = self._record_of(slot)
-        record.was_shown, record.needs_reset = True, False
+        record.was_shown, record.needs_reset, record.lost_client = True, False, False
         if self._conditions.unusual:
             self._note_answered(self._requests.alone(slot))
 

@@ -141,7 +141,7 @@ class HostRecord:
         last_loss: its last death.
         killable: the host, if it can be killed; place: if its worker starts itself.
         was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
-            user may set it in motion again.
+            user may set it in motion again; lost_client: its client was, not its episode alone.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
@@ -176,6 +176,7 @@ class HostRecord:
     place: SelfStarting | None = field(init=False)
     was_shown: bool = False
     needs_reset: bool = False
+    lost_client: bool = False
     limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
     restart_policy: RestartPolicy = field(init=False)

@@ -403,7 +403,8 @@ class Supervisor:
         # After too many losses in a row the error is raised, and the next request waits anew.
         loss = record.last_loss = replace(loss, replaced=True, resets=loss.resets and loss.replaced)
         # What has shown nothing has lost nothing.
-        record.needs_reset = record.needs_reset or (record.was_shown and record.is_hardware)
+        record.lost_client |= record.was_shown and record.is_hardware
+        record.needs_reset |= record.lost_client
         self.places.leave(record)
         self._update_any_deaths()
         return loss
