@@ -106,7 +106,6 @@ async def play(
             engine.news.clear()
     finally:
         running.cancel()
-        engine.stop_clock()
         await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
 
@@ -137,7 +136,6 @@ class _Engine:
     """The attempts in progress.
 
     Attributes:
-        clock: of the attempts, if they have a time limit.
         done: groups that the caller has not taken.
         news: is set when there is one, or nothing more will come.
     """
@@ -161,10 +159,7 @@ class _Engine:
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._health = health = Health()
-        self.clock: Clock | None = None
-        if rules.attempt_timeout is not None:
-            self.clock = Clock()
-            self.clock.start()
+        self._clock = None if rules.attempt_timeout is None else Clock()
         self._queue.may_play = lambda env_id: not health.rests(env_id, time.monotonic())
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)
@@ -173,10 +168,6 @@ class _Engine:
         self._wake = asyncio.Event()
         self.done = deque[AttemptGroup]()
         self.news = asyncio.Event()
-
-    def stop_clock(self) -> None:
-        if self.clock is not None:
-            self.clock.stop()
 
     async def take(self) -> AttemptGroup:
         """Hand over a group of attempts that is in the file; others may take its place."""
@@ -188,6 +179,8 @@ class _Engine:
 
     async def run(self) -> None:
         """Play all tasks."""
+        if self._clock is not None:
+            self._clock.start()
         try:
             while True:
                 self._wake.clear()
@@ -197,28 +190,32 @@ class _Engine:
                     await asyncio.sleep(0)
                     continue
                 self._check_envs()
-                lacking = self._num_lacking()
                 waiting = len(self._queue)  # Some may wait until an env has rested.
-                if not (self._playing or waiting or lacking) and self._source.is_at_end:
+                if not (self._playing or waiting) and self._source.is_at_end:
                     return
-                looks = lacking or self._has_clients
                 seconds = self._health.seconds_left(time.monotonic()) if waiting else None
-                if looks:
+                if self._has_clients:
                     seconds = min(seconds or _LOOK_SECONDS, _LOOK_SECONDS)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(seconds):
                         await self._wake.wait()
-                if looks:
+                if self._has_clients:
                     self._look()
         finally:
-            self._source.close()
-            for _, one in self._playing.values():
-                one.stop("the iterator of play() was closed")
-            await surely({*self._playing})
-            for task in self._playing:
-                # Read, so that asyncio doesn't log an error that is not asked for.
-                _ = task.cancelled() or task.exception()
+            if self._clock is not None:
+                self._clock.stop()
+            await self._end_all()
             self.news.set()
+
+    async def _end_all(self) -> None:
+        """Read no more tasks, and end what plays."""
+        self._source.close()
+        for _, one in self._playing.values():
+            one.stop("the iterator of play() was closed")
+        await surely({*self._playing})
+        for task in self._playing:
+            # Read, so that asyncio doesn't log an error that is not asked for.
+            _ = task.cancelled() or task.exception()
 
     # -- what begins ------------------------------------------------------------------
 
@@ -264,7 +261,7 @@ class _Engine:
         (job,) = self._queue.take(env_id)
         options = self._queue.players.options(env_id, job.spec)
         episode = self._group.episode(env_id, job.spec.seed, options)
-        view = AttemptInPlay(episode, job.spec, job.index, self.clock)
+        view = AttemptInPlay(episode, job.spec, job.index, self._clock)
         one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
         if self._health.is_slow:
             self._probes.append(one)
@@ -299,9 +296,9 @@ class _Engine:
 
     def _check_failures(self, outcome: Outcome) -> None:
         """Raise an error if more of the last attempts have failed than may."""
-        self._last.append(outcome)
         if self._rules.max_failures is None:
             return
+        self._last.append(outcome)
         kinds = Counter(one.kind for one in self._last if one.is_failure)
         if kinds.total() > self._rules.max_failures * _LAST:
             counts = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
@@ -319,7 +316,7 @@ class _Engine:
         """
         task.is_settled = True
         outcomes = [attempt.outcome for attempt in task.attempts.values()]
-        if not self._has_played and outcomes and all(map(_is_bug, outcomes)):
+        if not self._has_played and all(map(_is_bug, outcomes)):
             raise RLightningError(
                 f"the agent has failed in all {len(outcomes)} attempts at the first task, so no "
                 f"others are played: {outcomes[0].cause}"
