@@ -323,3 +323,18 @@ def test_a_fence_works_after_an_interrupt_in_the_previous_one() -> None:
             sys.settrace(None)
         trainer.worker_sleeps()
     assert 2 <= struck < 9
+
+
+def test_only_what_was_asked_to_stop_stops() -> None:
+    """Not an env that is being built or closed: that is no request, and has the number 0."""
+    _, trainer, worker = both_sides(3)
+    worker.begin(entry(0, 1, 0), 0)
+    assert worker.to_stop(0) == []
+    trainer.stop(2, 5)
+    assert worker.to_stop(0) == [2]
+    worker.begin(entry(5, 2, STEP), 0)
+    assert [worker.to_stop(0) for _ in range(2)] == [[2], [2]]
+    worker.begin(entry(0, 2, 0), 0)
+    assert worker.to_stop(0) == []
+    worker.begin(entry(6, 2, STEP), 0)
+    assert worker.to_stop(0) == []

@@ -226,7 +226,8 @@ class WorkerRings:
         found = [k for k, number in enumerate(stops) if number != self._stopped[k]]
         self._stopped = stops
         index = slot_of(current) - first_slot
-        if current and number_of(current) <= stops[index] and index not in found:
+        # An env that is being built or closed has the number 0, as if it were to be stopped.
+        if 0 < number_of(current) <= stops[index] and index not in found:
             found.append(index)
         return found
 
