@@ -17,6 +17,7 @@ import pytest
 from patience import HANG
 
 from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
+from rlightning_aio.envs.hardware import watched
 from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, RLightningError
 
 if TYPE_CHECKING:
@@ -271,6 +272,25 @@ def test_a_program_that_sends_no_action_in_time_stops_the_arm(
         batch, _ = group.reset()
         group.step(batch.respond(action=np.zeros((1, 2))))
     assert lines(log)[:4] == ["reset", "stop", "reset", "step [0.0, 0.0]"]
+
+
+class Slow:
+    """Two of them stop only at the same time."""
+
+    def __init__(self, both: threading.Barrier) -> None:
+        self.both, self.num_stops = both, 0
+
+    def stop(self) -> None:
+        self.both.wait(HANG)
+        self.num_stops += 1
+
+
+def test_envs_stop_at_the_same_time_and_at_least_once() -> None:
+    """Each takes some time, and what wants them to stop may be over before anybody looks."""
+    both = threading.Barrier(2)
+    envs: Any = [Slow(both), Slow(both)]
+    watched(lambda: True, lambda: envs).join(HANG)
+    assert [env.num_stops for env in envs] == [1, 1]
 
 
 @pytest.mark.parametrize("seconds", [0, -1, "1", None, float("inf")])

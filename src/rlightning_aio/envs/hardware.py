@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ACTION_TIMEOUT",
+    "begin_stops",
     "checked_input_of",
     "limit_actions",
     "stop",
@@ -50,6 +51,14 @@ def stop(env: BaseEnv) -> None:
         env.stop()
     except Exception:  # noqa: BLE001 - others must be stopped, too
         _log.exception("env %r could not be stopped", env.env_id)
+
+
+def begin_stops(envs: Iterable[BaseEnv]) -> list[Thread]:
+    """Stop `envs` at the same time, as a stop takes some time; return the threads that do it."""
+    threads = [Thread(target=stop, args=[env], name="stops hardware", daemon=True) for env in envs]
+    for thread in threads:
+        thread.start()
+    return threads
 
 
 def checked_input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
@@ -96,15 +105,17 @@ def watched(is_over: Callable[[], bool], due: Callable[[], Iterable[BaseEnv]]) -
     """Start a thread that stops envs, even while they are at work in another thread.
 
     Args:
-        is_over: ends the thread.
+        is_over: ends the thread, once those that are due then were stopped.
         due: returns the envs to stop now. One that is at work is returned until its work ends,
             as it may have begun to move after it was stopped.
     """
 
     def watch() -> None:
-        while not is_over():
-            for env in due():
-                stop(env)
+        while True:
+            for thread in begin_stops(due()):
+                thread.join()
+            if is_over():
+                return
             time.sleep(_LOOK_SECONDS)
 
     thread = Thread(target=watch, name="stops hardware", daemon=True)
@@ -122,7 +133,7 @@ def stopped_by_signals(envs: Iterable[BaseEnv]) -> Generator[None]:
     before: dict[int, Any] = {}
 
     def handle(number: int, frame: Any) -> None:
-        for env in list(envs):  # Each in a thread of its own, as a stop takes some time.
+        for env in list(envs):  # By itself, as only one is at work, and is stopped again and again.
             watched(is_over.is_set, lambda env=env: [env])
         before[number](number, frame)
 
@@ -154,7 +165,7 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
     if is_awaitable(env):
         raise ConfigError(f"{where}: an awaitable env can't have it")
     reset, step, close = env.reset, step_of(env), env.close
-    due, expired = math.inf, False
+    due, expired, is_closed = math.inf, False, False
 
     def timed_reset(**arguments: Any) -> Any:
         nonlocal due, expired
@@ -181,12 +192,12 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
         return [env]
 
     def timed_close() -> Any:
-        nonlocal due
-        due = -math.inf
+        nonlocal due, is_closed
+        due, is_closed = math.inf, True
         return close()
 
     changed: Any = env
     changed.reset, changed.step, changed.close = timed_reset, timed_step, timed_close
     if isinstance(env, FastPath):
         changed.bare_step = changed.bare_reset = lambda: None
-    watched(lambda: due == -math.inf, late)
+    watched(lambda: is_closed, late)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from threading import Thread
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 from weakref import WeakSet
 
@@ -21,8 +20,8 @@ from rlightning_aio._core.hosts.messages import (
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of
-from rlightning_aio._core.hosts.running.runner import attach_all, close_all
-from rlightning_aio.envs.hardware import stop, stopped_by_signals
+from rlightning_aio._core.hosts.running.runner import attach_all, close_all, stop_one
+from rlightning_aio.envs.hardware import stopped_by_signals
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.trees import copied
 
@@ -108,10 +107,7 @@ class InlineHost(Host):
 
     def stop(self, index: int, number: int) -> None:
         del number  # None is being executed now.
-        if index < len(self._runners):
-            # In a thread, as a stop takes some time, and other envs must stop, too.
-            env = self._runners[index].env
-            Thread(target=stop, args=[env], name="stops hardware", daemon=True).start()
+        stop_one(self._runners, index)
 
     def execute_next(self) -> bool:
         if not self._queue:

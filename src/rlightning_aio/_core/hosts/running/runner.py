@@ -29,7 +29,7 @@ from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.hardware import checked_input_of, stop
+from rlightning_aio.envs.hardware import begin_stops, checked_input_of, stop
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -64,6 +64,7 @@ __all__ = [
     "loaded",
     "placed",
     "seed_generators",
+    "stop_one",
 ]
 
 _log = logging.getLogger("rlightning_aio")
@@ -473,3 +474,9 @@ def disconnect_all(runners: Sequence[EnvRunner]) -> None:
     for runner in runners:
         with contextlib.suppress(Exception):
             runner.env.on_disconnect()
+
+
+def stop_one(runners: Sequence[EnvRunner], index: int) -> None:
+    """Begin to stop one of the envs of a host in this process, if it is built."""
+    for runner in runners[index : index + 1]:
+        begin_stops([runner.env])
