@@ -126,9 +126,8 @@ class Players:
         """Return True if all envs are gone, or left alone."""
         return self.entry_of.keys() <= self.gone | self.left_alone
 
-    def refusal(self) -> RLightningError:
-        """The error for attempts that only envs which are left alone could play."""
-        env_id = min(self.left_alone)
+    def refusal(self, env_id: str) -> RLightningError:
+        """The error for attempts that only an env which is left alone could play."""
         return RLightningError(
             f"env {env_id!r} was lost or has raised an error, and may move something real, so it "
             f"is reset only if you ask for it: group.reset(env_ids=[{env_id!r}]), and then play on"

@@ -355,7 +355,7 @@ class _Engine:
         if queue.free or self._source.is_at_end:
             return
         if queue.players.left_alone and queue.players.is_nobody_left():
-            raise queue.players.refusal()
+            raise queue.players.refusal(min(queue.players.left_alone))
         if not self._has_clients:
             raise queue.fault or RLightningError("no env of this group is left that could play")
 

@@ -167,6 +167,15 @@ class AttemptQueue:
             queue.extend(kept)
         return removed
 
+    def withdraw_all(self) -> list[Job]:
+        """Remove all attempts that wait, and return them."""
+        pinned = chain.from_iterable(queues.values() for queues in self._pinned.values())
+        queues = [*self._waiting.values(), *pinned]
+        removed = [*chain.from_iterable(queues)]
+        for queue in queues:
+            queue.clear()
+        return removed
+
     # -- what is played next ----------------------------------------------------------
 
     def next_env(self) -> str | None:
@@ -227,12 +236,15 @@ class AttemptQueue:
 
     # -- what has ended ---------------------------------------------------------------
 
-    def end(self, job: Job, attempt: Attempt) -> bool:
-        """Queue an attempt again that has failed, or note it; True if it is noted."""
+    def end(self, job: Job, attempt: Attempt, *, is_last: bool = False) -> bool:
+        """Queue an attempt again that has failed, or note it; True if it is noted.
+
+        It `is_last` if nobody could try it again.
+        """
         outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
         if job.task.is_settled:
             return False
-        if tries_again(self._rules, outcome, job.failures):
+        if not is_last and tries_again(self._rules, outcome, job.failures):
             job.failures.append(outcome)
             if is_of_env(outcome):
                 job.failed_on.add(outcome.env_id)
@@ -304,4 +316,4 @@ class AttemptQueue:
         players = self.players
         is_pinned = not players.left_alone.isdisjoint(self._pinned_to())
         if is_pinned or not players.can_play(self._entries(), alone=True):
-            raise players.refusal()
+            raise players.refusal(min(players.left_alone))

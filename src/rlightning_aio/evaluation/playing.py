@@ -18,7 +18,7 @@ import numpy as np
 
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents, readable, summed_rewards
-from rlightning_aio.errors import EnvFault, RLightningError, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
@@ -86,6 +86,7 @@ class PolicyPlay:
         """An episode of the queue is going on; False before the result of its reset."""
         self._reward = np.zeros(ends[-1])
         self._length = np.zeros(ends[-1], np.int64)
+        self._has_clients = len(group) > group.size()
         self._pending: set[str] = set()
         """Envs with a request in flight."""
         self._begun: set[str] = set()
@@ -105,7 +106,10 @@ class PolicyPlay:
             self._begin_episodes()
             self._queue.check_players()
             if not self._pending:
-                return self._found
+                if not len(self._queue):
+                    return self._found
+                self._end_waiting()
+                continue
             try:
                 batch: BatchedData
                 batch, _ = yield lambda: self._group.collect_async(
@@ -130,6 +134,8 @@ class PolicyPlay:
 
     def _begin_episodes(self) -> None:
         """Note ended episodes, and begin others in idle envs."""
+        if self._has_clients:
+            self._look()
         while True:
             while self._ended:
                 self._keep(*self._ended.popleft())
@@ -144,6 +150,29 @@ class PolicyPlay:
             except WorkerDied as fault:
                 self._note_fault(fault)
 
+    def _look(self) -> None:
+        """Look for clients that have come, come back or left."""
+        pending, plays = self._pending, self._plays
+        self._queue.look(one for one in self._places if one in pending or plays(one))
+
+    def _end_waiting(self) -> None:
+        """End what waits while no env plays: only envs that are not there could play it."""
+        self._look()
+        if self._queue.next_env() is not None:
+            return
+        players = self._queue.players
+        for job in self._queue.withdraw_all():
+            env_id = job.spec.env_id
+            alone = players.left_alone.intersection({env_id} if env_id else players.left_alone)
+            cause = "no client is there that could play it"
+            if alone:
+                cause = str(players.refusal(min(alone)))
+            outcome = Outcome("env_away", "infrastructure", cause, env_id)
+            if job.failures:  # Those say more.
+                outcome = job.failures.pop()
+            attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
+            self._keep(job, attempt, is_last=True)
+
     def _begin(self, env_id: str, job: Job) -> None:
         seed, options = job.spec.seed, self._queue.players.options(env_id, job.spec)
         seeds = None if seed is None else {env_id: seed - job.sub_env}
@@ -153,11 +182,11 @@ class PolicyPlay:
         if self._films is not None:
             self._films.begin(env_id, job)
 
-    def _keep(self, job: Job, attempt: Attempt) -> None:
+    def _keep(self, job: Job, attempt: Attempt, *, is_last: bool = False) -> None:
         """Note what came of an episode."""
         if self._films is not None and not attempt.outcome.is_failure:
             self._films.keep(attempt)
-        if not self._queue.end(job, attempt):
+        if not self._queue.end(job, attempt, is_last=is_last):
             return
         self._queue.flush()
         if attempt.outcome.is_failure and not self._has_warned:
@@ -332,10 +361,11 @@ class PolicyPlay:
     def _note_fault(self, fault: EnvFault) -> None:
         """Note the episodes that an error ended; envs that are not replaced leave."""
         struck, is_named = {fault.env_id}, fault.outcome.blame != "infrastructure"
+        if isinstance(fault, WorkerDied | EnvAway):
+            # The env at fault may be another one, whose own request a replacement answers.
+            struck = {*fault.env_ids} or struck
         if isinstance(fault, WorkerDied):
             self._queue.fault = fault
-            # The env at fault may be another one, whose own request a replacement answers.
-            struck = {*fault.env_ids}
             self._queue.players.refresh()
         self._pending -= struck
         gone = self._queue.players.gone
