@@ -25,6 +25,7 @@ from rlightning_aio.evaluation import (
     ResultsFile,
     evaluate,
 )
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -180,6 +181,30 @@ def test_an_episode_whose_env_raises_fails_after_some_attempts() -> None:
         assert one.outcome.cause == "ValueError: as asked"
     assert found.success is not None
     assert (found.success.count, found.failures) == (8, {"env_raised": 8})
+
+
+@pytest.mark.parametrize("deed", [RAISE, DIE])
+def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
+    deed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others go on; what only it could play has failed, and says what to do."""
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+    fields = {"env_kwargs": {"breaks": {"2": deed}}, "on_worker_death": "restart"}
+    fields |= {"placement": "process", "envs_per_process": 1}
+    queue = [EpisodeSpec("2", 0), *(EpisodeSpec("1", seed) for seed in range(8))]
+    with group_of(3, **fields) as group, group.auto_reset(100):
+        found = evaluate(group, nothing, queue, retries=0)
+        (failed,) = found.failed
+        assert failed.outcome.kind == ("env_raised" if deed == RAISE else "env_died")
+        assert failed.env_id not in {one.env_id for one in found.played}
+        group.reset()
+        pinned = [EpisodeSpec(task, 0, env_id="env-0") for task in "21"]
+        found = evaluate(group, nothing, [*pinned, *queue[1:]], retries=2)
+        assert {one.spec.task for one in found.failed} == {"1", "2"}
+        assert len(found.played) == 8
+        causes = {one.spec.task: one.outcome.cause for one in found.failed}
+        assert "group.reset(env_ids=['env-0'])" in causes["1"]
+        assert not any(one.failures for one in found.attempts)
 
 
 def test_an_episode_whose_worker_always_ends_fails() -> None:

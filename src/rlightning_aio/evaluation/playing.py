@@ -338,7 +338,8 @@ class PolicyPlay:
 
     def _release(self, env_id: str) -> None:
         """Let an env begin other episodes if it plays none."""
-        if not self._plays(env_id) and env_id not in self._queue.players.gone:
+        players = self._queue.players
+        if not self._plays(env_id) and env_id not in players.gone | players.left_alone:
             self._queue.free[env_id] = None
 
     # -- faults -----------------------------------------------------------------------
@@ -356,6 +357,7 @@ class PolicyPlay:
             self._films.drop(env_id)
         for sub_env in range(len(self._places[env_id])):
             self._end(env_id, sub_env, outcome)
+        self._queue.players.note(replace(outcome, env_id=env_id))
         self._release(env_id)
 
     def _note_fault(self, fault: EnvFault) -> None:
