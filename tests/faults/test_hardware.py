@@ -16,7 +16,16 @@ import numpy as np
 import pytest
 from patience import HANG
 
-from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
+from rlightning_aio import (
+    ENVS,
+    BaseEnv,
+    BatchedData,
+    EnvConfig,
+    EnvRet,
+    PolicyResponse,
+    build_env_group,
+    sync,
+)
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, RLightningError
 
@@ -195,6 +204,33 @@ def test_an_arm_stops_when_the_group_refuses_its_batch(
             group.step(BatchedData(["arm-0"], [PolicyResponse("arm-0", np.zeros(2))]))
         group.reset()
     assert lines(log).count("reset") == 2
+
+
+class AwaitableArm(Arm):
+    """An arm whose methods are coroutine functions."""
+
+    async def reset(self, **arguments: Any) -> EnvRet:  # type: ignore[override]
+        return super().reset(**arguments)
+
+    async def step(self, policy_resp: PolicyResponse) -> EnvRet:  # type: ignore[override]
+        return super().step(policy_resp)
+
+
+@pytest.mark.parametrize("placement", ["process", "loop"])
+async def test_an_awaitable_arm_stops_when_the_group_refuses_its_batch(
+    arm: Any, log: Path, placement: str
+) -> None:
+    ENVS.register("test arm", hardware=True)(AwaitableArm)
+    async with build_env_group(arm(placement)) as group:
+        await group.reset()
+        with pytest.raises(BadAction):
+            await group.step(refused_batches()["NaN"]())
+        wait_for(log, "stop")
+
+
+def test_an_actor_of_ray_gets_no_arm(arm: Any) -> None:
+    with pytest.raises(ConfigError, match=r"placement: an actor of Ray can't be told to stop"):
+        sync.build_env_group(arm("ray"))
 
 
 @pytest.mark.parametrize("columns", [None, np.zeros((0, 2)), np.zeros((2, 2))])

@@ -139,6 +139,15 @@ def _check_task(config: EnvConfig) -> str | None:
     return None
 
 
+def _check_placement(config: EnvConfig) -> str | None:
+    if config.placement == "ray" and ENVS.is_hardware(config.backend):
+        return (
+            f"an actor of Ray can't be told to stop what backend {config.backend!r} moves while it "
+            "is at work; use placement: process, or a client of an env_server on another machine"
+        )
+    return None
+
+
 def _check_num_envs(config: EnvConfig) -> str | None:
     backend = None if ENVS.registered(config.backend) else ENVS.described(config.backend)
     if config.num_envs == 1 or backend is None or backend.vectorized:
@@ -170,6 +179,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,
     "env_kwargs": _check_env_kwargs,
+    "placement": _check_placement,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "on_env_error": _check_on_env_error,

@@ -177,6 +177,8 @@ class Host(Protocol):
         Args:
             index: of the env, which is hardware, in this host.
             number: of its current or last request; later ones may move it again.
+
+        An actor of Ray can't, so the config refuses hardware there.
         """
 
     def processor_ns(self) -> int | None:

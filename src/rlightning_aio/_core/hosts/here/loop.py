@@ -16,7 +16,7 @@ from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import Built, Closed, Reported, Result
-from rlightning_aio._core.hosts.running.runner import attach_all
+from rlightning_aio._core.hosts.running.runner import attach_all, stop_one
 from rlightning_aio.protocol.rings import WorkerBell, bell_size
 from rlightning_aio.trees import copied
 
@@ -102,6 +102,10 @@ class LoopHost(Host):
         """End requests by a cancellation of what their envs await; see `base.Host.abort`."""
         for entry in entries.tolist():
             self._envs.abort(entry)
+
+    def stop(self, index: int, number: int) -> None:
+        del number  # No code of an env is being executed now.
+        stop_one(self._envs.runners, index)
 
     # -- completions --------------------------------------------------------------
 
