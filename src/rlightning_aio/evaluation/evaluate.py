@@ -97,9 +97,8 @@ def evaluate(
         min_results: results to wait for; None is half of the envs.
         retries: how often an episode is played again that was lost with its worker or by an
             exception, unless policy or caller alone are to blame: with its seed, and by any env
-            that may play it. It isn't counted if another env of the worker is at fault. After that
-            it has failed, and the others are played. What moves something real plays nothing more
-            after a loss: only you reset it.
+            that may play it; not counted if another env of the worker is at fault. After that it
+            has failed. After a loss, what moves something real plays no more: only you reset it.
         results: the file to save episodes in; those that it has are not played again. One file for
             each `seed`, since episodes without a seed are only known by their number.
         video: folder for films of the first episode of each task, which is asked for a frame by
