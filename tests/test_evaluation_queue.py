@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 from collections import Counter
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,6 +20,7 @@ from kit.scripted import DIE, GO, HANG, RAISE, Awaitable, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.attempts import file
 from rlightning_aio.evaluation import (
     EpisodeSpec,
     Evaluation,
@@ -403,6 +405,45 @@ def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
         assert not found.failures
     with ResultsFile(tmp_path / "results.jsonl") as results:
         assert len(results) == 12
+
+
+class Later(Executor):
+    """Writes when somebody waits for it."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        class Written(Future[Any]):
+            def result(self, timeout: float | None = None) -> Any:
+                if not self.done():
+                    self.set_result(fn(*args, **kwargs))
+                return super().result(timeout)
+
+        return Written()
+
+
+def test_what_was_added_just_before_an_evaluation_is_not_played_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(file, "new_writer", Later)
+    spec = EpisodeSpec("1", 0)
+    (played,) = evaluated(group_of(), [spec]).attempts
+    with ResultsFile(tmp_path / "results.jsonl") as results:
+        results.add(replace(played, length=77))
+        (found,) = evaluated(group_of(), [spec], results=results).attempts
+    assert found.length == 77
+
+
+def test_a_line_that_can_not_be_made_is_an_error(tmp_path: Path) -> None:
+    """Not of the kind that a full disk is."""
+    (played,) = evaluated(group_of(), [EpisodeSpec("1", 0)]).attempts
+    nested: list[Any] = []
+    for _ in range(100_000):
+        nested = [nested]
+    results = ResultsFile(tmp_path / "results.jsonl")
+    results.add(replace(played, result=nested))
+    with pytest.raises(rl.ConfigError, match=r"results\.jsonl.*RecursionError"):
+        results.flush()
+    with pytest.raises(rl.ConfigError, match="RecursionError"):
+        results.close()
 
 
 def test_a_file_whose_first_line_was_cut_is_begun_again(tmp_path: Path) -> None:

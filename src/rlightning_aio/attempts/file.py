@@ -173,11 +173,12 @@ class ResultsFile:
                 write(what)
             except ConfigError as error:
                 self._error = error
+            except Exception as error:  # noqa: BLE001  # The next call raises it.
+                self._error = ConfigError(f"{self._name}: a line can't be written: {error!r}")
+                self._error.__cause__ = error
 
     def _add(self, attempt: Attempt) -> None:
-        start, length = self._write(attempt.to_json())
-        place = attempt.spec.key, attempt.index, attempt.sub_env
-        self._lines[place] = _Line(start, length, is_final(attempt.outcome))
+        self._keep(attempt, *self._write(attempt.to_json()))
 
     def _check(self) -> None:
         if self._error is not None:
@@ -235,7 +236,9 @@ class ResultsFile:
         if _HANDED_OUT in row:
             self._handed_out.add(spec_of(row[_HANDED_OUT]).key)
             return
-        attempt = attempt_of(row)
+        self._keep(attempt_of(row), start, length)
+
+    def _keep(self, attempt: Attempt, start: int, length: int) -> None:
         place = attempt.spec.key, attempt.index, attempt.sub_env
         self._lines[place] = _Line(start, length, is_final(attempt.outcome))
 

@@ -92,6 +92,7 @@ class AttemptQueue:
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
         self._rules, self._results = rules, results
+        self.flush()  # Else a line may be missing that was added just before.
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
         self.fault: WorkerDied | None = None
