@@ -22,8 +22,6 @@ from rlightning_aio.trees import Tree, index, mapped
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["BY_ROW", "ResultColumns"]
-
 # Offset of the monotonic clock, which stamps results, from the epoch.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 

@@ -40,22 +40,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.batch.sent import Sources
 
-__all__ = [
-    "BatchedData",
-    "Origin",
-    "answer_of",
-    "batch_of_results",
-    "columns_of_responses",
-    "has_ended",
-    "names_of",
-    "origin_of",
-    "parts_of",
-    "plain_columns",
-    "slots_of",
-    "sources_of",
-    "with_repeats",
-]
-
 _MISSING: Any = object()
 _ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
 """The end of an env's id: its number in the entry, and the name of a place."""

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["all_agents", "outcomes_of", "summed_rewards"]
-
 
 class Endings(Protocol):
     """The columns of a batch that say how episodes ended."""

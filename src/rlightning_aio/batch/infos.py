@@ -20,15 +20,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.protocol.info import InfoSchema
 
-__all__ = [
-    "columns_of_infos",
-    "info_list_of_rows",
-    "infos_of_each",
-    "infos_of_rows",
-    "listed",
-    "vector_infos",
-]
-
 
 def vector_infos(infos: Sequence[Mapping[Any, Any]]) -> dict[Any, Any]:
     """Convert `infos` to columns: a typed array for each key, and a mask ``_key``.

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = ["joined"]
-
 
 def joined(batches: Sequence[BatchedData]) -> BatchedData:
     """Concatenate the results of several batches of one group.

@@ -24,17 +24,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = [
-    "column_of_parts",
-    "in_order",
-    "infos_of_parts",
-    "observations_of_parts",
-    "reported_infos_of_parts",
-    "rows_in_order",
-    "shapes",
-    "taken_parts",
-]
-
 T = TypeVar("T")
 
 

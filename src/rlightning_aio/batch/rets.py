@@ -12,8 +12,6 @@ from rlightning_aio.types import EnvRet, MultiAgentEnvRet, unchecked
 if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = ["rets_of"]
-
 _FIELDS: Final = (
     "env_id",
     "observation",

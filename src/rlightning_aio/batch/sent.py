@@ -20,16 +20,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import PolicyResponse
 
-__all__ = [
-    "UNASKED",
-    "Sent",
-    "Sources",
-    "columns_of_values",
-    "copied",
-    "joined_sources",
-    "taken_sources",
-]
-
 UNASKED: Final = -1
 """The row of a result that answers no response."""
 

@@ -12,15 +12,6 @@ from rlightning_aio.trees import as_array, key_of, zipped
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "columns_where_possible",
-    "concatenated",
-    "differing",
-    "form_of",
-    "plain_numbers",
-    "stacked_values",
-]
-
 _PLAIN: Final = (int, float, bool)
 
 

@@ -17,15 +17,6 @@ from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-__all__ = [
-    "Entry",
-    "check_entry",
-    "check_imports",
-    "check_installed",
-    "check_names",
-    "runs_here",
-]
-
 
 @dataclass(slots=True)
 class Entry:

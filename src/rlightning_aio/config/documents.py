@@ -18,8 +18,6 @@ from rlightning_aio.config.problems import Problems, as_text, explained, unknown
 from rlightning_aio.config.yaml_files import TOP_LEVEL, imports_above, plain, read_yaml, sections
 from rlightning_aio.errors import ConfigError
 
-__all__ = ["load_config", "parse_configs"]
-
 _OF_ENTRIES = EnvConfig.model_fields.keys() - {"imports"}
 """Keys of an entry that a document of entries has not."""
 _TYPO = 0.8

@@ -19,14 +19,6 @@ from pydantic import (
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
 from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, is_mujocos, name_of, placement_of
 
-__all__ = [
-    "MADE_BY_GYMNASIUM",
-    "EnvConfig",
-    "completed",
-    "makers_of",
-    "moved",
-]
-
 MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
 """Backends whose `env_kwargs` go to `gymnasium.make`."""
 

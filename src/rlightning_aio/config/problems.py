@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 
     from pydantic_core import ErrorDetails
 
-__all__ = ["Problems", "as_text", "explained", "unknown_field"]
-
 
 @dataclass(slots=True)
 class Problems:

@@ -15,8 +15,6 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["TOP_LEVEL", "imports_above", "plain", "read_yaml", "sections"]
-
 TOP_LEVEL = ("envs", "env", "imports")
 """Sections of a file that are read."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.trees import Path
 
-__all__ = ["out_of_bounds"]
-
 _NUMBERS = (np.ndarray, np.generic, int, float)
 
 

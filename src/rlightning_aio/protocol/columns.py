@@ -25,24 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.trees import Node, Tree
 
-__all__ = [
-    "Leaf",
-    "Misfit",
-    "Rows",
-    "assemble",
-    "check_keys",
-    "fitted",
-    "fitted_tree",
-    "gather",
-    "is_array",
-    "leaf_of",
-    "leaves",
-    "out_of_range",
-    "row_reader",
-    "row_writer",
-    "structure",
-]
-
 Rows: TypeAlias = "slice | NDArray[np.intp]"
 """A selection of rows: a slice for a contiguous range, else an index array."""
 

@@ -15,25 +15,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "ANSWERS_WITH_VALUE",
-    "NUMBER_SHIFT",
-    "OP_BITS",
-    "OP_BITS_ARRAY",
-    "OP_MASK",
-    "RENEW",
-    "SLOT_MASK",
-    "SLOT_MASK_ARRAY",
-    "WITHOUT_OP",
-    "Operation",
-    "answers_with_value",
-    "entry",
-    "number_of",
-    "op_of",
-    "slot_of",
-    "slots_of",
-]
-
 
 class Operation(IntEnum):
     """The kind of a request.

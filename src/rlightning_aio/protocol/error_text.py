@@ -9,8 +9,6 @@ from typing import Any, Final
 from rlightning_aio.outcomes import BLAMES
 from rlightning_aio.protocol.entries import answers_with_value
 
-__all__ = ["ErrorText"]
-
 
 @dataclass(frozen=True)
 class ErrorText:

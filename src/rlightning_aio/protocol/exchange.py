@@ -38,45 +38,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = [
-    "ARMED",
-    "AT_LAST",
-    "BUSY",
-    "CAREFUL",
-    "CURRENT",
-    "CURRENT_SINCE_NS",
-    "FEW_NUMBERS",
-    "FRAMES_SEEN",
-    "FRAMES_TO_TRAINER",
-    "FRAMES_TO_WORKER",
-    "GOAL_MASK",
-    "GOAL_SHIFT",
-    "IN_ORDER",
-    "LINE",
-    "NUM_COUNTS",
-    "REPORTED",
-    "REQUESTS_SENT",
-    "SEEN",
-    "SENT",
-    "SETTLED",
-    "TAKEN",
-    "WORKER_ASLEEP",
-    "Ring",
-    "Row",
-    "WorkerSide",
-    "arm",
-    "complete",
-    "gather",
-    "is_due",
-    "new_fence",
-    "row_step",
-    "serve",
-    "submit",
-    "sum_of_squares",
-    "take",
-    "unpacked",
-]  # fmt: skip
-
 LINE: Final = 8
 """Words of a cache line."""
 IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")

@@ -13,8 +13,6 @@ import struct
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = ["BELL", "CHUNK_BYTES", "HEADER", "Frame", "FrameKind", "FrameReader", "encode"]
-
 HEADER: Final = struct.Struct("<IIq")
 
 

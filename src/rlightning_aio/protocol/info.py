@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = [
-    "INFO_BYTES",
-    "INFO_BYTES_OF_SUB_ENV",
-    "NO_INFO",
-    "PICKLED",
-    "InfoSchema",
-    "InfoWriter",
-    "has_mask",
-    "is_mask",
-]
-
 INFO_BYTES: Final = 512
 """Space for infos in a row; the minimum for rows with sub-environments."""
 INFO_BYTES_OF_SUB_ENV: Final = 128

@@ -16,20 +16,6 @@ from rlightning_aio.protocol import exchange
 if TYPE_CHECKING:
     from types import ModuleType
 
-__all__ = [
-    "VARIABLE",
-    "arm",
-    "compiled",
-    "complete",
-    "gather",
-    "is_due",
-    "row_step",
-    "select",
-    "selected",
-    "serve",
-    "submit",
-]
-
 VARIABLE: Final = "RLIGHTNING_AIO_IMPL"
 """The environment variable that names an implementation."""
 _FUNCTIONS: Final = ("arm", "complete", "gather", "is_due", "row_step", "serve", "submit")

@@ -18,8 +18,6 @@ import cloudpickle
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["CodePickler", "dumped", "dumped_with_code"]
-
 
 _REDUCERS: Final[Any] = cloudpickle.Pickler.dispatch_table
 

@@ -54,9 +54,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-
-__all__ = ["TrainerBell", "TrainerRings", "WorkerBell", "WorkerRings", "bell_size", "rings_size"]
-
 _WORDS: Final = 5 * LINE
 _COUNTERS: Final = LINE
 _EPOCH_SHIFT: Final = 55

@@ -26,18 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.trees import Tree
     from rlightning_aio.types import EnvMeta
 
-__all__ = [
-    "AS_BEFORE",
-    "IS_RESET",
-    "NO_SEED",
-    "OVER",
-    "TERMINATED",
-    "TRUNCATED",
-    "RowLayout",
-    "Slab",
-    "rows_for",
-]
-
 NO_SEED: Final = -1
 AS_BEFORE: Final = -2
 """In place of a seed: those of the last reset, and its options, where the env knows them."""

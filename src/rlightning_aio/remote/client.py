@@ -70,8 +70,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.net.client_session import Event
 
-__all__ = ["RemoteEnvClient", "is_address"]
-
 _SECONDS_BETWEEN_ATTEMPTS: Final = (0.1, 5.0)
 """The first pause, and the longest. Each attempt doubles it, until a server requests something."""
 _ATTEMPT_SECONDS: Final = 3 * HANDSHAKE_SECONDS

@@ -33,16 +33,6 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Sequence
 
-__all__ = [
-    "ClientKeys",
-    "ListedKeys",
-    "ServerKeys",
-    "make_keys",
-    "read_client_keys",
-    "read_public_key",
-    "read_server_keys",
-]
-
 _PUBLIC_SUFFIX: Final = ".key"
 _SERVER: Final = "server"
 _CLIENT: Final = "client"

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.net.wire import Part
 
-__all__ = ["is_readable", "next_frame", "next_message", "receive_parts", "send_parts"]
-
 _COPIED_BYTES: Final = 4096
 # Plain ints: an operation on an enum costs as much as the call itself.
 _LAST: Final = int(zmq.NOBLOCK)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Driver, Shared
     from rlightning_aio._core.hosts.messages import Completion, Completions
 
-__all__ = ["Tables"]
-
 
 @dataclass(frozen=True)
 class Tables:

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = ["KEPT", "Trace"]
-
 KEPT: Final = 1 << 18
 """The number of results that are kept, and of slices of the trainer."""
 _TRAINER: Final = 1

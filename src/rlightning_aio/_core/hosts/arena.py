@@ -15,8 +15,6 @@ from typing import Final
 
 from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 
-__all__ = ["Arena", "make_private", "map_shared"]
-
 _MAP_FIXED: Final = 0x10
 
 

@@ -27,18 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.rings import TrainerBell
     from rlightning_aio.types import EnvMeta
 
-__all__ = [
-    "Driver",
-    "Executing",
-    "Host",
-    "HostFactory",
-    "Killable",
-    "SelfStarting",
-    "Server",
-    "Source",
-    "Wiring",
-]
-
 T = TypeVar("T")
 
 

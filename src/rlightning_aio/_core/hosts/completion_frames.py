@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import Completion
 
-__all__ = ["SENDER", "completion_in", "frame_of"]
-
 SENDER: Final = 0
 """The host of completions that travel in frames; the trainer's end knows which it is."""
 

@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Final, cast
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["READABLE", "WRITABLE", "Inbox", "WakeUp", "new_descriptor_set"]
-
 # The numbers that epoll has; those of selectors are different.
 READABLE: Final = select.POLLIN if hasattr(select, "epoll") else selectors.EVENT_READ
 WRITABLE: Final = select.POLLOUT if hasattr(select, "epoll") else selectors.EVENT_WRITE

@@ -10,15 +10,6 @@ from rlightning_aio.protocol.entries import Operation
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = [
-    "AWAITED_CLOSE_SECONDS",
-    "RestartPolicy",
-    "close_seconds",
-    "hung",
-    "limits_of",
-    "restart_pause",
-]
-
 AWAITED_CLOSE_SECONDS: Final = 10.0
 """How long awaitable envs may take to close, where their entry doesn't say."""
 _CLOSE_SECONDS: Final = 1.5

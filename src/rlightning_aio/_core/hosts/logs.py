@@ -13,8 +13,6 @@ import sys
 from dataclasses import dataclass
 from typing import Final, TextIO
 
-__all__ = ["LogSettings", "log_like", "log_settings"]
-
 _PLAIN: Final = logging.Formatter(logging.BASIC_FORMAT)
 
 

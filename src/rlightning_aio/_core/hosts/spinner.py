@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Spinner"]
-
 _LIMIT_SECONDS: Final = 400e-6
 # A yield takes half a microsecond if no other process wants the core.
 _YIELD_SECONDS: Final = 10e-6

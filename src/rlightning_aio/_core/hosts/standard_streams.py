@@ -9,8 +9,6 @@ import os
 import sys
 from typing import Final, TextIO
 
-__all__ = ["occupy_standard_streams", "stdout_set_aside"]
-
 _STDOUT: Final = 1
 _STDERR: Final = 2
 

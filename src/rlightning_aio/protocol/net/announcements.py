@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.net.wire import ClientHello
 
-__all__ = ["Announcement", "ClientKind", "Rejection", "announced"]
-
 
 class Rejection(Exception):
     """A reason to refuse a client; `retry` if the same hello may succeed later."""

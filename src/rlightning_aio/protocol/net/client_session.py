@@ -43,16 +43,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = [
-    "ClientSession",
-    "Ended",
-    "Phase",
-    "Refused",
-    "ResetRequest",
-    "StepRequest",
-    "Welcomed",
-]
-
 _MAX_TEXT: Final = 50_000
 _LATEST_NS: Final = 2**63 - 1
 

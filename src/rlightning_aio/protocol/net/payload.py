@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.net.wire import Compression
 
-__all__ = ["MAX_HEAD", "Packed", "ResultFields", "ResultLayout", "SpaceLayout"]
-
 MAX_HEAD = 1 << 20
 """Rewards of one result."""
 

@@ -47,8 +47,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.announcements import Announcement, ClientKind
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["ClientPlace", "OutgoingMessage", "PlaceEvents", "RemoteResult", "ServerSessions"]
-
 _MAX_REFUSED: Final = 8
 """Refusals that an error repeats."""
 

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["UnsupportedSpace", "describe", "space_from"]
-
 _MAX_DEPTH: Final = 16
 _MAX_MEMBERS: Final = 256
 _MAX_AXES: Final = 32

@@ -11,8 +11,6 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-__all__ = ["LOG", "in_lines", "in_one_line"]
-
 LOG: Final = logging.getLogger("rlightning_aio.remote")
 _ONE_LINE: Final = 1000
 _LINES: Final = 100_000

@@ -23,38 +23,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = [
-    "DEFAULT_HEARTBEAT",
-    "DTYPES",
-    "HANDSHAKE_SECONDS",
-    "HARDWARE_HEARTBEAT",
-    "MAX_FRAME_BYTES",
-    "MAX_HEADER_BYTES",
-    "MAX_HELLO_BYTES",
-    "MAX_NAME_LENGTH",
-    "MAX_PARTS",
-    "VERSION",
-    "ArrayForm",
-    "Bye",
-    "ClientHello",
-    "ClientResult",
-    "Compression",
-    "Failure",
-    "FromClient",
-    "FromServer",
-    "Part",
-    "Reader",
-    "Refusal",
-    "Reset",
-    "Step",
-    "Untransferable",
-    "Welcome",
-    "WireError",
-    "Writer",
-    "ping_ms",
-    "portable",
-]
-
 VERSION: Final = 3
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_HELLO_BYTES: Final = 256 << 10

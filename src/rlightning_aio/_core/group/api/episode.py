@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["Agents", "EnvEpisode"]
-
 
 class Agents:
     """`AgentSteps` of one group, on its event loop."""

@@ -31,18 +31,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
 
-__all__ = [
-    "AutoResetContext",
-    "Facade",
-    "default_min_results",
-    "ensure_auto_reset",
-    "is_lost",
-    "is_resettable",
-    "only_result",
-    "response_to",
-    "steps_of",
-]
-
 
 _log = logging.getLogger("rlightning_aio")
 _NOT_CLOSED: Final = ("TimeoutError", "WorkerDied")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import PolicyResponse
 
-__all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandle"]
-
 E = TypeVar("E", bound="EnvHandleInterface")
 
 

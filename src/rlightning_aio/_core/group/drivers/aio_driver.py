@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure, Wait
     from rlightning_aio._core.hosts.base import Source
 
-__all__ = ["AioDriver"]
-
 T = TypeVar("T")
 
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.hosts.base import Source
 
-__all__ = ["SyncDriver", "press_again"]
-
 T = TypeVar("T")
 A = TypeVarTuple("A")
 

@@ -18,19 +18,6 @@ from rlightning_aio.errors import RLightningError
 if TYPE_CHECKING:
     from collections.abc import Callable, Sized
 
-__all__ = [
-    "LONGEST_SECONDS",
-    "TURN",
-    "GroupDriver",
-    "Patient",
-    "Procedure",
-    "Scope",
-    "Wait",
-    "earliest",
-    "forked_from",
-    "this_process",
-]
-
 T = TypeVar("T")
 LONGEST_SECONDS: Final = 1e5
 

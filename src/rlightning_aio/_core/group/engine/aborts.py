@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Aborts"]
-
 _WHY: Final = Loss("was aborted", "cancelled", "caller")
 
 

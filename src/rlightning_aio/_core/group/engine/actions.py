@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["OutOfBandSteps", "number_limits", "write_actions", "write_column"]
-
 
 @dataclass(frozen=True, slots=True)
 class OutOfBandSteps:

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["AgentStep", "AgentSteps", "EpisodeStart", "MethodCall", "StepEnd"]
-
 _MANY: Final = 400
 """With this number of steps outstanding, several end in a hundredth of the time of one."""
 _SHARE: Final = 0.01

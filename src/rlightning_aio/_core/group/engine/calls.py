@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Calls", "values_of"]
-
 Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
 """Name of a method and its arguments."""
 

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Core"]
-
 
 class Core:
     """The operations of an `EnvGroup`, by its names; others are those of `steps` and `calls`.

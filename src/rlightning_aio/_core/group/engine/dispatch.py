@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Dispatch", "Packed"]
-
 Packed: TypeAlias = "tuple[NDArray[np.intp], list[Any]]"
 """Positions in a batch of steps, and for each the packed arguments that go out of band."""
 

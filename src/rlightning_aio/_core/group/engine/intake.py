@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault, EnvRaised
     from rlightning_aio.outcomes import Blame
 
-__all__ = ["Intake"]
-
 _ASKED_AGAIN: Final = (int(Operation.STEP), int(Operation.RESET))
 
 

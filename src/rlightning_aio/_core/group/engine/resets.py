@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Resets"]
-
 
 class Resets:
     """See the module; the arguments are the group's parts."""

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.trees import Tree
 
-__all__ = ["Results"]
-
 _Chosen: TypeAlias = "tuple[Slab, NDArray[np.intp], NDArray[np.intp] | None]"
 """A slab, slots whose rows it has, and their positions in a batch; None for 0, 1, 2, …"""
 

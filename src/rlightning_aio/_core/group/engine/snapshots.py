@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import EnvState
 
-__all__ = ["Snapshots"]
-
 
 class Snapshots:
     """See the module; the arguments are the group's parts."""

@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
 
-__all__ = ["CollectRules", "Flags", "Steps"]
-
 _STEP: Final = int(Operation.STEP)
 Flags: TypeAlias = "list[bool]"
 

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Host, Server
     from rlightning_aio.protocol.rings import TrainerBell
 
-__all__ = ["REPLIES", "Poller", "Waiting"]
-
 REPLIES: Final = Wait()
 """What `Waiting.serve` waits for where its work has nothing else to wait for."""
 

@@ -30,19 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.outcomes import Loss
 
-__all__ = [
-    "LEGAL",
-    "Episodes",
-    "LossEvent",
-    "LossPhase",
-    "Position",
-    "Report",
-    "Seeds",
-    "as_int",
-    "checked_seed",
-    "seeds_for",
-]
-
 _NO_LIMIT: Final = 1 << 62
 
 

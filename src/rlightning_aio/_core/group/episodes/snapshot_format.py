@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["EnvSnapshot", "check_same", "identity_of", "pack", "unpack"]
-
 _BEGINNING: Final = b"rlightning-aio snapshot 1\n"
 _DIGEST: Final = hashlib.sha256
 _START: Final = len(_BEGINNING) + _DIGEST().digest_size

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Driver
     from rlightning_aio._core.hosts.messages import StartOrder
 
-__all__ = ["assemble"]
-
 
 def assemble(plan: Plan, driver: Driver, *, shares_thread: bool) -> Core:
     """Create the core of a group and its hosts, without starting anything.

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import HostFactory
     from rlightning_aio.registry import Placement
 
-__all__ = ["Plan", "PreprocessFn", "host_class", "placement_for", "plan_group"]
-
 PreprocessFn = Callable[[PolicyResponse], Any]
 
 

@@ -17,8 +17,6 @@ from rlightning_aio.registry import ENVS, load
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["nums_hosts", "start_orders"]
-
 Share: TypeAlias = "list[tuple[int, PreprocessFn | None]]"
 """The envs of a host: their positions in the entry, and their preprocess functions."""
 

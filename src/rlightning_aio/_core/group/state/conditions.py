@@ -18,22 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = [
-    "BESIDE_ROWS",
-    "CLIENTS",
-    "CLOSED",
-    "DEATH",
-    "FAULT",
-    "LOST_EPISODE",
-    "NO_SPAN",
-    "OF_HOSTS",
-    "UNLIKE_ENVS",
-    "Conditions",
-    "Lifetime",
-    "Observed",
-    "Observer",
-]
-
 CLOSED: Final = 1 << 0
 """The group is not open: before `init`, and after `close`."""
 UNLIKE_ENVS: Final = 1 << 1

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import ClientTraits, EnvMeta
 
-__all__ = ["EnvTable"]
-
 
 class EnvTable:
     """Arrays over the envs of a group.

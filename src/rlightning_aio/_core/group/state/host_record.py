@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.outcomes import Loss
 
-__all__ = ["HostLoss", "HostRecord", "Stage", "last_lines"]
-
 
 class Stage(Enum):
     """The stage of a host in its life."""

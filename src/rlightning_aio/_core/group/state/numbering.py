@@ -18,8 +18,6 @@ from rlightning_aio.protocol.entries import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Numbering"]
-
 _OP: Final = np.array(OP_MASK)
 _NEXT: Final = {op: np.array((1 << NUMBER_SHIFT) + op) for op in map(int, Operation)}
 """Numbers to add to an entry without an operation."""

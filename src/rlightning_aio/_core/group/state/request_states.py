@@ -5,8 +5,6 @@ from __future__ import annotations
 from enum import Enum, IntEnum, auto
 from typing import Final
 
-__all__ = ["COLLECTOR", "LEGAL", "NOBODY", "Event", "Owner", "State"]
-
 
 class State(IntEnum):
     """State of a slot's request."""

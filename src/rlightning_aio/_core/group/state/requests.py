@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.rings import TrainerBell
 
-__all__ = ["CollectorQueue", "Requests", "Ticket", "Tickets"]
-
 
 # Plain ints: NumPy takes several times as long over members of an enum.
 _IDLE_CODE, _BUSY_CODE, _READY_CODE, _SPENT_CODE = map(int, State)

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.columns import Rows
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["SlabLayout", "check_actions", "rows_in"]
-
 
 def rows_in(layout: SlabLayout, slots: NDArray[np.intp], everyone: NDArray[np.intp]) -> Rows:
     """The rows of `slots` in the only slab; a slice if `slots` is the array `everyone`."""

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio.batch.columns import ResultColumns
 
-__all__ = ["Sums"]
-
 _MOST_ROWS: Final = 1 << 12
 """The number of results that are added at once: their columns still fit into a core's cache."""
 _LEAST_ROWS: Final = 16

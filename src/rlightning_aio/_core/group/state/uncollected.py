@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.conditions import Conditions
     from rlightning_aio.errors import EnvFault
 
-__all__ = ["UncollectedErrors"]
-
 # Plain ints: NumPy takes several times as long over members of an enum.
 _IDLE_CODE: Final = int(State.IDLE)
 _SPENT_CODE: Final = int(State.SPENT)

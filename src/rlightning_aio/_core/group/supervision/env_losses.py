@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvRaised
     from rlightning_aio.outcomes import Loss
 
-__all__ = ["EnvLosses"]
-
 _ERRORS: Final[dict[str, type[EnvFault]]] = {"env_hung": EnvHung, "env_away": EnvAway}
 """By the kind of an outcome; others are `WorkerDied`."""
 

@@ -27,16 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Death, ErrorText
     from rlightning_aio.errors import EnvFault
 
-__all__ = [
-    "CrashLog",
-    "cause_of",
-    "culprit_of",
-    "host_loss",
-    "late_fault",
-    "start_fault",
-    "without_terminal",
-]
-
 _LINES: Final = 3
 _EVERY: Final = 100
 

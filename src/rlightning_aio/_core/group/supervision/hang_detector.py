@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["HangDetector", "read_news"]
-
 _ABORT_SECONDS: Final = 0.2
 """Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
 _LOOKS: Final = 4

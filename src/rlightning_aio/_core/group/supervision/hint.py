@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["LAST_LOOK", "Advice", "Hint", "advice"]
-
 _FIRST_LOOK: Final = 8
 """Number of batches after which envs are past their first steps, which may compile and load."""
 LAST_LOOK: Final = 1024

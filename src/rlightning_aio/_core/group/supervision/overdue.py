@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Overdue"]
-
 OWED_SECONDS = 60.0
 
 _log = logging.getLogger("rlightning_aio")

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Taken
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Places"]
-
 
 class Places:
     """See the module.

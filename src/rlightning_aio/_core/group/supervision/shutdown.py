@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Shutdown"]
-
 _KILL_SECONDS: Final = 0.3
 """Limit for a kill to be reported."""
 _END_SECONDS: Final = 1.5

@@ -63,8 +63,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Taken
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
-
 LOOK_SECONDS: Final = 0.02
 """Interval of checks in a trainer that never has to wait."""
 _DUMP_SECONDS: Final = 1.0

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
 
-__all__ = ["Workers"]
-
 _MOST_LISTED: Final = 8
 _STATES: Final = {
     Stage.NEW: "new",

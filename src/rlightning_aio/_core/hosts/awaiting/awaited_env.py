@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
-__all__ = ["CANCEL_SECONDS", "AwaitedEnv", "Then", "end_all", "reraise"]
-
 CANCEL_SECONDS: Final = 0.4
 """How long a task may go on after it was cancelled."""
 

@@ -22,24 +22,6 @@ from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
 
-__all__ = [
-    "LONG_TURN_SECONDS",
-    "MOST_THREADS",
-    "OWNER",
-    "TimeLimit",
-    "awaited_calls",
-    "cancel",
-    "cancel_leftovers",
-    "leave_behind",
-    "log",
-    "new_task",
-    "run_loop",
-    "tasks_of",
-    "time_collector",
-    "wait_fairly",
-    "watched",
-]
-
 LONG_TURN_SECONDS: Final = 0.1
 """An env that holds the event loop for longer is reported."""
 MOST_THREADS: Final = 256

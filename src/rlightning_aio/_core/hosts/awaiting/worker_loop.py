@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
-__all__ = ["Awaiting"]
-
 
 class Awaiting:
     """See the module.

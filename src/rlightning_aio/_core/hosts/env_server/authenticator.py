@@ -20,8 +20,6 @@ from rlightning_aio.remote.zmq_messages import is_readable, next_message
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["Authenticator"]
-
 _DOMAIN = "rlightning-aio"
 
 

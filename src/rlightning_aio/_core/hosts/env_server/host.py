@@ -44,8 +44,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.announcements import Announcement
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["EnvServer", "EnvServerHost"]
-
 
 class EnvServer:
     """What the places of one entry share; see `base.Server`.

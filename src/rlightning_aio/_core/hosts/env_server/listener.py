@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.server_session import ServerSessions
     from rlightning_aio.protocol.net.wire import Part
 
-__all__ = ["Listener"]
-
 _MESSAGES_PER_PUMP: Final = 1000
 """Upper limit, so that the driver does other things in between."""
 _MAX_UNSENT_PER_CLIENT: Final = 100

@@ -15,8 +15,6 @@ from rlightning_aio.remote.keys import read_server_keys
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["ServerSettings", "place_names", "server_settings"]
-
 _MAX_PLACES: Final = 1024
 _Name = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^/\x00-\x1f]+$")]
 

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["InlineHost"]
-
 _Waiting: TypeAlias = "tuple[int, NDArray[np.int64], Callable[[], Any]]"
 """An entry, by itself and as an array of one, and the function that executes it."""
 _STEP: Final = int(Operation.STEP)

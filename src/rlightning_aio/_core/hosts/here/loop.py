@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder
 
-__all__ = ["LoopHost"]
-
 
 class LoopHost(Host):
     """Runs awaitable envs on the event loop of the trainer; see `base.Host`."""

@@ -19,8 +19,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-__all__ = ["adopt_orphans", "children", "kill_below"]
-
 _OUTLIVES: Final = b"\0RLIGHTNING_AIO_OUTLIVES=1\0"
 """In the environment of a process that is not killed: the watchdog of an arm has to stop the arm
 then, and ends by itself.

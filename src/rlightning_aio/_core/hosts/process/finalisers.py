@@ -14,8 +14,6 @@ import threading
 import weakref
 from typing import Any
 
-__all__ = ["drop_inherited", "run_all"]
-
 # What `multiprocessing` uses of them has no public name.
 _atexit: Any = atexit
 _threading: Any = threading

@@ -21,21 +21,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import WorkerPlace
 
-__all__ = [
-    "REFUSED",
-    "CloseLimit",
-    "Exited",
-    "Fork",
-    "Forked",
-    "Kill",
-    "Message",
-    "MessageSocket",
-    "NotForked",
-    "Preload",
-    "Ready",
-    "Received",
-]
-
 
 @dataclass(frozen=True)
 class Preload:

@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.process.fork_messages import Message
 
-__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "GYMNASIUM", "die_with_parent", "main"]
-
 GYMNASIUM: Final = (1, 2)
 """The oldest version that workers can use; that of pyproject.toml."""
 

@@ -54,8 +54,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import Message
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["ForkServerHandle", "ProcessHost", "ending"]
-
 _STDERR: Final = 2
 _PACKAGE: Final = str(Path(__file__).parents[3])
 _ONE_THREAD = dict.fromkeys(

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import ErrorText, WorkerPlace
 
-__all__ = ["Link"]
-
 
 class Link:
     """The connection to one worker; its replacement gets a new one.

@@ -21,8 +21,6 @@ from rlightning_aio._core.hosts.process.descendants import kill_below
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import MessageSocket
 
-__all__ = ["Key", "RunningForkServer", "end_all", "inherited", "keep", "kept", "take"]
-
 Key: TypeAlias = tuple[object, ...]
 
 _MOST: Final = 3

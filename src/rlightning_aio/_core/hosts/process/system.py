@@ -11,8 +11,6 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["check_system", "processor_ns"]
-
 
 def check_system(config: EnvConfig) -> None:
     """Check that worker processes can run on this system.

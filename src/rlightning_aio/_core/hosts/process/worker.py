@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["Worker", "main"]
-
 _STEP: Final = int(Operation.STEP)
 
 

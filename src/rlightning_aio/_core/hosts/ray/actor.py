@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.protocol.frames import Frame
 
-__all__ = ["Batch", "EnvActor", "Reply"]
-
 
 class Batch(NamedTuple):
     """Requests to envs of one actor.

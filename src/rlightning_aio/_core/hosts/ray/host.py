@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.frames import Frame
 
-__all__ = ["RayHost"]
-
 # Untyped, because `make check` runs without Ray.
 ray: Any = import_module("ray")
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["Columns", "RowTable"]
-
 Columns = list["NDArray[Any]"]
 """One array `[rows, ...]` for each column, slab by slab."""
 

@@ -18,8 +18,6 @@ from rlightning_aio.trees import copied
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
 
-__all__ = ["Abandoned", "AwaitedRunner"]
-
 
 class Abandoned(Exception):
     """The env was replaced while it was executing a request; its result is dropped."""

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["build_env", "built_env", "built_envs", "check_distinct", "not_built"]
-
 
 def build_env(
     config: EnvConfig,

@@ -9,8 +9,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["call_env"]
-
 
 def call_env(env: BaseEnv, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Call a method of the env, or else of the outermost wrapper that has it.

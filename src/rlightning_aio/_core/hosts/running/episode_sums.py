@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import Autoreset
 
-__all__ = ["EpisodeSums"]
-
 
 class EpisodeSums:
     """Adds up rewards and steps in place.

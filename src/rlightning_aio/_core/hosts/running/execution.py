@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
-__all__ = ["completion_of", "execute"]
-
 
 def execute(
     host_id: int,

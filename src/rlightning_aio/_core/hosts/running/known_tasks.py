@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["known_tasks", "register_tasks"]
-
 
 def known_tasks() -> tuple[bytes, ...]:
     """Return all registered tasks that can be pickled.

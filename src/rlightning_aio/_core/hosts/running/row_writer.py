@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset
 
-__all__ = ["Execute", "GetInput", "RowWriter", "ShownResult", "infos_out_of_band"]
-
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns the part of the result that is out of band."""
 GetInput: TypeAlias = "Callable[[], Any]"

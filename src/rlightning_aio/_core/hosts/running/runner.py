@@ -55,18 +55,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta
 
-__all__ = [
-    "EnvRunner",
-    "attach_all",
-    "close_all",
-    "disconnect_all",
-    "give_rows",
-    "loaded",
-    "placed",
-    "seed_generators",
-    "stop_one",
-]
-
 _log = logging.getLogger("rlightning_aio")
 
 
