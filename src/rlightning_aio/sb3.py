@@ -183,7 +183,8 @@ class VecEnv(_Base):
         elif not any(options):
             options = None
         observations, infos = self.envs.reset(seed=seed, options=options)
-        self.reset_infos = _each(infos, self.num_envs)
+        none: NDArray[np.bool_] = np.zeros(self.num_envs, np.bool_)
+        self.reset_infos = _each(infos, none)
         self._reset_seeds()
         self._reset_options()
         return observations
@@ -224,9 +225,10 @@ class VecEnv(_Base):
             error.add_note("with a model, model.set_env(env): learn() then begins with a reset")
             raise
         done = terminated | truncated
-        infos = LazyInfos(partial(_infos_of_step, found, done, truncated & ~terminated))
+        infos = LazyInfos(partial(_infos_of_step, found, done))
         for k in np.flatnonzero(done).tolist():
             infos[k], self.reset_infos[k] = self._last_and_first(infos[k])
+            infos[k]["TimeLimit.truncated"] = not terminated[k]
         return observations, rewards, done, infos
 
     def _last_and_first(self, info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -237,9 +239,8 @@ class VecEnv(_Base):
                 "infos, so the last observation is unknown: a vector env with same-step "
                 "autoreset must report it"
             )
-        last = {"terminal_observation": info.pop("final_obs")}
-        last["TimeLimit.truncated"] = info.pop("TimeLimit.truncated")
-        return {**info.pop("final_info", {}), **last}, info
+        last_observation = info.pop("final_obs")
+        return {**info.pop("final_info", {}), "terminal_observation": last_observation}, info
 
     def close(self) -> None:
         """Close the envs and end their workers; idempotent."""
@@ -355,19 +356,19 @@ def _check_given(envs: gym.vector.VectorEnv[Any, Any, Any], entry: dict[str, Any
         )
 
 
-def _each(infos: dict[str, Any], num_envs: int) -> list[dict[str, Any]]:
+def _each(infos: dict[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """List the infos of the envs; a vector env may leave out masks."""
     each = infos.each() if isinstance(infos, LazyColumns) else None
-    return listed(infos_of_each(infos, num_envs), num_envs) if each is None else each
+    if each is not None:
+        return each
+    # What an env has left to its next episode is of that env alone.
+    masks = {f"_{key}": done for key in ("final_obs", "final_info") if key in infos}
+    return listed(infos_of_each({**masks, **infos}, len(done)), len(done))
 
 
-def _infos_of_step(
-    found: dict[str, Any], done: NDArray[np.bool_], cut: NDArray[np.bool_]
-) -> list[dict[str, Any]]:
-    """List the infos of a step, with ``TimeLimit.truncated``."""
-    each = _each(found, len(done))
-    for info, is_done, is_cut in zip(each, done.tolist(), cut.tolist(), strict=True):
-        info["TimeLimit.truncated"] = is_cut
-        if not is_done:  # A vector env without masks has one for every env.
-            info.pop("final_obs", None)
+def _infos_of_step(found: dict[str, Any], done: NDArray[np.bool_]) -> list[dict[str, Any]]:
+    """List the infos of a step; of envs whose episode goes on, with ``TimeLimit.truncated``."""
+    each = _each(found, done)
+    for k in np.flatnonzero(~done).tolist():
+        each[k]["TimeLimit.truncated"] = False
     return each

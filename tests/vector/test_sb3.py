@@ -352,6 +352,46 @@ def test_a_vector_env_without_masks_and_without_final_info() -> None:
         env.step([0, 0])
 
 
+class SameNames(gym.Env[Any, Any]):
+    """Its infos have keys that this library, Gymnasium and Stable-Baselines3 use as well."""
+
+    observation_space = gym.spaces.Box(0, 9, (1,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), {**self.own, "worker_restarted": "by me", "episode": 3}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return np.full(1, self.steps, np.float32), 1.0, self.steps == 2, False, {**self.own}
+
+    own: ClassVar = {
+        "TimeLimit.truncated": "mine",
+        "outcome": "open",
+        "suspects": [1],
+        "terminal_observation": 5,
+        "is_success": True,
+    }
+
+
+@pytest.mark.parametrize("fields", [{}, {"placement": "inline"}])
+def test_names_of_an_env_that_are_ours_as_well_are_its_own(fields: dict[str, Any]) -> None:
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from rlightning_aio.sb3 import VecEnv
+
+    ours, theirs = VecEnv([SameNames] * 2, **fields), DummyVecEnv([SameNames] * 2)
+    for step in range(5):
+        for env in (ours, theirs) if not step else ():
+            env.reset()
+        assert_alike(ours.reset_infos, theirs.reset_infos)
+        assert_alike(list(ours.step([0, 0])[3]), theirs.step([0, 0])[3])
+    assert ours.reset_infos[1]["TimeLimit.truncated"] == "mine"
+    ours.close()
+
+
 def test_the_vector_env_of_ale_py() -> None:
     """It is trained on as it is."""
     pytest.importorskip("ale_py")
