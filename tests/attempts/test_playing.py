@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from attempts.room import CountedRoom
+from attempts.room import AwaitedRoom, CountedRoom
 from attempts.rooms import PLACES, rooms
 from kit.counting import ClientThread, CountingEnv
 from patience import HANG
@@ -27,6 +27,7 @@ from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
+from rlightning_aio.attempts.rules import is_unnamed
 from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
 from rlightning_aio.registry import ENVS
 
@@ -880,6 +881,38 @@ async def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
             with pytest.raises(rl.RLightningError, match=asks):
                 await played(group, source, agent, 1, rules)
             assert sorted(broken) == [f"room-{k}" for k in range(4)]
+
+
+class Poisoned(AwaitedRoom):
+    """An action may end its worker, while all envs in that wait."""
+
+    async def pause(self, action: Any = None) -> None:
+        if action == "poison":
+            asyncio.get_running_loop().call_later(0.02, os._exit, 3)
+        await super().pause("hang" if action == "poison" else {"seconds": 0.01})
+
+
+async def test_poison_tasks_cost_only_themselves() -> None:
+    """Those that were executed with one are played again where nobody else plays."""
+    poison = (3, 11, 12)
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step(1)
+        while not episode.is_over:
+            await episode.step("poison" if episode.spec.seed in poison else 1)
+
+    place = {"task": Poisoned, "envs_per_process": 4}
+    async with rooms(place, 8) as group:
+        found = await played(group, tasks(24), agent, size=2)
+        assert not any(worker["given_up"] for worker in group.get_workers())
+    assert sorted(one.spec.seed for one in found if not one.is_complete) == [*poison]
+    for attempts in found:
+        for attempt in attempts:
+            outcomes = [*attempt.failures, attempt.outcome]
+            unnamed = [one for one in outcomes if is_unnamed(one)]
+            named = [one for one in outcomes if one.kind == "env_died" and one.blame == "env"]
+            assert len(unnamed) <= 1
+            assert bool(named) == (attempt.spec.seed in poison)
 
 
 async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFixture) -> None:

@@ -29,6 +29,7 @@ class Players:
 
     Attributes:
         entry_of: the name of the config entry of each env.
+        worker_of: the ids of all envs in the worker of each env.
         gone: envs whose worker is not replaced.
         left_alone: what moves something real and was lost or has raised: only its user resets it.
         present: envs that are there, and neither gone nor left alone.
@@ -38,6 +39,11 @@ class Players:
         self._group = group
         self.entry_of: dict[str, str] = {
             env_id: worker["entry"]
+            for worker in group.get_workers()
+            for env_id in worker["env_ids"]
+        }
+        self.worker_of: dict[str, list[str]] = {
+            env_id: worker["env_ids"]
             for worker in group.get_workers()
             for env_id in worker["env_ids"]
         }

@@ -14,7 +14,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.attempts.players import Players
-from rlightning_aio.attempts.rules import is_of_env, tries_again
+from rlightning_aio.attempts.rules import is_of_env, is_unnamed, tries_again
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -59,7 +59,6 @@ class Job:
         sub_env: of the env that it waits for.
         since: when it began to wait for an env, in monotonic seconds.
         failures: outcomes of its tries so far.
-        failed_on: the envs on which they failed, bystanders aside.
     """
 
     task: TaskInPlay
@@ -67,12 +66,21 @@ class Job:
     sub_env: int = 0
     since: float = 0.0
     failures: list[Outcome] = field(default_factory=list["Outcome"])
-    failed_on: set[str] = field(default_factory=set[str])
 
     @property
     def spec(self) -> EpisodeSpec:
         """The task."""
         return self.task.spec
+
+    @property
+    def failed_on(self) -> set[str]:
+        """The envs on which its tries have failed, bystanders aside."""
+        return {one.env_id for one in self.failures if is_of_env(one)}
+
+    @property
+    def plays_alone(self) -> bool:
+        """A worker has died while it was one of several that were executed."""
+        return any(map(is_unnamed, self.failures))
 
 
 class AttemptQueue:
@@ -100,6 +108,8 @@ class AttemptQueue:
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
+        # Envs whose worker is kept for a job that plays alone.
+        self._kept_for: dict[str, Job] = {}
         self._places: set[tuple[EpisodeKey, int, int]] = set()
 
     # -- what waits -------------------------------------------------------------------
@@ -166,6 +176,8 @@ class AttemptQueue:
             kept = [job for job in queue if job.task is not task]
             queue.clear()
             queue.extend(kept)
+        for job in removed:
+            self._keep_nothing_for(job)
         return removed
 
     def withdraw_all(self) -> list[Job]:
@@ -175,6 +187,7 @@ class AttemptQueue:
         removed = [*chain.from_iterable(queues)]
         for queue in queues:
             queue.clear()
+        self._kept_for.clear()
         return removed
 
     # -- what is played next ----------------------------------------------------------
@@ -186,26 +199,41 @@ class AttemptQueue:
         return next((id_ for id_ in self.free if self.may_play(id_) and self._has_job(id_)), None)
 
     def _has_job(self, env_id: str) -> bool:
-        pinned = self._pinned.get(env_id)
-        return bool(pinned and any(pinned.values())) or self._shared_job(env_id) is not None
+        for queue in self._pinned.get(env_id, {}).values():
+            if queue:  # Those of other sub-environments begin together with it.
+                return self._may_have(env_id, queue[0])
+        return self._shared_job(env_id) is not None
 
     def _shared_job(self, env_id: str) -> int | None:
-        """Position of what an env plays next of those that any env may play.
-
-        One that has failed on it waits for another env, if there is one.
-        """
+        """Position of what an env plays next of those that any env may play."""
         waiting = self._waiting.get(self.players.entry_of[env_id], ())
-        for position, job in enumerate(waiting):
-            if env_id not in job.failed_on or not self._others(job):
-                return position
-        return None
+        return next((k for k, job in enumerate(waiting) if self._may_have(env_id, job)), None)
 
-    def _others(self, job: Job) -> bool:
-        """Return True if there are envs on which a job has not failed."""
-        players = self.players
-        return any(
-            players.entry_of[env_id] == job.spec.entry for env_id in players.present - job.failed_on
-        )
+    def _may_have(self, env_id: str, job: Job) -> bool:
+        """Return True if an env may play what waits for its entry, or for itself.
+
+        What has failed on it waits for another env, if there is one. What plays alone has a worker
+        kept for it, and waits until all envs there are idle.
+        """
+        if self._kept_for.get(env_id, job) is not job:
+            return False
+        if not job.failures:
+            return True
+        entry_of, left = self.players.entry_of, self.players.present - job.failed_on
+        has_others = not job.spec.env_id and any(entry_of[one] == job.spec.entry for one in left)
+        if env_id in job.failed_on and has_others:
+            return False
+        if not job.plays_alone:
+            return True
+        if env_id not in self._kept_for:
+            if any(self._kept_for.get(one) is job for one in left):
+                return False
+            self._kept_for.update(dict.fromkeys(self.players.worker_of[env_id], job))
+        return self.players.present.intersection(self.players.worker_of[env_id]) <= {*self.free}
+
+    def _keep_nothing_for(self, job: Job) -> None:
+        if self._kept_for:
+            self._kept_for = {one: kept for one, kept in self._kept_for.items() if kept is not job}
 
     def take(self, env_id: str) -> list[Job]:
         """Remove what an idle env plays next, which it begins now: one of each sub-environment.
@@ -213,12 +241,12 @@ class AttemptQueue:
         Episodes of sub-environments begin together. After a loss they may have played different
         numbers, so those begin that have played the fewest.
         """
-        del self.free[env_id]
         pinned = [queue for queue in self._pinned.get(env_id, {}).values() if queue]
+        position = None if pinned else self._shared_job(env_id)
+        del self.free[env_id]
         if pinned:
             first = min(queue[0].index for queue in pinned)
             return [queue.popleft() for queue in pinned if queue[0].index == first]
-        position = self._shared_job(env_id)
         assert position is not None
         waiting = self._waiting[self.players.entry_of[env_id]]
         job = waiting[position]
@@ -243,12 +271,11 @@ class AttemptQueue:
         It `is_last` if nobody could try it again.
         """
         outcome = attempt.outcome = replace(attempt.outcome, attempt=len(job.failures))
+        self._keep_nothing_for(job)
         if job.task.is_settled:
             return False
         if not is_last and tries_again(self._rules, outcome, job.failures):
             job.failures.append(outcome)
-            if is_of_env(outcome):
-                job.failed_on.add(outcome.env_id)
             self._wait(job)
             return False
         attempt.failures = tuple(job.failures)

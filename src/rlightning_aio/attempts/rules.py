@@ -12,9 +12,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Rules", "is_final", "is_from_env", "is_of_env", "is_retried", "needed", "tries_again"]
-
-
 _OF_ENVS: Final = ("env_raised", "env_died", "env_hung", "env_away", "not_started")
 
 
@@ -35,6 +32,11 @@ def is_of_env(outcome: Outcome) -> bool:
     return is_from_env(outcome) and not is_bystanders(outcome)
 
 
+def is_unnamed(outcome: Outcome) -> bool:
+    """Return True if its worker has died while several envs were waiting in it."""
+    return outcome.kind == "env_died" and outcome.blame == "infrastructure" and is_of_env(outcome)
+
+
 def is_from_env(outcome: Outcome) -> bool:
     """Return True for a failure that the env has not survived, whoever is at fault."""
     return outcome.kind in _OF_ENVS
@@ -53,7 +55,9 @@ class Rules:
             has taken more than half of the time, it is ``env_hung``.
         retries: how often an attempt that has failed is tried again, on another env than before. A
             failure for which another env of the worker is to blame isn't counted. What the policy
-            alone or the caller has caused isn't tried again, and neither is ``timed_out``.
+            alone or the caller has caused isn't tried again, and neither is ``timed_out``. After
+            the death of a worker in which several were executed, each of them is tried again in a
+            worker where nobody else plays.
         first: as soon as this many attempts have not failed, the group is complete, and the others
             are cancelled; None: it is complete if none has failed.
         max_concurrency: how many attempts may play at once; None for one on each env.

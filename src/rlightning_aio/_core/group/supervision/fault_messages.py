@@ -81,8 +81,10 @@ def culprit_of(
         return record.aborted_slot
     if record.awaits_several:
         # The worker marks whose code runs, and that of one whose request is over may run, too.
-        slot = slot_of(entries[0]) if entries and entries[0] else None
-        return slot if slot in record.slots else None
+        if entries and entries[0]:
+            slot = slot_of(entries[0])
+            return slot if slot in record.slots else None
+        return int(unanswered[0]) if len(unanswered) == 1 else None
     slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
     for entry in entries:
         if entry in slot_of_entry:
