@@ -7,6 +7,8 @@ docs/stable_baselines3.md lists the differences.
 from __future__ import annotations
 
 import inspect
+import os
+from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
@@ -18,6 +20,7 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch.contents import reported_info_list, reported_infos
 from rlightning_aio.batch.infos import infos_of_each, listed
+from rlightning_aio.envs.adapted.makers import RESTARTS
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import ConfigError
@@ -26,7 +29,7 @@ from rlightning_aio.vector.lazy_infos import LazyColumns, LazyInfos
 from rlightning_aio.vector.making import batch_of, is_brief, steps_together
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -57,7 +60,7 @@ def make_vec_env(
     Envs of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped together, in
     threads of this process, inside a `VecMonitor`, unless they need a wrapper or a file each.
     Classic control, toy text and a single env are what Stable-Baselines3 makes, a `DummyVecEnv`.
-    All else is a `VecEnv` of separate envs in workers, each in a `Monitor`.
+    All else is a `VecEnv` of separate envs in workers, each in a `Monitor` that restarts continue.
 
     Args:
         env_id: a registered name, or a callable that makes an env.
@@ -85,7 +88,7 @@ def make_vec_env(
             "leave it out, or call Stable-Baselines3's make_vec_env"
         )
     make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
-    given = {"env_kwargs": env_kwargs, **more}
+    given = {**more, "env_kwargs": env_kwargs, "monitor_kwargs": _Continued(more)}
     inspect.signature(make).bind(env_id, n_envs, seed, vec_env_kwargs=vec_env_kwargs, **given)
     fields = {k: v for k, v in (vec_env_kwargs or {}).items() if k not in _IGNORED}
     if vec_env_cls is dummy and fields:
@@ -103,6 +106,29 @@ def make_vec_env(
         vec_env_cls = dummy
     kind = dummy if vec_env_cls is dummy else VecEnv
     return make(env_id, n_envs, seed, vec_env_cls=kind, vec_env_kwargs=fields, **given)
+
+
+class _Continued(Mapping[str, Any]):
+    """``monitor_kwargs``, read in the worker as it makes a `Monitor`: the file of an env that was
+    made before goes on.
+    """
+
+    def __init__(self, more: Mapping[str, Any]) -> None:
+        self._given: dict[str, Any] = {
+            "override_existing": True,
+            **(more.get("monitor_kwargs") or {}),
+        }
+
+    def __getitem__(self, key: str) -> Any:
+        if key == "override_existing" and os.environ.get(RESTARTS, "0") != "0":
+            return False
+        return self._given[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._given)
+
+    def __len__(self) -> int:
+        return len(self._given)
 
 
 class VecEnv(_Base):
@@ -183,8 +209,7 @@ class VecEnv(_Base):
         elif not any(options):
             options = None
         observations, infos = self.envs.reset(seed=seed, options=options)
-        none: NDArray[np.bool_] = np.zeros(self.num_envs, np.bool_)
-        self.reset_infos = _each(infos, none)
+        self.reset_infos = _each(infos, np.array([False] * self.num_envs))
         self._reset_seeds()
         self._reset_options()
         return observations

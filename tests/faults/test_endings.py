@@ -16,6 +16,7 @@ import pytest
 from faults.leaving import ABORT, HANG, SLEEP, Awaitable, Leaving, Starting
 from faults.test_shutdown import processes_of, trainer, watched
 from kit.processes import fork_server_pid, stop
+from kit.scripted import DIE, RAISE, Scripted
 from patience import HANG as PATIENCE
 
 import rlightning_aio
@@ -60,6 +61,44 @@ def test_an_inline_env_is_freed_when_its_group_closes() -> None:
     group.close()
     gc.collect()
     assert made[0]() is None
+
+
+class Counting(Scripted):
+    """Writes down how often it was made before."""
+
+    def __init__(self, log: Path) -> None:
+        with log.open("a") as file:
+            file.write(os.environ["RLIGHTNING_AIO_RESTARTS"])
+
+
+@pytest.mark.parametrize("kind", ["worker", "shared", "inline", "awaitable", "loop"])
+def test_a_callable_can_know_how_often_it_was_called(kind: str, tmp_path: Path) -> None:
+    """After exceptions and deaths: no number comes twice, so it can be part of a file's name."""
+    dies = kind in ("worker", "shared", "awaitable")
+    fields: dict[str, Any] = {"placement": kind} if not dies else {}
+    if kind == "shared":
+        fields = {"envs_per_process": 2}
+
+    def made(k: int) -> Any:
+        env = Counting(tmp_path / str(k))
+        return Awaitable(env) if kind in ("awaitable", "loop") else env
+
+    tasks = [partial(made, k) for k in range(2)]
+    config = entry(tasks, num_workers=2, on_env_error="restart", max_restarts=9, **fields)
+
+    async def play() -> None:
+        async with rlightning_aio.build_env_group(config) as group:
+            batch, _ = await group.reset()
+            for action in (RAISE, DIE, RAISE, RAISE, DIE):
+                if action != DIE or dies:
+                    await group.step(batch.respond(action=[action, 0]))
+                    await group.step(batch.respond(action=[0, 0]))
+
+    asyncio.run(play())
+    assert "RLIGHTNING_AIO_RESTARTS" not in os.environ
+    assert (tmp_path / "0").read_text() == ("012345" if dies else "0123")
+    deaths = 2 if kind == "shared" else 0
+    assert (tmp_path / "1").read_text() == "012"[: 1 + deaths]
 
 
 KILLS = {"crash": ABORT, "hang": HANG, "abort": HANG, "destroyed": SLEEP}

@@ -116,13 +116,13 @@ class _ActorClass:
     def remote(self, *arguments: Any) -> _Handle:
         if self._world.refuses():
             raise RuntimeError("Ray is not there, as the world wants it")
-        return _Handle(_Actor(self._world, self._actor_class, pickle.dumps(arguments)))
+        return _Handle(Actor(self._world, self._actor_class, pickle.dumps(arguments)))
 
 
 class _Handle:
     """See `ray.actor.ActorHandle`."""
 
-    def __init__(self, actor: _Actor) -> None:
+    def __init__(self, actor: Actor) -> None:
         self.actor = actor
 
     def __getattr__(self, name: str) -> _Method:
@@ -132,7 +132,7 @@ class _Handle:
 class _Method:
     """See `ray.actor.ActorMethod`."""
 
-    def __init__(self, actor: _Actor, name: str) -> None:
+    def __init__(self, actor: Actor, name: str) -> None:
         self._actor, self._name = actor, name
 
     def remote(self, *arguments: Any) -> _Reference:
@@ -141,7 +141,7 @@ class _Method:
         return call.outcome
 
 
-class _Actor(Process):
+class Actor(Process):
     """The process of an actor, which executes one call after the other."""
 
     def __init__(self, world: World, actor_class: type, arguments: bytes) -> None:

@@ -51,6 +51,9 @@ class Machine:
         while True:
             time.sleep(3600)
 
+    def make(self, code: int) -> None:
+        """Begin to make the env whose first script has this code."""
+
     async def await_for(self, seconds: float) -> None:
         """Like `spend`, in an awaitable env, while others continue."""
         await asyncio.sleep(seconds / 100)
@@ -498,6 +501,7 @@ class _Body:
     """What all envs of scripts have: the scripts, and what can be asked of them."""
 
     def __init__(self, codes: Sequence[int], mode: str, layout: str, controls: str) -> None:
+        machine.make(codes[0])
         self.layout, self.controls = layout, controls
         self.scripts = Scripts(codes, mode)
 

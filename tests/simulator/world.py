@@ -59,6 +59,7 @@ from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.running import build_env
+from rlightning_aio.envs.adapted import makers
 from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ class World:
         wrongs: what the package did to processes that it should not have done.
         network: between env_servers and their clients, which `Network.client` starts.
         deaths: of each process that ended with an error, by its name.
+        made: how often each env was made, by the code of its first script.
         ended: it is no more.
         stopped: processes that are stopped.
         running: whose code runs: a process's, the kernel's or a fork server's (`NOBODY`), or the
@@ -139,6 +141,7 @@ class World:
         self.faults = self._storm = faults
         self.counts: Counter[str] = Counter()
         self.deaths: Counter[str] = Counter()
+        self.made: Counter[int] = Counter()
         self.wrongs: list[str] = []
         self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
@@ -464,6 +467,16 @@ class SimulatedMachine:
         process = self._world.running
         assert isinstance(process, Process), "an env in the trainer's process can't die or hang"
         return process
+
+    def make(self, code: int) -> None:
+        """Check that the env can know how often it was made before."""
+        made = self._world.made
+        told = os.environ.get(makers.RESTARTS)
+        if told is None or isinstance(self._world.running, rays.Actor):
+            return  # A client makes its env itself, and an actor does not know all.
+        if int(told) != made[code]:
+            self._world.wrongs.append(f"{code} was made {made[code]} times, and is told {told}")
+        made[code] += 1
 
     async def await_for(self, seconds: float) -> None:
         await asyncio.sleep(seconds)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
-from kit.scripted import Counts
+from kit.scripted import DIE, RAISE, Counts, Scripted
 from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
 
@@ -390,6 +390,31 @@ def test_names_of_an_env_that_are_ours_as_well_are_its_own(fields: dict[str, Any
         assert_alike(list(ours.step([0, 0])[3]), theirs.step([0, 0])[3])
     assert ours.reset_infos[1]["TimeLimit.truncated"] == "mine"
     ours.close()
+
+
+class Short(Scripted):
+    """Its episodes have two steps."""
+
+    length = 2
+
+
+def test_a_monitor_continues_its_file_after_a_restart(tmp_path: Path) -> None:
+    """And begins it anew in another program, as Stable-Baselines3 does, unless it must not."""
+    from rlightning_aio.sb3 import make_vec_env
+
+    def lines() -> list[str]:
+        return (tmp_path / "0.monitor.csv").read_text().splitlines()
+
+    for kwargs in ({}, {"override_existing": False}):
+        before = len(lines()) if kwargs else 2
+        given = {"monitor_dir": str(tmp_path), "monitor_kwargs": kwargs}
+        env = make_vec_env(Short, 2, vec_env_kwargs={"on_env_error": "restart"}, **given)
+        env.reset()
+        for action in (0, 0, DIE, 0, 0, RAISE, 0, 0):
+            env.step([action, 0])
+        env.close()
+        assert len(lines()) == before + 3
+        assert [line[:2] for line in lines() if not line[0].isdigit()] == ["#{", "r,"]
 
 
 def test_the_vector_env_of_ale_py() -> None:

@@ -67,7 +67,7 @@ def _capacity(num_envs: int) -> int:
 
 def rings_size(num_envs: int) -> int:
     """Size in bytes of the words and both rings of a worker with `num_envs` envs."""
-    return 8 * (_WORDS + 2 * _capacity(num_envs) + num_envs)
+    return 8 * (_WORDS + 2 * _capacity(num_envs) + 2 * num_envs)
 
 
 def _split(buffer: memoryview, num_envs: int) -> tuple[memoryview, memoryview, memoryview]:
@@ -79,6 +79,11 @@ def _split(buffer: memoryview, num_envs: int) -> tuple[memoryview, memoryview, m
 
 def _stops(words: memoryview[int], num_envs: int) -> memoryview[int]:
     """Return a word for each env: the request up to which it must stop whatever it moves."""
+    return words[len(words) - 2 * num_envs : len(words) - num_envs]
+
+
+def _made(words: memoryview[int], num_envs: int) -> memoryview[int]:
+    """Return a word for each env: how often it was made, by this worker and those before it."""
     return words[len(words) - num_envs :]
 
 
@@ -86,13 +91,15 @@ class TrainerRings:
     """The trainer's side: appends requests, reads reports.
 
     Args:
-        buffer: the memory of the rings, zeroed.
+        buffer: the memory of the rings. It is cleared here, but for how often each env was made.
         num_envs: of the worker.
         bell: of the group; index: of the worker's counter in it.
     """
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: TrainerBell, index: int) -> None:
         self._words, requests, reports = _split(buffer, num_envs)
+        cleared = self._words[: len(self._words) - num_envs]
+        cleared[:] = memoryview(bytes(8 * len(cleared))).cast("q")
         self._requests: NDArray[np.int64] = np.frombuffer(requests, np.int64)
         self._reports: NDArray[np.int64] = np.frombuffer(reports, np.int64)
         self._own = memoryview(bytearray(16)).cast("q")
@@ -199,6 +206,7 @@ class WorkerRings:
 
     Attributes:
         own: the worker's own counts; see `exchange`.
+        made: how often each env was made, by this worker and by those that it replaces.
     """
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: WorkerBell) -> None:
@@ -212,6 +220,7 @@ class WorkerRings:
         self._frames_sent = 0
         self._stops = _stops(self._words, num_envs)
         self._stopped = [0] * num_envs
+        self.made = _made(self._words, num_envs)
 
     def to_stop(self, first_slot: int) -> list[int]:
         """Return the indices of the envs that must stop now.

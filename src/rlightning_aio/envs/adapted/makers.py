@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
@@ -15,7 +15,10 @@ from rlightning_aio.registry import name_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["adapted"]
+__all__ = ["RESTARTS", "adapted"]
+
+RESTARTS: Final = "RLIGHTNING_AIO_RESTARTS"
+"""Environment variable that tells the code of an env, while it is made, how often it was before."""
 
 
 def adapted(

@@ -45,7 +45,7 @@ from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable
+    from collections.abc import Callable, Coroutine, Iterable, MutableSequence
 
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
@@ -96,11 +96,11 @@ class AwaitedEnvs:
     Args:
         host_id, first_slot: of the host.
         order: what to build.
-        inline: see `EnvRunner`.
+        made: how often each env was made, counted on here.
         post: gets every completion.
         done: gets the entries of requests whose results are all in their rows.
         enter: gets an entry whenever the code of its env is about to run, and 0 after that; None:
-            nobody needs it.
+            the envs are in the trainer's process.
 
     Attributes:
         num_busy: how many envs execute a request now.
@@ -111,8 +111,8 @@ class AwaitedEnvs:
         host_id: int,
         first_slot: int,
         order: StartOrder,
+        made: MutableSequence[int] | memoryview[int],
         *,
-        inline: bool,
         post: Callable[[Completion], object],
         done: Callable[[int], object],
         enter: Callable[[int], object] | None = None,
@@ -121,7 +121,8 @@ class AwaitedEnvs:
         self._host_id = host_id
         self._first_slot = first_slot
         self._order = order
-        self._inline = inline
+        self._made = made
+        self._inline = enter is None
         self._post = post
         self._done = done
         self._enter = enter
@@ -190,7 +191,7 @@ class AwaitedEnvs:
 
     async def _build(self, record: _EnvRecord) -> BaseException | None:
         """Build an env; return the error if that fails."""
-        make: Any = partial(built_env, self._order, record.index, inline=self._inline)
+        make: Any = partial(built_env, self._order, self._made, record.index, inline=self._inline)
         if self._enter is not None:
             entry = entry_of(0, self._first_slot + record.index, 0)
             make = partial(_entered, make, self._enter, entry)

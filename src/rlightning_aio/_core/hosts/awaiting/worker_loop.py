@@ -17,7 +17,7 @@ from rlightning_aio._core.hosts.limits import limits_of
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, MutableSequence, Sequence
 
     from rlightning_aio._core.hosts.messages import Completion, ErrorText, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
@@ -30,6 +30,7 @@ class Awaiting:
     Args:
         order, first_slot: of the worker.
         runners: of its envs.
+        made: how often each was made, counted on here.
         report: takes the entries of requests whose results are all in their rows.
         post: sends a completion.
         enter: says that an env's code runs now, by an entry; 0: none does.
@@ -43,6 +44,7 @@ class Awaiting:
         order: StartOrder,
         first_slot: int,
         runners: Sequence[EnvRunner],
+        made: MutableSequence[int] | memoryview[int],
         report: Callable[[int], None],
         post: Callable[[Completion], None],
         enter: Callable[[int], None],
@@ -52,7 +54,7 @@ class Awaiting:
             0,
             first_slot,
             order,
-            inline=False,
+            made,
             post=post,
             done=report,
             enter=enter,

@@ -42,7 +42,6 @@ class Link:
     def __init__(
         self, place: WorkerPlace, memory: memoryview, wiring: Wiring, channel: socket.socket
     ) -> None:
-        memory[:] = bytes(len(memory))
         self._rings = TrainerRings(memory, place.num_envs, wiring.bell, place.host_id)
         self._host_id = place.host_id
         self._completions = wiring.completions

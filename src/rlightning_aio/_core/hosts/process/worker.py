@@ -121,6 +121,7 @@ class Worker:
             self._order,
             self._first_slot,
             self._runners,
+            rings.made,
             lambda entry: rings.report(entry, ring),
             self._post,
             lambda entry: rings.begin(entry, time.monotonic_ns()),
@@ -270,7 +271,7 @@ class Worker:
             self._order = order
             if order.logs is not None:
                 log_like(order.logs, _name_of(order))
-            for runner in built_envs(order):
+            for runner in built_envs(order, self._rings.made):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
             if order.is_hardware:

@@ -93,11 +93,12 @@ class EnvActor:
     def hello(self) -> None:
         """Return, which shows that a node has started this actor."""
 
-    def build(self, order: bytes) -> Frame:
+    def build(self, order: bytes, restarts: int = 0) -> Frame:
         """Build the envs, and give each a row in this process.
 
         Args:
             order: a `StartOrder`, pickled.
+            restarts: how many actors were before this one.
 
         Returns `Built` or `NotBuilt`.
         """
@@ -106,7 +107,7 @@ class EnvActor:
             given = pickle.loads(order)
             assert given is not None
             given = replace(given, trainer_pid=None)
-            for runner in built_envs(given):
+            for runner in built_envs(given, [restarts] * len(given.worker_indices)):
                 self._runners.append(runner)
             places = list(_placed_here(self._runners))
             give_rows(places, SENDER, self._post)

@@ -186,6 +186,7 @@ class RayHost(Host):
         self._post = wiring.completions.append
         self._pid = os.getpid()
         self._life: _Life | None = None
+        self._num_lives = 0
         self._started: list[EnvStarted] = []
         self._table: RowTable | None = None
         self._closing = False
@@ -206,7 +207,8 @@ class RayHost(Host):
         life = self._life = _Life(actor)
         self._wiring.driver.watch(self)
         life.call(actor.hello, self._on_placed)
-        life.call(actor.build, self._on_built, self._start_payload)
+        life.call(actor.build, self._on_built, self._start_payload, self._num_lives)
+        self._num_lives += 1
 
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -12,13 +13,14 @@ from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
+from rlightning_aio.envs.adapted.makers import RESTARTS
 from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, MutableSequence, Sequence
 
     from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.config import EnvConfig
@@ -53,8 +55,10 @@ def build_env(
     return env
 
 
-def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
-    """Build the envs of a host one after the other.
+def built_envs(
+    order: StartOrder, made: MutableSequence[int] | memoryview[int], *, inline: bool = False
+) -> Iterator[EnvRunner]:
+    """Build the envs of a host one after the other; see `built_env`.
 
     A worker has its own numbers: those that fork servers fork have the same generators.
     """
@@ -63,7 +67,7 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
         register_tasks(order.tasks)
     built: list[EnvRunner] = []
     for index in range(len(order.worker_indices)):
-        built.append(built_env(order, index, inline=inline))
+        built.append(built_env(order, made, index, inline=inline))
         check_distinct(built)
         yield built[-1]
 
@@ -100,11 +104,20 @@ def not_built(
     return NotBuilt(host_id, min(num_built, most - 1), ErrorText.of(error))
 
 
-def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunner:
+def built_env(
+    order: StartOrder,
+    made: MutableSequence[int] | memoryview[int],
+    index: int,
+    *,
+    inline: bool = False,
+) -> EnvRunner:
     """Build one env of a host.
+
+    While it is made, `RESTARTS` in the environment says how often it was made before.
 
     Args:
         order: of the host.
+        made: how often each env of the host was made, counted on here.
         index: of the env in the host.
         inline: see `EnvRunner`.
 
@@ -118,7 +131,12 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
     def make() -> BaseEnv:
         fn = order.preprocess_fns[index]
         hardware = order.is_hardware
-        env = build_env(config, order.env_class, worker_index, fn, is_hardware=hardware)
+        os.environ[RESTARTS] = str(made[index])
+        made[index] += 1
+        try:
+            env = build_env(config, order.env_class, worker_index, fn, is_hardware=hardware)
+        finally:
+            os.environ.pop(RESTARTS, None)
         env.trainer_pid = None if inline else order.trainer_pid
         return env
 
