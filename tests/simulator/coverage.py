@@ -32,7 +32,6 @@ ELSEWHERE: Final = "elsewhere: "
 ROWS: Final[dict[str, str]] = {
     "the environment raises in `reset`": "EnvRaised",
     "… in `reset` or `step`, with": "restarted after an exception",
-    "the environment forks": ELSEWHERE + "tests/faults, as a world has no memory to copy",
     "a worker is killed": "died",
     "… during a call of a method": "died in a call",
     "… while it was idle": "died while idle",
