@@ -115,6 +115,16 @@ def test_a_collector_raises_it_once_and_goes_on(where: str) -> None:
 
 
 @WHERE
+def test_a_block_has_all_envs_after_it_was_raised(where: str) -> None:
+    with sync.build_env_group(entries(where)) as group:
+        collector = Collector(group, policy, num_transitions=8, wait_all=True)
+        with pytest.raises(EnvRaised, match=r"'bad-0'.*can't be read"):
+            collect_for_ever(collector)
+        for _ in range(3):
+            assert collector.collect().index.tolist() == [[0, 1]] * 4
+
+
+@WHERE
 def test_a_batch_raises_it_where_its_row_is_read(where: str) -> None:
     with sync.build_env_group(entries(where)) as group:
         batch, _ = group.reset()

@@ -346,7 +346,7 @@ class Collector(Generic[G, R]):
             return
         for part in self._unstored:
             part.kind.hold(part)
-        if not self._num_steps:
+        if not (self._num_steps or self._failed):
             self._lay_out()
 
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:

@@ -137,15 +137,12 @@ class EnvKind:
 
     def hold(self, part: Part) -> None:
         """Keep `part` as the newest results of its envs."""
-        if self.held is None or len(part.batch) == len(self.held.batch):
+        if self.held is None or np.array_equal(self.held.results.index, part.results.index):
             self.held = part
             return
-        count = len(self.held.batch)
-        first = self.held.results.index.reshape(count, -1)[:, 0]
-        newer = part.results.index.reshape(len(part.batch), -1)[:, 0]
-        rows = np.arange(count)
-        rows[np.searchsorted(first, newer)] = count + np.arange(len(newer))
-        self.held = self.part(joined([self.held.batch, part.batch]).take(rows.tolist()))
+        both = [one.results.index.reshape(len(one.batch), -1)[:, 0] for one in (part, self.held)]
+        _, rows = np.unique(np.concatenate(both), return_index=True)  # The first, so the newer one.
+        self.held = self.part(joined([part.batch, self.held.batch]).take(rows.tolist()))
 
     def columns_of(self, part: Part, answer: Any) -> tuple[BatchedData, dict[str, Tree]]:
         """Convert the policy's answer for `part` to a batch of responses, and to columns.
