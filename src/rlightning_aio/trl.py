@@ -12,10 +12,11 @@ import json
 import math
 import zlib
 from collections import Counter, defaultdict
-from itertools import groupby
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio.attempts import Attempt, EpisodeSpec, play
+from rlightning_aio.attempts.players import Players
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -91,15 +92,14 @@ async def _played(
 
     Where a batch is cut for several processes, a process has fewer of one task than of others.
     """
+    specs = [*map(Players(group).assigned, specs)]  # As `play` has them.
     runs = [list(run) for _, run in groupby(specs, lambda spec: spec.key)]
     size = math.gcd(*map(len, runs))
     tasks = [spec for run in runs for spec in run[::size]]
     found = defaultdict[Any, list[Attempt]](list)
     async with contextlib.aclosing(play(group, tasks, agent, size, rules)) as groups:
         async for attempts in groups:
-            _, *of_task = key = attempts.spec.key
-            found[key] += attempts
-            found["", *of_task] = found[key]  # Its entry may have been left to `play`.
+            found[attempts.spec.key] += attempts
     return [found[spec.key].pop(0) for spec in specs]
 
 
@@ -112,15 +112,13 @@ def _columns(attempts: list[Attempt], tokenizer: Any) -> dict[str, Any]:
     ends = [tokenizer.eos_token_id]
     masked = {"prompt_ids": ends, "completion_ids": ends, "logprobs": [0.0], "env_mask": [0]}
     rows = [masked if one.reward is None else one.result for one in attempts]
-    found: dict[str, Any] = {
-        name: [row.get(name) for row in rows] for result in whole for name in result
-    }
+    names = dict.fromkeys(chain.from_iterable(whole))
+    found: dict[str, Any] = {name: [row.get(name) for row in rows] for name in names}
     found["env_mask"] = [row.get("env_mask", [1] * len(row["completion_ids"])) for row in rows]
-    rewards = [one.reward for one in attempts]
     return {
         "logprobs": None,
         **found,
-        "reward": rewards,
+        "reward": [one.reward for one in attempts],
         "outcome": [one.outcome for one in attempts],
     }
 

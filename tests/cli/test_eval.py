@@ -49,6 +49,13 @@ def test_each_env_plays_the_same_number_of_episodes(tmp_path: Path) -> None:
     assert played == [(f"pole-{k}", n) for k in range(3) for n in range(2)]
 
 
+def test_the_name_of_an_entry_may_have_a_slash(tmp_path: Path) -> None:
+    config = write_config(tmp_path, {**POLE, "name": "my/cart"})
+    played = invoke_json("eval", config, "--episodes", 1)["attempts"]
+    assert {one["env_id"] for one in played} == {f"my/cart-{k}" for k in range(3)}
+    assert invoke_json("rollout", config, "--steps", 9)
+
+
 def test_success_is_read_from_the_last_info(tmp_path: Path) -> None:
     """Without it there is no success rate."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)

@@ -98,6 +98,20 @@ def test_entries_that_differ_alone_are_not_mixed() -> None:
     assert found["env_mask"] == [[1]] * 3
 
 
+def test_envs_may_have_a_task_with_a_name() -> None:
+    """The tasks of prompts have none, so they are those of the entry."""
+
+    async def steps(episode: Any) -> Any:
+        assert episode.spec.task == "CartPole-v1"
+        while not episode.is_over:
+            await episode.step(0)
+        return {"prompt_ids": [1], "completion_ids": [2]}
+
+    with rollouts(rl.build_env_group("CartPole-v1", num_workers=2), steps) as rollout_func:
+        found = rollout_func(["a", "a", "b", "b"], TRAINER)
+    assert [one.kind for one in found["outcome"]] == ["terminated"] * 4
+
+
 @pytest.mark.parametrize(
     ("returned", "message"),
     [

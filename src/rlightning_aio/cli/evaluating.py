@@ -29,6 +29,7 @@ from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import Responder, load_policy, servers_announced
 from rlightning_aio.cli.terminal import (
     Progress,
+    connections_logged,
     count,
     counted,
     named_columns,
@@ -227,7 +228,7 @@ def _play(
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
     ended: _End | None = "Ended by an error"
     try:
-        with Progress() as progress:
+        with Progress() as progress, connections_logged():
             run_interruptible(_evaluate(group, order, policy, results, progress))
         ended = None
     except KeyboardInterrupt:

@@ -55,7 +55,9 @@ class PolicyRaised(RLightningError):
 def servers_announced(group: EnvGroup, progress: Progress) -> bool:
     """Say where the env_servers of a group listen; return True if it has any."""
     found = False
-    for server_id in dict.fromkeys(one.partition("/")[0] for one in group.env_ids):
+    hosts = [(host["entry"], env_id) for host in group.get_workers() for env_id in host["env_ids"]]
+    ids = [entry + env_id.removeprefix(entry).partition("/")[0] for entry, env_id in hosts]
+    for server_id in dict.fromkeys(ids):
         if isinstance(server := group[server_id], ServerHandle):
             found = True
             progress.say(f"{server_id} listens at {server.address}")
