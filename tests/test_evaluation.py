@@ -387,13 +387,15 @@ def test_it_is_printed_as_a_table() -> None:
 @pytest.mark.parametrize(
     ("told", "success", "words"),
     [
-        (np.nan, None, ""),
+        (None, None, ""),
+        (np.nan, None, "leaves out 4 whose success is NaN of 4 episodes: 0.0%"),
+        ([1, np.nan, np.inf, 0], 0.5, "leaves out 2 whose success is NaN of 4 episodes: 25.0%"),
         ([0.7, 0.2, 1.0, 0.0], 0.5, "a value above 0.5; the mean of the values is 0.475"),
         ([1, None, None, 1], 1.0, "out 2 with no success in the last info of 4 episodes: 50"),
     ],
 )  # fmt: skip
 def test_what_counts_as_a_success_is_said(told: Any, success: float | None, words: str) -> None:
-    """NaN is no verdict, a share counts above one half, and what is left out is named."""
+    """NaN is a verdict that has failed, a share counts above one half, and what is left out is named."""
     values = np.broadcast_to(np.array(told, object), 4).tolist()
 
     def judged(k: int) -> Callable[[], Succeeding]:

@@ -37,8 +37,8 @@ class Attempt:
         outcome: how it ended.
         reward: the undiscounted return, summed over agents; None if it has failed.
         length: number of steps.
-        success_value: ``success`` or ``is_success`` of the last info as a number; None if it has
-            neither or NaN, or if the attempt has failed.
+        success_value: ``success`` or ``is_success`` of the last info as a number; NaN if that is
+            no finite one; None if it has neither, or if the attempt has failed.
         sub_env: index of the sub-environment that played it; 0 if the env has only one.
         rewards: of each step, in order; empty if a policy played several envs at once.
         columns: what the agent gave to `step` with each action, and ``action`` itself: lists with
@@ -72,21 +72,24 @@ class Attempt:
 
     @property
     def success(self) -> bool | None:
-        """`success_value` is above 0.5; None if it is unknown."""
-        return None if self.success_value is None else self.success_value > 0.5
+        """`success_value` is above 0.5; None if it is unknown or NaN."""
+        value = self.success_value
+        return None if value is None or math.isnan(value) else value > 0.5
 
     def to_json(self) -> dict[str, Any]:
         """Return the attempt as a row of JSON, without observations.
 
-        Columns and a result that JSON can't hold are null, and so are numbers that are not finite.
+        Columns and a result that JSON can't hold are null, and so are numbers that are not finite;
+        but a success of NaN is the text ``"nan"``.
         """
+        value = self.success_value
         row = {
             **self.spec.to_json(),
             "index": self.index,
             "reward": self.reward,
             "length": self.length,
             # A verdict as such, a share as a number.
-            "success": self.success if self.success_value in (0, 1) else self.success_value,
+            "success": self.success if value in (0, 1) else "nan" if value != value else value,
             "sub_env": self.sub_env,
             "rewards": self.rewards,
             "outcome": self.outcome.to_json(),
@@ -163,7 +166,7 @@ class AttemptGroup(Sequence[Attempt]):
 def success_of(info: dict[str, Any], sub_env: int = 0) -> float | None:
     """Read the success of an episode from its last info, or from the ``final_info`` in it.
 
-    None if it says nothing, or something that is neither a bool nor a number, such as NaN.
+    None if it says nothing, or something that is neither a bool nor a number; NaN for infinity.
     """
     final: Any = info.get("final_info")
     marked: Any = info.get("_final_info")
@@ -176,5 +179,5 @@ def success_of(info: dict[str, Any], sub_env: int = 0) -> float | None:
             array = np.asarray(given.tolist() if hasattr(given, "tolist") else given).reshape(-1)
             if array.size and array.dtype.kind in "biuf":
                 value = float(array[sub_env if array.size > 1 else 0])
-                return None if math.isnan(value) else value
+                return value if math.isfinite(value) else math.nan
     return None

@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def _success_values(self) -> list[float]:
-        return [one.success_value for one in self.played if one.success_value is not None]
+        return [one.success_value or 0.0 for one in self.played if one.success is not None]
 
     @property
     def remarks(self) -> list[str]:
@@ -84,7 +84,8 @@ class Evaluation:
         left out of the success rate.
         """
         found, values = list[str](), self._success_values
-        if not values:
+        told = sum(one.success_value is not None for one in self.played)
+        if not told:
             return found
         if any(value not in (0, 1) for value in values):
             found.append(
@@ -92,9 +93,10 @@ class Evaluation:
             )
         left_out = len(self.attempts) - len(values)
         if left_out:
-            failed, silent = len(self.failed), left_out - len(self.failed)
+            failed, silent = len(self.failed), len(self.played) - told
             parts = [f"{failed} failed"] * bool(failed)
             parts += [f"{silent} with no success in the last info"] * bool(silent)
+            parts += [f"{told - len(values)} whose success is NaN"] * (told > len(values))
             least = sum(value > 0.5 for value in values) / len(self.attempts)
             found.append(
                 f"the success rate leaves out {' and '.join(parts)} of {len(self.attempts)} "
