@@ -395,7 +395,7 @@ def test_it_is_printed_as_a_table() -> None:
     ],
 )  # fmt: skip
 def test_what_counts_as_a_success_is_said(told: Any, success: float | None, words: str) -> None:
-    """NaN is a verdict that has failed, a share counts above one half, and what is left out is named."""
+    """NaN is a failed verdict, a share counts above one half, and what is left out is named."""
     values = np.broadcast_to(np.array(told, object), 4).tolist()
 
     def judged(k: int) -> Callable[[], Succeeding]:

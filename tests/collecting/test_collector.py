@@ -196,6 +196,13 @@ def test_infos_with_the_name_of_a_rollouts_column_raise() -> None:
     for infos, why in (("success", "give .'success',."), (["reward"], "already has 'reward'")):
         with pytest.raises(ValueError, match=why):
             collector_of_infos(1.0, infos)
+    group, collector = collector_of_infos(1.0, ["success"])
+    with group, group.auto_reset():
+        rollout = collector.collect()
+    for name in {*dir(rollout), *rollout} - {"success"}:
+        if not name.startswith("_"):
+            with pytest.raises(ValueError, match=f"already has '{name}'"):
+                collector_of_infos(1.0, [name])
 
 
 def test_each_agent_has_its_own_rewards_and_ends() -> None:

@@ -82,14 +82,16 @@ class Attempt:
         Columns and a result that JSON can't hold are null, and so are numbers that are not finite;
         but a success of NaN is the text ``"nan"``.
         """
-        value = self.success_value
+        success = self.success_value
+        if success is not None and math.isnan(success):
+            success = "nan"
         row = {
             **self.spec.to_json(),
             "index": self.index,
             "reward": self.reward,
             "length": self.length,
             # A verdict as such, a share as a number.
-            "success": self.success if value in (0, 1) else "nan" if value != value else value,
+            "success": self.success if success in (0, 1) else success,
             "sub_env": self.sub_env,
             "rewards": self.rewards,
             "outcome": self.outcome.to_json(),

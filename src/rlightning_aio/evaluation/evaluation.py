@@ -84,8 +84,8 @@ class Evaluation:
         left out of the success rate.
         """
         found, values = list[str](), self._success_values
-        told = sum(one.success_value is not None for one in self.played)
-        if not told:
+        known = sum(one.success_value is not None for one in self.played)
+        if not known:
             return found
         if any(value not in (0, 1) for value in values):
             found.append(
@@ -93,10 +93,10 @@ class Evaluation:
             )
         left_out = len(self.attempts) - len(values)
         if left_out:
-            failed, silent = len(self.failed), len(self.played) - told
+            failed, silent = len(self.failed), len(self.played) - known
             parts = [f"{failed} failed"] * bool(failed)
             parts += [f"{silent} with no success in the last info"] * bool(silent)
-            parts += [f"{told - len(values)} whose success is NaN"] * (told > len(values))
+            parts += [f"{known - len(values)} whose success is NaN"] * (known > len(values))
             least = sum(value > 0.5 for value in values) / len(self.attempts)
             found.append(
                 f"the success rate leaves out {' and '.join(parts)} of {len(self.attempts)} "
