@@ -6,14 +6,14 @@ over, also when it was lost with a worker.
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.policies.episodes import begins_of_envs
-from rlightning_aio.trees import as_array, index, mapped, stacked, walked, zipped
+from rlightning_aio.trees import Tree, as_array, index, mapped, stacked, walked, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -23,6 +23,22 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
 
 __all__ = ["ActionChunks"]
+
+
+@dataclass(slots=True)
+class _Left:
+    """Actions that an env plays, of how many each is the average, and how many were played."""
+
+    actions: Tree
+    counts: NDArray[np.int64]
+    played: int = 0
+
+    def __len__(self) -> int:
+        return len(self.counts) - self.played
+
+    def next(self) -> Tree:
+        self.played += 1
+        return index(self.actions, self.played - 1)
 
 
 class ActionChunks:
@@ -61,8 +77,7 @@ class ActionChunks:
                 "with temporal_ensemble every step asks for a chunk: no n_action_steps"
             )
         self._policy, self._steps, self._decay = policy, n_action_steps, temporal_ensemble
-        self._left: dict[str, deque[tuple[Any, int]]] = {}
-        """Actions that envs will play next, and of how many each is the average."""
+        self._left: dict[str, _Left] = {}
 
     def __call__(self, batch: BatchedData) -> Any:
         """Return the next action of each env, awaitable if the policy's answer is."""
@@ -101,29 +116,32 @@ class ActionChunks:
                 f"the policy's chunks have {horizon} actions, fewer than "
                 f"n_action_steps={self._steps}"
             )
+        count = self._steps or horizon
         for row, env_id in enumerate(env_ids):
-            chunk = index(chunks, row)
-            actions = [index(chunk, k) for k in range(self._steps or horizon)]
-            before = self._left.get(env_id, ())
-            self._left[env_id] = deque(
-                map(self._averaged, actions, [*before, *[(None, 0)] * horizon])
-            )
-
-    def _averaged(self, action: Any, before: tuple[Any, int]) -> tuple[Any, int]:
-        """Add an action to the average of those that were predicted before for the same step."""
-        mean, count = before
-        if not count:
-            return action, 1
-        weights = np.exp(-(self._decay or 0.0) * np.arange(count + 1))
-        share = float(weights[-1] / weights.sum())
-
-        def moved(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
-            return old + share * (new - old)
-
-        return zipped(moved, mean, action), count + 1
+            own = _Left(mapped(lambda leaf, k=row: leaf[k], chunks), np.ones(count, np.int64))
+            if self._decay is not None and env_id in self._left:
+                _average(self._left[env_id], own, self._decay)
+            self._left[env_id] = own
 
     def _next(self, env_ids: list[str]) -> Any:
-        return stacked([self._left[env_id].popleft()[0] for env_id in env_ids])
+        return stacked([self._left[env_id].next() for env_id in env_ids])
+
+
+def _average(before: _Left, now: _Left, decay: float) -> None:
+    """Add a new chunk to the averages of those that were predicted before for the same steps."""
+    counts = before.counts[before.played :][: len(now)]
+    size = len(counts)
+    most: int = counts.max(initial=0)
+    weights = np.exp(-decay * np.arange(most + 1))
+    shares = (weights / weights.cumsum())[counts]
+
+    def moved(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+        old = old[before.played :][:size]
+        new[:size] = old + (shares * (new[:size] - old).T).T
+        return new
+
+    zipped(moved, before.actions, now.actions)
+    now.counts[:size] += counts
 
 
 def _checked(leaf: Any, count: int, lengths: set[int]) -> NDArray[Any]:
