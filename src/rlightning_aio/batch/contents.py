@@ -91,14 +91,17 @@ def values_or_faults(batch: BatchedData) -> list[Any]:
 
 def readable(batch: BatchedData) -> tuple[BatchedData, list[EnvFault]]:
     """Return the results of a batch that can be read here, and the errors of the others."""
-    if not any(part.out_of_band for part in parts_of(batch)):
-        return batch, []
-    found = values_or_faults(batch)
-    faults = [one for one in found if isinstance(one, EnvFault)]
+    faults: dict[int, EnvFault] = {}
+    for part in parts_of(batch):
+        for row in part.out_of_band:
+            try:
+                part.out_of_band_of(row)
+            except EnvFault as fault:
+                faults[row if part.positions is None else part.positions.item(row)] = fault
     if not faults:
         return batch, []
-    rows = [row for row, one in enumerate(found) if not isinstance(one, EnvFault)]
-    return batch.take(rows), faults
+    rows = [row for row in range(len(batch)) if row not in faults]
+    return batch.take(rows), [fault for _, fault in sorted(faults.items(), key=lambda one: one[0])]
 
 
 def lost_rows(batch: BatchedData) -> set[int]:
