@@ -112,13 +112,9 @@ def attempt_of(row: Mapping[str, Any]) -> Attempt:
     spec = spec_of(fields)
     outcome = Outcome.from_json(fields.pop("outcome"))
     failures = tuple(map(Outcome.from_json, fields.pop("failures")))
-    rewards = [math.nan if reward is None else reward for reward in fields.pop("rewards")]
-    reward, success = fields.pop("reward"), fields.pop("success")
-    if reward is None and not outcome.is_failure:  # It was not finite.
-        reward = math.nan
+    success = fields.pop("success")
     value = None if success is None else float(success)
-    known = {"outcome": outcome, "failures": failures, "rewards": rewards, "reward": reward}
-    return Attempt(spec, **known, success_value=value, **fields)
+    return Attempt(spec, outcome=outcome, failures=failures, success_value=value, **fields)
 
 
 def _json_or_none(value: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 from dataclasses import asdict, dataclass, field
 
 # Typer reads annotations.
@@ -33,7 +32,6 @@ from rlightning_aio.cli.terminal import (
     count,
     counted,
     named_columns,
-    notes_on_returns,
     number,
     print_json,
     print_lines,
@@ -373,9 +371,6 @@ def _notes(found: Evaluation) -> list[str]:
     if failures := found.failures:
         kinds = ", ".join(f"{count(failures[kind])} {kind}" for kind in sorted(failures))
         notes.append(f"tries that failed, by the kind of their outcome: {kinds}")
-    notes += notes_on_returns(
-        attempt.env_id for attempt in found.played if not math.isfinite(attempt.reward or 0.0)
-    )
     failed = found.failed
     notes += [_failure(attempt) for attempt in failed[:_NAMED]]
     if len(failed) > _NAMED:

@@ -43,7 +43,6 @@ __all__ = [
     "in_words",
     "interruptible",
     "named_columns",
-    "notes_on_returns",
     "number",
     "print_json",
     "print_lines",
@@ -55,8 +54,6 @@ INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as in shells."""
 _WIDE: Final = 160
 """Width of a table in a file, whose readers wrap lines themselves."""
-_NAMED: Final = 8
-"""Number of envs that a message names; further ones are counted."""
 _LONG: Final = 1e12
 """Smallest number that is written with a power of ten."""
 _REFRESH_SECONDS: Final = 0.25
@@ -108,16 +105,6 @@ def named_columns(title: str, *names: str, texts: Sequence[str] = ()) -> Table:
             name, justify="left" if is_text else "right", overflow="fold", vertical="bottom"
         )
     return table
-
-
-def notes_on_returns(env_ids: Iterable[str]) -> list[str]:
-    """Return a note on envs whose returns are not finite, or an empty list."""
-    named = sorted(set(env_ids))
-    if not named:
-        return []
-    more = f" and {count(len(named) - _NAMED)} more" if len(named) > _NAMED else ""
-    note = f"returns of {', '.join(named[:_NAMED])}{more} are NaN, infinite or too large to add up"
-    return [f"{note}; figures with them are left out"]
 
 
 # -- errors and signals ---------------------------------------------------------------

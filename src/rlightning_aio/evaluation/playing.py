@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
@@ -272,7 +273,7 @@ class PolicyPlay:
         places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
         stepped = self._counts[places] & ~begins
         rewards = np.where(stepped, summed_rewards(batch.reward).reshape(-1), 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):  # The return shows it.
+        with np.errstate(over="ignore", invalid="ignore"):  # It has failed.
             self._reward[places] += rewards
         self._length[places] += stepped
         done = all_agents(batch.done)
@@ -327,11 +328,15 @@ class PolicyPlay:
         job = self._jobs.pop(place, None)
         if job is None:
             return
-        if not outcome.is_failure and np.isnan(self._reward[place]):
-            outcome = Outcome("env_raised", "env", "returned no reward", env_id)
+        reward = float(self._reward[place])
+        if not (outcome.is_failure or math.isfinite(reward)):
+            cause = (
+                "returned no reward" if math.isnan(reward) else f"its rewards are {reward} in sum"
+            )
+            outcome = Outcome("env_raised", "env", cause, env_id)
         attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
         if not outcome.is_failure:
-            attempt.reward, attempt.success_value = float(self._reward[place]), success
+            attempt.reward, attempt.success_value = reward, success
             attempt.length = int(self._length[place])
         self._counts[place] = False
         self._ended.append((job, attempt))
