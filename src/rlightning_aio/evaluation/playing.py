@@ -330,9 +330,7 @@ class PolicyPlay:
             return
         reward = float(self._reward[place])
         if not (outcome.is_failure or math.isfinite(reward)):
-            cause = (
-                "returned no reward" if math.isnan(reward) else f"its rewards are {reward} in sum"
-            )
+            cause = "returned no reward" if math.isnan(reward) else f"rewards add up to {reward}"
             outcome = Outcome("env_raised", "env", cause, env_id)
         attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
         if not outcome.is_failure:
