@@ -41,9 +41,11 @@ RUNS = {
 }
 """The name of each report, and the program with its arguments that writes it."""
 PICTURED = next(iter(RUNS))
-WIDTH, TOP, LEFT, LONGEST = 720, 44, 250, 370
-BAR, GAP = 22, 6
-OURS_COLOUR, THEIRS_COLOUR = "#3f51b5", "#b0b4c3"
+WIDTH, TOP, LEFT, LONGEST, BAR, GAP = 400, 56, 188, 152, 20, 6
+STYLE = """text{font-size:12px;font-family:sans-serif;fill:#222}.page{fill:#fff}
+.ours{fill:#3f51b5}.theirs{fill:#b0b4c3}
+@media(prefers-color-scheme:dark){text{fill:#eee}.page{fill:#1e2129}.ours{fill:#7986cb}
+.theirs{fill:#666d80}}"""
 
 
 def run(name: str) -> bool:
@@ -107,32 +109,28 @@ def drawn(results: Path) -> str:
     report = json.loads((results / f"{PICTURED}.json").read_text())
     rates = {name: found["median"] for name, found in report["results"].items()}
     height, machine = TOP + len(rates) * (BAR + GAP) + GAP, report["machine"]
-    size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
-    title = f"{report['title']}: env steps per second, {machine['cores']} cores"
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="sans-serif" font-size="14">',
-        f"<title>{escape(title)}</title>",
-        f'<rect width="{WIDTH}" height="{height}" rx="8" fill="#ffffff"/>',
-        _text(16, 26, f"{title} ({machine['cpu']}), {machine['date']}", weight="bold"),
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="600">',
+        f"<title>{escape(report['title'])}</title><style>{STYLE}</style>",
+        f'<rect width="{WIDTH}" height="{height}" rx="6" class="page"/>',
+        _text(10, 20, f"{report['title']}: env steps per second", weight="bold"),
+        _text(10, 38, f"{machine['cores']} cores ({machine['cpu']}), {machine['date']}"),
     ]
     for row, name in enumerate(sorted(rates, key=lambda name: -rates[name])):
         y, length = TOP + row * (BAR + GAP), LONGEST * rates[name] / max(rates.values())
-        colour = OURS_COLOUR if name.startswith("rlightning_aio") else THEIRS_COLOUR
+        kind = "ours" if name.startswith("rlightning_aio") else "theirs"
         shape = f'x="{LEFT}" y="{y}" width="{length:.0f}" height="{BAR}" rx="3"'
         parts += [
-            _text(LEFT - 10, y + 16, name, anchor="end"),
-            f'<rect {shape} fill="{colour}"/>',
+            _text(10, y + 14, name),
+            f'<rect {shape} class="{kind}"/>',
             # Three digits, as in the tables.
-            _text(LEFT + length + 8, y + 16, f"{float(f'{rates[name]:.3g}'):,.0f}"),
+            _text(LEFT + length + 6, y + 14, f"{float(f'{rates[name]:.3g}'):,.0f}"),
         ]
     return "\n".join([*parts, "</svg>", ""])
 
 
-def _text(x: float, y: int, text: str, *, anchor: str = "start", weight: str = "normal") -> str:
-    return (
-        f'<text x="{x:.0f}" y="{y}" text-anchor="{anchor}" font-weight="{weight}" '
-        f'fill="#22252d">{escape(text)}</text>'
-    )
+def _text(x: float, y: int, text: str, *, weight: str = "normal") -> str:
+    return f'<text x="{x:.0f}" y="{y}" font-weight="{weight}">{escape(text)}</text>'
 
 
 def main() -> int:
