@@ -339,8 +339,9 @@ class Attempts(InContext):
         self._check_shown(env, attempt.first, script)
         rewards: list[float] = []
         ended = cut = False
+        info: dict[str, Any] = {}
         for act in played.acts:
-            reward, ended, cut, _ = script.step(*act)
+            reward, ended, cut, info = script.step(*act)
             rewards.append(reward)
         require(attempt.rewards == rewards, "other rewards", rewards)
         require(attempt.length == len(rewards), "another length", len(rewards))
@@ -368,6 +369,8 @@ class Attempts(InContext):
             self._check_shown(env, attempt.last, script)
         if not outcome.is_failure:
             require(attempt.reward == sum(rewards), "another reward", sum(rewards))
+            success = info["success"] > 0.5 if "success" in info else None
+            require(attempt.success == success, "another success", success)
 
     def _script(self, played: Played, steps: int | None = None) -> Script:
         """The script of an env, where some steps of an attempt lead to."""

@@ -1068,7 +1068,7 @@ class Play(Session):
         sized = ("vector", "single", "digits", "number")
         fits = [k for k, i in enumerate(ids) if self.model.envs[i].entry.controls in sized]
         kinds = ["unknown", "double", "count"] + ["shape"] * bool(fits)
-        kind = rng.choice(kinds + ["busy"] * bool(busy) + ["foreign"] * (len(ids) > 1))
+        kind = rng.choice(kinds + ["busy"] * bool(busy) + ["foreign", "seed"] * (len(ids) > 1))
         wrong: Any = EnvBusy
         if kind == "unknown":
             ids.append("nobody-7")
@@ -1080,6 +1080,11 @@ class Play(Session):
         elif kind == "foreign":
             ids[0], ids[1] = ids[1], ids[0]
             wrong = BadAction
+        elif kind == "seed":
+            seeds = dict.fromkeys(ids, 3)
+            with self.expected(ValueError, "a seed of an env that is not reset"):
+                self.group.reset_async(seeds, env_ids=ids[1:])
+            return
         elif kind == "busy":
             env = rng.choice(busy)  # Its error may have been read, but it was not collected.
             ids.append(env.env_id)

@@ -54,6 +54,9 @@ class Machine:
     def make(self, code: int) -> None:
         """Begin to make the env whose first script has this code."""
 
+    def closing(self, code: int, *, ends: bool) -> None:
+        """Begin to close an awaitable env, or end that."""
+
     async def await_for(self, seconds: float) -> None:
         """Like `spend`, in an awaitable env, while others continue."""
         await asyncio.sleep(seconds / 100)
@@ -242,8 +245,9 @@ class Script:
 def _changing(token: int) -> dict[str, Any]:
     """An entry of an info whose key and type depend on the token."""
     kinds: tuple[dict[str, Any], ...] = (
-        {"success": token % 8 > 3}, {"extra": token / 2}, {"text": f"t{token}"},
+        {"success": token % 8 / 8}, {"extra": token / 2}, {"text": f"t{token}"},
         {"array": np.full(3, token, np.float32)}, {"extra": token}, {"extra": token / 4},
+        {"": token},
     )  # fmt: skip
     return kinds[token % len(kinds)]
 
@@ -410,8 +414,8 @@ LAYOUTS: dict[str, Layout] = {
     ),
     "list": Layout(
         spaces.Sequence(spaces.Box(0, 1 << 20, (1,), np.float64)),
-        lambda w: tuple(np.array([word], np.float64) for word in w),
-        lambda o: [one[0] for one in o],
+        lambda w: tuple(np.array([word], np.float64) for word in (*w, *range(w.mix % 3))),
+        lambda o: [one[0] for one in o[:5]],
     ),
     "part": Layout(
         spaces.Dict(named=_VECTOR, said=spaces.Text(8, charset=_NUMBERS)),
@@ -532,13 +536,27 @@ class _Body:
 
 
 class _Single(_Body):
+    """One script; those with an odd code return the same array again and again."""
+
     def __init__(self, code: int, layout: str, controls: str) -> None:
         super().__init__([code], "disabled", layout, controls)
+        self._returned: np.ndarray | None = None
         self.observation_space = deepcopy(LAYOUTS[layout].space)
         self.action_space = deepcopy(CONTROLS[controls].space)
 
+    def observed(self, words: Words, effect: str = "plain") -> Any:
+        observed = super().observed(words, effect)
+        if not self.scripts.subs[0].code % 2 or not isinstance(observed, np.ndarray):
+            return observed
+        if self._returned is None:
+            self._returned = observed
+        self._returned[...] = observed
+        return self._returned
+
     def _begun(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
         (info,) = self.scripts.reset(seed, options)
+        if options is not None:
+            options.clear()  # They are this env's own.
         return self.observed(self.scripts.words[0]), info
 
     def _stepped(self, act: Act) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -570,7 +588,7 @@ class Scripted(_Single, gym.Env[Any, Any]):
 
 
 class Awaitable(_Single):
-    """A script with `async def`."""
+    """A script with `async def`; one with an odd code takes long to close."""
 
     async def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
         for fault in self.scripts.faults_of_reset(options):
@@ -581,6 +599,16 @@ class Awaitable(_Single):
         act = decoded(self.controls, action)
         await perform_awaiting(*act)
         return self._stepped(act)
+
+    async def close(self) -> None:
+        code = self.scripts.subs[0].code
+        machine.closing(code, ends=False)
+        try:
+            if code % 2:
+                await machine.await_for(3.0)
+            super().close()
+        finally:
+            machine.closing(code, ends=True)
 
 
 class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
@@ -619,6 +647,8 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
         for fault in self.scripts.faults_of_reset(options):
             perform(*fault)
         infos = self.scripts.reset(seed, options)
+        if options is not None:
+            options.clear()
         return self._stacked(self.scripts.words), self._joined(infos)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:

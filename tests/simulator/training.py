@@ -480,20 +480,22 @@ class Evaluations(InContext):
         if attempt.outcome.is_failure:
             require(attempt.reward is None, "a failure with a reward", attempt)
         else:
-            shown = attempt.reward, attempt.length
+            shown = attempt.reward, attempt.length, attempt.success
             right = self.played(env, k, seed, attempt.spec.options)
             require(shown == right, "an episode", attempt, right)
 
-    def played(self, env: Env, k: int, seed: int | None, options: Any) -> tuple[float, int]:
-        """Return and length of an episode that is played alone."""
+    def played(
+        self, env: Env, k: int, seed: int | None, options: Any
+    ) -> tuple[float, int, bool | None]:
+        """Return, length and success of an episode that is played alone."""
         script = Script(env.codes[k], env.entry.own_limit)
         script.reset(seed, options)
         total, length = 0.0, 0
         while True:
-            reward, ended, cut, _ = script.step(*self.choose(script.words))
+            reward, ended, cut, info = script.step(*self.choose(script.words))
             total, length = total + reward, length + 1
             if ended or cut or length >= self.limit_of(env):
-                return total, length
+                return total, length, info["success"] > 0.5 if "success" in info else None
 
     async def finish(self) -> None:
         await self.settle()

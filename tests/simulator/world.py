@@ -130,6 +130,7 @@ class World:
         network: between env_servers and their clients, which `Network.client` starts.
         deaths: of each process that ended with an error, by its name.
         made: how often each env was made, by the code of its first script.
+        closing: codes of awaitable envs that close, and whose process they are in.
         ended: it is no more.
         stopped: processes that are stopped.
         running: whose code runs: a process's, the kernel's or a fork server's (`NOBODY`), or the
@@ -142,6 +143,7 @@ class World:
         self.counts: Counter[str] = Counter()
         self.deaths: Counter[str] = Counter()
         self.made: Counter[int] = Counter()
+        self.closing: set[tuple[int, Process | Nobody | None]] = set()
         self.wrongs: list[str] = []
         self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
@@ -477,6 +479,12 @@ class SimulatedMachine:
         if int(told) != made[code]:
             self._world.wrongs.append(f"{code} was made {made[code]} times, and is told {told}")
         made[code] += 1
+        if (code, self._world.running) in self._world.closing:
+            self._world.wrongs.append(f"{code} is made while the one before still closes")
+
+    def closing(self, code: int, *, ends: bool) -> None:
+        closing, one = self._world.closing, (code, self._world.running)
+        closing.discard(one) if ends else closing.add(one)
 
     async def await_for(self, seconds: float) -> None:
         await asyncio.sleep(seconds)
