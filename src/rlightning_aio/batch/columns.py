@@ -1,7 +1,8 @@
-"""`ResultColumns`: the arrays of a batch of results."""
+"""`ResultColumns`: the arrays of a batch of results, and `EnvNames`, of the envs of a group."""
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 import time
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,6 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.errors import unreadable
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
@@ -24,6 +24,41 @@ if TYPE_CHECKING:
 
 # Offset of the monotonic clock, which stamps results, from the epoch.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class EnvNames:
+    """Ids and config entries of the envs of a group, by slot; they never change.
+
+    Attributes:
+        env_ids: id of each env.
+        entries: number of the config entry of each slot; entry_names: names of the entries.
+        index_offset: position in the group of the first sub-environment of each slot.
+    """
+
+    env_ids: Sequence[str]
+    entries: NDArray[np.intp]
+    entry_names: Sequence[str]
+    index_offset: NDArray[np.int64]
+
+    def ids(self, slots: NDArray[np.intp]) -> list[str]:
+        """Ids of `slots`, in order."""
+        chosen: list[int] = slots.tolist()
+        return [self.env_ids[slot] for slot in chosen]
+
+    def names(self, slots: NDArray[np.intp]) -> list[str]:
+        """Config entries of `slots`, in order."""
+        chosen: list[int] = self.entries[slots].tolist()
+        return [self.entry_names[entry] for entry in chosen]
+
+    def of(self, slots: NDArray[np.intp]) -> EnvNames:
+        """Select `slots`, which become slots 0, 1, 2, …"""
+        return dataclasses.replace(
+            self,
+            env_ids=self.ids(slots),
+            entries=self.entries[slots],
+            index_offset=self.index_offset[slots],
+        )
 
 
 class ResultColumns(msgspec.Struct):

@@ -15,12 +15,13 @@ from rlightning_aio.batch.data import (
     parts_of,
     slots_of,
 )
-from rlightning_aio.batch.endings import all_agents, summed_rewards
 from rlightning_aio.batch.parts import (
+    all_agents,
     column_of_parts,
     infos_of_parts,
     reported_infos_of_parts,
     rows_in_order,
+    summed_rewards,
 )
 from rlightning_aio.errors import EnvFault
 

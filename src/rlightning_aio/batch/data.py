@@ -15,19 +15,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rlightning_aio.batch.endings import outcomes_of
+from rlightning_aio.batch.columns import EnvNames
 from rlightning_aio.batch.infos import vector_infos
-from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.batch.parts import (
     column_of_parts,
     in_order,
     infos_of_parts,
     observations_of_parts,
+    outcomes_of,
+    rets_of,
     rows_in_order,
     shapes,
     taken_parts,
 )
-from rlightning_aio.batch.rets import rets_of
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.batch.names import EnvNames
+from rlightning_aio.batch.columns import EnvNames
 from rlightning_aio.config import makers_of
 from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.registry import name_of
