@@ -143,3 +143,28 @@ def test_a_module_that_a_worker_imports_does_not_undo_what_the_program_has_chang
         with rl.build_env_group({**entry, **fields}) as group:
             assert group.reset()[0].info("told") == ["new"]
     del sys.modules["registers_tasks"]
+
+
+def test_workers_import_a_task_of_the_program_when_they_make_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A trainer that has imported a simulator has all its tasks; other workers don't need it."""
+    (tmp_path / "a_simulator.py").write_text(
+        "import gymnasium as gym\n"
+        "def make(**kwargs): return gym.make('Pendulum-v1', **kwargs)\n"
+        f"gym.register('Simulated-v0', make, max_episode_steps={LIMIT})\n"
+    )
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    __import__("a_simulator")
+
+    def told(name: str | None) -> Any:
+        """The env of a task, and whether its simulator was imported before it was made."""
+        env = Told(told=str("a_simulator" in sys.modules))
+        if name is not None:
+            env.told += f" {gym.make(name).spec.max_episode_steps}"  # type: ignore[union-attr]
+        return env
+
+    envs = VectorEnv([lambda: told(None), lambda: told("Simulated-v0")])
+    assert list(envs.reset()[1]["told"]) == ["False", f"False {LIMIT}"]
+    envs.close()
+    del sys.modules["a_simulator"]

@@ -6,6 +6,7 @@ A script registers its tasks when it starts, and may change registered ones; wor
 from __future__ import annotations
 
 import contextlib
+import copy
 import functools
 import pickle
 import sys
@@ -25,23 +26,54 @@ if TYPE_CHECKING:
 def known_tasks() -> tuple[bytes, ...]:
     """Return all registered tasks that can be pickled.
 
-    Those that are named by texts come together; a class or function of another is unpickled by
-    itself, so that one whose module is missing in the worker costs no others.
+    Those that are named by texts come together; another is unpickled by itself, so that one whose
+    arguments a worker can't import costs no others.
     """
     specs = list(gym.registry.values())
     named = [spec for spec in specs if _is_text(spec.entry_point, spec.vector_entry_point)]
     others = [spec for spec in specs if not _is_text(spec.entry_point, spec.vector_entry_point)]
-    return (*_pickled(named), *(one for spec in others for one in _pickled([spec])))
+    return (*_pickled(named), *(one for spec in others for one in _pickled_alone(spec)))
 
 
 def _is_text(*entry_points: Any) -> bool:
     return all(isinstance(one, str | None) for one in entry_points)
 
 
+def _pickled_alone(spec: EnvSpec) -> Iterator[bytes]:
+    with contextlib.suppress(Exception):
+        entry_points: dict[str, Any] = {
+            name: one if _is_text(one) else _Deferred(dumped_with_code(one))
+            for name in ("entry_point", "vector_entry_point")
+            for one in [getattr(spec, name)]
+        }
+        later = copy.copy(spec)
+        vars(later).update(entry_points)
+        yield dumped_with_code([later])
+
+
+class _Deferred:
+    """A class or function of the trainer, which a worker imports when it makes an env of it.
+
+    A trainer that has imported a simulator has all its tasks registered, and the workers of other
+    envs would import it, too, with seconds and gigabytes.
+    """
+
+    def __init__(self, pickled: bytes) -> None:
+        self._pickled = pickled
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return pickle.loads(self._pickled)(*args, **kwargs)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # Asked by pickle and copy, before there is anything to unpickle.
+            raise AttributeError(name)
+        return getattr(pickle.loads(self._pickled), name)
+
+
 def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
     try:
-        yield dumped(specs, "") if len(specs) > 1 else dumped_with_code(specs)
-    except Exception:
+        yield dumped(specs, "")
+    except TypeError:
         if len(specs) > 1:
             for spec in specs:
                 yield from _pickled([spec])
