@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf
+from rlightning_aio.protocol.columns import in_brackets
 from rlightning_aio.trees import tree_of, walked
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
         # In this form NaN is outside.
         outside = ~((array >= low) & (array <= high))
         if outside.any():
-            name = Leaf(path, (), array.dtype).name
+            name = in_brackets(path)
             number, least, most = (one[outside][0] for one in (array, low, high))
             yield f"{what}{name} holds {number}, and the space goes from {least} to {most}"
 

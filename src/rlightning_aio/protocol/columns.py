@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.trees import Node, Tree
+    from rlightning_aio.trees import Node, Path, Tree
 
 Rows: TypeAlias = "slice | NDArray[np.intp]"
 """A selection of rows: a slice for a contiguous range, else an index array."""
@@ -35,14 +35,19 @@ _FIXED = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 class Leaf:
     """One array of a tree: its path, and the shape and dtype of one row."""
 
-    path: tuple[str | int, ...]
+    path: Path
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
 
     @property
     def name(self) -> str:
         """The path in Python's notation; empty for a space of one array."""
-        return "".join(f"[{key!r}]" for key in self.path)
+        return in_brackets(self.path)
+
+
+def in_brackets(path: Path) -> str:
+    """Write the keys that lead to an array in Python's notation."""
+    return "".join(f"[{key!r}]" for key in path)
 
 
 def leaves(space: gym.Space[Any]) -> tuple[Leaf, ...] | None:
@@ -79,8 +84,8 @@ def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
     return isinstance(space, _FIXED)
 
 
-def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
-    """Arrange `arrays`, given in the order of `leaves`, in the structure of `space`."""
+def assemble(space: gym.Space[Any], arrays: Iterator[Any]) -> Tree:
+    """Arrange `arrays`, or others, given in the order of `leaves`, in the structure of `space`."""
     return mapped(lambda _: next(arrays), tree_of(space))
 
 
@@ -145,7 +150,7 @@ def fitted_tree(
     space: gym.Space[Any],
     value: Any,
     what: str,
-    path: tuple[str | int, ...] = (),
+    path: Path = (),
 ) -> Tree:
     """Convert `value` to arrays with the shapes and dtypes of `space`, without needless copies.
 
@@ -159,7 +164,7 @@ def fitted_tree(
         parts = space.spaces.items()
         return {k: fitted_tree(inner, value[k], what, (*path, k)) for k, inner in parts}
     if is_tuple(space):
-        _check_length(value, len(space.spaces), what, path)
+        check_length(value, len(space.spaces), what, path)
         return tuple(
             fitted_tree(inner, part, what, (*path, position))
             for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
@@ -168,23 +173,24 @@ def fitted_tree(
     return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
 
 
-def check_keys(
-    value: Any, keys: Collection[str], what: str, path: tuple[str | int, ...] = ()
-) -> None:
+def check_keys(value: Any, keys: Collection[str], what: str, path: Path = ()) -> None:
     """Raise `Misfit` if `value` is no dict with these keys."""
     if not hasattr(value, "keys") or value.keys() != keys:
         raise _misplaced(what, path, f"a dict with keys {sorted(map(str, keys))}", value)
 
 
-def _check_length(value: Any, length: int, what: str, path: tuple[str | int, ...]) -> None:
+def check_length(value: Any, length: int, what: str, path: Path) -> None:
+    """Raise `Misfit` if `value` is no tuple or list of this length."""
     if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != length:
         raise _misplaced(what, path, f"a tuple of {length}", value)
 
 
-def _misplaced(what: str, path: tuple[str | int, ...], expected: str, value: Any) -> Misfit:
-    place = Leaf(path, (), np.dtype(bool)).name
+def _misplaced(what: str, path: Path, expected: str, value: Any) -> Misfit:
     found = f"keys {sorted(map(str, value))}" if hasattr(value, "keys") else type(value).__name__
-    return Misfit(f"{what}{place} doesn't fit its space: expected {expected}, found {found}")
+    if isinstance(value, tuple | list):
+        found = f"one of {len(cast('list[Any]', value))}"
+    place = what + in_brackets(path)
+    return Misfit(f"{place} doesn't fit its space: expected {expected}, found {found}")
 
 
 def row_writer(
@@ -192,7 +198,7 @@ def row_writer(
     tree: Tree,
     row: int,
     what: str,
-    path: tuple[str | int, ...] = (),
+    path: Path = (),
 ) -> Callable[[Any], None]:
     """Make a function that copies a value of `space` into `row` of `tree`.
 
@@ -231,7 +237,7 @@ def _dict_writer(
     tree: Tree,
     row: int,
     what: str,
-    path: tuple[str | int, ...],
+    path: Path,
 ) -> Callable[[Any], None]:
     writers = {
         key: row_writer(inner, tree[key], row, what, (*path, key))
@@ -251,7 +257,7 @@ def _tuple_writer(
     tree: Tree,
     row: int,
     what: str,
-    path: tuple[str | int, ...],
+    path: Path,
 ) -> Callable[[Any], None]:
     writers = [
         row_writer(inner, part, row, what, (*path, position))
@@ -259,7 +265,7 @@ def _tuple_writer(
     ]
 
     def write(value: tuple[Any, ...] | list[Any] | NDArray[Any]) -> None:
-        _check_length(value, len(writers), what, path)
+        check_length(value, len(writers), what, path)
         for writer, part in zip(writers, value, strict=True):
             writer(part)
 

@@ -16,9 +16,17 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.protocol.columns import Leaf, Misfit, check_keys, fitted
+from rlightning_aio.protocol.columns import (
+    Leaf,
+    Misfit,
+    assemble,
+    check_keys,
+    check_length,
+    fitted,
+    in_brackets,
+)
 from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
-from rlightning_aio.trees import as_array
+from rlightning_aio.trees import as_array, mapped, tree_of, walked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.protocol.net.wire import Compression
+    from rlightning_aio.trees import Path, Tree
 
 MAX_HEAD = 1 << 20
 """Rewards of one result."""
@@ -61,10 +70,14 @@ class SpaceLayout:
     def __init__(
         self, space: gym.Space[Any], what: str, compression: Compression | None = None
     ) -> None:
-        self._node = _node_of(space, what, _Zstd() if compression else None)
-        self._only = self._node.form if type(self._node) is _Array else None
-        self.num_frames = self._node.num_frames
-        self.num_texts = self._node.num_texts
+        zstd = _Zstd() if compression else None
+        parts = walked(tree_of(space))
+        codecs = [_codec_of(part, what + in_brackets(path), zstd) for path, part in parts]
+        self._what = what
+        self._tree = assemble(space, iter(codecs))
+        self._only = self._tree.form if type(self._tree) is _Array else None
+        self.num_texts = sum(type(codec) is _Text for codec in codecs)
+        self.num_frames = len(codecs) - self.num_texts
 
     def pack(self, value: Any, packed: Packed) -> None:
         """Append `value` to `packed`; the bytes are copies.
@@ -72,7 +85,21 @@ class SpaceLayout:
         Raises:
             Misfit: it doesn't fit the space; the message says what was expected and found.
         """
-        self._node.pack(value, packed)
+        self._pack(self._tree, value, packed, ())
+
+    def _pack(self, tree: Tree, value: Any, packed: Packed, path: Path) -> None:
+        if isinstance(tree, dict):
+            parts = cast("dict[str, Any]", tree)
+            check_keys(value, parts.keys(), self._what, path)
+            for key, part in parts.items():
+                self._pack(part, value[key], packed, (*path, key))
+        elif isinstance(tree, tuple):
+            parts = cast("tuple[Any, ...]", tree)
+            check_length(value, len(parts), self._what, path)
+            for position, (part, own) in enumerate(zip(parts, value, strict=True)):
+                self._pack(part, own, packed, (*path, position))
+        else:
+            tree.pack(value, packed)
 
     def unpack(self, frames: Sequence[Part], texts: Sequence[str]) -> Any:
         """Return the value at the start of `frames`; its arrays are read-only views of them.
@@ -87,23 +114,11 @@ class SpaceLayout:
             )
         if self._only is not None:
             return self._only.read(frames[0])
-        return self._node.unpack(_Arriving(iter(frames), iter(texts)))
+        arriving = _Arriving(iter(frames), iter(texts))
+        return mapped(lambda codec: codec.unpack(arriving), self._tree)
 
 
-class _Node:
-    num_frames = 0
-    num_texts = 0
-
-    def pack(self, value: Any, packed: Packed) -> None:
-        raise NotImplementedError
-
-    def unpack(self, arriving: _Arriving) -> Any:
-        raise NotImplementedError
-
-
-class _Array(_Node):
-    num_frames = 1
-
+class _Array:
     def __init__(self, space: gym.Space[Any], what: str) -> None:
         shape = tuple(cast("tuple[int, ...]", space.shape))
         self.form = ArrayForm(DTYPES[np.dtype(space.dtype).name], shape)
@@ -196,9 +211,7 @@ class _Number(_Array):
         return number
 
 
-class _Text(_Node):
-    num_texts = 1
-
+class _Text:
     def __init__(self, space: spaces.Text, what: str) -> None:
         self._space = space
         self._what = what
@@ -215,51 +228,7 @@ class _Text(_Node):
         return text
 
 
-class _Parts(_Node):
-    """The common part of Dict and Tuple: values one after the other."""
-
-    def __init__(self, nodes: dict[Any, _Node], what: str) -> None:
-        self._nodes = nodes
-        self._what = what
-        self.num_frames = sum(node.num_frames for node in nodes.values())
-        self.num_texts = sum(node.num_texts for node in nodes.values())
-
-
-class _Dict(_Parts):
-    def pack(self, value: Any, packed: Packed) -> None:
-        check_keys(value, self._nodes.keys(), self._what)
-        for key, node in self._nodes.items():
-            node.pack(value[key], packed)
-
-    def unpack(self, arriving: _Arriving) -> Any:
-        return {key: node.unpack(arriving) for key, node in self._nodes.items()}
-
-
-class _Tuple(_Parts):
-    def pack(self, value: Any, packed: Packed) -> None:
-        if not isinstance(value, tuple | list):
-            raise self._misfit(type(value).__name__)
-        parts = cast("Sequence[Any]", value)
-        if len(parts) != len(self._nodes):
-            raise self._misfit(f"one of {len(parts)}")
-        for node, part in zip(self._nodes.values(), parts, strict=True):
-            node.pack(part, packed)
-
-    def _misfit(self, found: str) -> Misfit:
-        expected = f"a tuple of {len(self._nodes)}"
-        return Misfit(f"{self._what} doesn't fit its space: expected {expected}, found {found}")
-
-    def unpack(self, arriving: _Arriving) -> Any:
-        return tuple(node.unpack(arriving) for node in self._nodes.values())
-
-
-def _node_of(space: gym.Space[Any], what: str, zstd: _Zstd | None) -> _Node:
-    if isinstance(space, spaces.Dict):
-        items = cast("spaces.Dict[Any]", space).spaces.items()
-        return _Dict({key: _node_of(s, f"{what}[{key!r}]", zstd) for key, s in items}, what)
-    if isinstance(space, spaces.Tuple):
-        parts = enumerate(cast("spaces.Tuple[Any]", space).spaces)
-        return _Tuple({k: _node_of(s, f"{what}[{k}]", zstd) for k, s in parts}, what)
+def _codec_of(space: gym.Space[Any], what: str, zstd: _Zstd | None) -> _Array | _Text:
     if isinstance(space, spaces.Text):
         return _Text(space, what)
     if isinstance(space, spaces.Discrete):
@@ -350,10 +319,3 @@ class ResultLayout:
 
     def _by_agent(self, column: NDArray[Any]) -> Any:
         return dict(zip(self._agents, column, strict=True)) if self._agents else column
-
-    def cut_short(self, observation: Any) -> ResultFields:
-        """Return an outcome that is truncated at `observation`."""
-        if not self.head:
-            return ResultFields(observation, 0.0, False, True)
-        reward, flags = np.zeros(self.head), np.zeros(self.head, bool)
-        return ResultFields(observation, *map(self._by_agent, (reward, flags, ~flags)))
