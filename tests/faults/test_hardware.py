@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -27,7 +28,14 @@ from rlightning_aio import (
     sync,
 )
 from rlightning_aio.envs.hardware import watched
-from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, RLightningError
+from rlightning_aio.errors import (
+    BadAction,
+    ConfigError,
+    EnvHung,
+    EnvRaised,
+    RLightningError,
+)
+from rlightning_aio.protocol.entries import RENEW
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -228,6 +236,91 @@ async def test_an_awaitable_arm_stops_when_the_group_refuses_its_batch(
         wait_for(log, "stop")
 
 
+class Hanging(AwaitableArm):
+    """Never ends a step with a positive action."""
+
+    async def step(self, policy_resp: PolicyResponse) -> EnvRet:  # type: ignore[override]
+        if policy_resp.action[0] > 0:
+            await asyncio.sleep(HANG)
+        return await super().step(policy_resp)
+
+
+@pytest.mark.parametrize("placement", ["process", "loop"])
+async def test_the_arm_stops_that_took_the_place_of_another(
+    arm: Any, log: Path, placement: str
+) -> None:
+    ENVS.register("test arm", hardware=True)(Hanging)
+    fields = {**arm(placement), "on_worker_death": "restart", "step_timeout": 0.2}
+    async with build_env_group(fields) as group:
+        batch, _ = await group.reset()
+        with pytest.raises(EnvHung):
+            await group.step(batch.respond(action=np.ones((1, 2))))
+        wait_for(log, "stop")
+        with pytest.raises((EnvHung, EnvRaised)):
+            await group.step(batch.respond(action=np.zeros((1, 2))))
+        await group.reset()
+        assert lines(log) == ["reset", "stop", "reset"]
+        log.unlink()  # noqa: ASYNC240
+        with pytest.raises(BadAction):
+            await group.step(refused_batches()["NaN"]())
+        wait_for(log, "stop")
+
+
+@pytest.mark.parametrize("placement", ["process", "loop"])
+async def test_an_awaitable_arm_is_not_rebuilt_for_a_task(
+    arm: Any, log: Path, placement: str
+) -> None:
+    """Nor closed for that, so that it can be told to stop."""
+    ENVS.register("test arm", hardware=True)(AwaitableArm)
+    async with build_env_group(arm(placement)) as group:
+        batch, _ = await group.reset()
+        await group["arm-0"].call(RENEW)
+        await group.step(batch.respond(action=np.zeros((1, 2))))
+        with pytest.raises(BadAction):
+            await group.step(refused_batches()["NaN"]())
+        wait_for(log, "stop")
+    assert lines(log) == ["reset", "step [0.0, 0.0]", "stop"]
+
+
+class Closing(Arm):
+    """Notes every stop, and when it is closed and freed; the second of two closes slowly."""
+
+    def __init__(self, *arguments: Any, **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.itself = self  # So that only a collection frees it.
+
+    def stop(self) -> None:
+        self.note(f"{self.worker_index} stopped")
+
+    def close(self) -> None:
+        self.note(f"{self.worker_index} closed")
+        if self.worker_index:
+            time.sleep(0.3)
+
+    def __del__(self) -> None:
+        self.note(f"{self.worker_index} freed")
+
+
+def test_an_arm_that_has_closed_is_not_stopped_any_more(log: Path) -> None:
+    """Its connection is gone then, while another arm of the dead trainer closes."""
+    command = [sys.executable, "-c", TRAINER, "process", str(log), "two"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as trainer:
+        trainer.wait(HANG)
+    wait_for(log, "1 freed")
+    after = lines(log)[lines(log).index("0 closed") :]
+    assert "0 stopped" not in after
+    assert "1 stopped" not in after[after.index("0 freed") :]
+
+
+def test_an_arm_is_freed_when_its_group_closes(arm: Any, log: Path) -> None:
+    """Nothing keeps it, so that its own end runs."""
+    ENVS.register("test arm", hardware=True)(Closing)
+    with sync.build_env_group(arm("process")) as group:
+        group.reset()
+    wait_for(log, "0 freed")
+
+
 def test_an_actor_of_ray_gets_no_arm(arm: Any) -> None:
     with pytest.raises(ConfigError, match=r"placement: an actor of Ray can't be told to stop"):
         sync.build_env_group(arm("ray"))
@@ -245,13 +338,19 @@ def test_an_arm_stops_when_a_column_is_refused(arm: Any, log: Path, columns: Any
 
 TRAINER = """
 import sys
-from faults.test_hardware import Arm
+from faults.test_hardware import Arm, Closing
 from rlightning_aio import ENVS, sync
 import rlightning_aio as rl
 placement, log, kind = sys.argv[1:]
-ENVS.register("test arm", hardware=True)(Arm)
+ENVS.register("test arm", hardware=True)(Closing if kind == "two" else Arm)
 entry = {"name": "arm", "backend": "test arm", "task": "any", "placement": placement}
 entry["env_kwargs"] = {"log": log}
+if kind == "two":
+    import os, signal
+    entry |= {"num_workers": 2, "envs_per_process": 2}
+    with sync.build_env_group(entry) as group:
+        group.reset()
+        os.kill(os.getpid(), signal.SIGKILL)
 if kind == "sync":
     with sync.build_env_group(entry) as group:
         group.reset(options={"slow": True})
@@ -325,8 +424,8 @@ def test_envs_stop_at_the_same_time_and_at_least_once() -> None:
     """Each takes some time, and what wants them to stop may be over before anybody looks."""
     both = threading.Barrier(2)
     envs: Any = [Slow(both), Slow(both)]
-    watched(lambda: True, lambda: envs).join(HANG)
-    assert [env.num_stops for env in envs] == [1, 1]
+    watched(lambda: envs)()
+    assert envs[0].num_stops == envs[1].num_stops >= 1
 
 
 @pytest.mark.parametrize("seconds", [0, -1, "1", None, float("inf")])

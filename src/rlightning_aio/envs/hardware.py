@@ -32,6 +32,7 @@ __all__ = [
     "checked_input_of",
     "limit_actions",
     "stop",
+    "stop_all",
     "stopped_by_signals",
     "watched",
 ]
@@ -40,6 +41,8 @@ _log = logging.getLogger("rlightning_aio")
 
 _LOOK_SECONDS: Final = 0.01
 """Time between two looks at whether an env at work must stop."""
+_STOP_SECONDS: Final = 0.1
+"""How long others wait for the stop of an env, which may hang."""
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
@@ -59,6 +62,12 @@ def begin_stops(envs: Iterable[BaseEnv]) -> list[Thread]:
     for thread in threads:
         thread.start()
     return threads
+
+
+def stop_all(envs: Iterable[BaseEnv]) -> None:
+    """Stop `envs` at the same time, and wait until they have stopped, or for a moment each."""
+    for thread in begin_stops(envs):
+        thread.join(_STOP_SECONDS)
 
 
 def checked_input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
@@ -101,26 +110,32 @@ def _fitting(env: BaseEnv, action: Any) -> Any:
     raise BadAction(f"{env.env_id}: an action was refused: {fault}; the env got none and stops")
 
 
-def watched(is_over: Callable[[], bool], due: Callable[[], Iterable[BaseEnv]]) -> Thread:
-    """Start a thread that stops envs, even while they are at work in another thread.
+def watched(due: Callable[[], Iterable[BaseEnv]]) -> Callable[[], None]:
+    """Have a thread stop envs, even while they are at work in another thread.
 
     Args:
-        is_over: ends the thread, once those that are due then were stopped.
         due: returns the envs to stop now. One that is at work is returned until its work ends,
             as it may have begun to move after it was stopped.
+
+    Returns a function that ends this, once those that are due then were stopped. Idempotent.
     """
+    is_over = Event()
 
     def watch() -> None:
-        while True:
-            for thread in begin_stops(due()):
-                thread.join()
-            if is_over():
-                return
-            time.sleep(_LOOK_SECONDS)
+        is_last = False
+        while not is_last:
+            is_last = is_over.is_set()
+            stop_all(due())
+            is_over.wait(_LOOK_SECONDS)
 
     thread = Thread(target=watch, name="stops hardware", daemon=True)
     thread.start()
-    return thread
+
+    def end() -> None:
+        is_over.set()
+        thread.join()
+
+    return end
 
 
 @contextlib.contextmanager
@@ -129,26 +144,25 @@ def stopped_by_signals(envs: Iterable[BaseEnv]) -> Generator[None]:
 
     An event loop only notes Ctrl-C, so nothing else would end a motion that blocks it.
     """
-    is_over = Event()
     before: dict[int, Any] = {}
 
     def handle(number: int, frame: Any) -> None:
         for env in list(envs):  # By itself, as only one is at work, and is stopped again and again.
-            watched(is_over.is_set, lambda env=env: [env])
+            ends.callback(watched(lambda env=env: [env]))
         before[number](number, frame)
 
-    try:
-        if current_thread() is main_thread():
-            for number in _SIGNALS:
-                if callable(handler := signal.getsignal(number)):
-                    before[number] = handler
-                    signal.signal(number, handle)
-        yield
-    finally:
-        is_over.set()
-        for number, handler in before.items():
-            if signal.getsignal(number) is handle:  # The env may have set another.
-                signal.signal(number, handler)
+    with contextlib.ExitStack() as ends:
+        try:
+            if current_thread() is main_thread():
+                for number in _SIGNALS:
+                    if callable(handler := signal.getsignal(number)):
+                        before[number] = handler
+                        signal.signal(number, handle)
+            yield
+        finally:
+            for number, handler in before.items():
+                if signal.getsignal(number) is handle:  # The env may have set another.
+                    signal.signal(number, handler)
 
 
 def limit_actions(env: BaseEnv, seconds: Any) -> None:
@@ -165,7 +179,7 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
     if is_awaitable(env):
         raise ConfigError(f"{where}: an awaitable env can't have it")
     reset, step, close = env.reset, step_of(env), env.close
-    due, expired, is_closed = math.inf, False, False
+    due, expired = math.inf, False
 
     def timed_reset(**arguments: Any) -> Any:
         nonlocal due, expired
@@ -192,12 +206,13 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
         return [env]
 
     def timed_close() -> Any:
-        nonlocal due, is_closed
-        due, is_closed = math.inf, True
+        nonlocal due
+        due = math.inf
+        end()
         return close()
 
     changed: Any = env
     changed.reset, changed.step, changed.close = timed_reset, timed_step, timed_close
     if isinstance(env, FastPath):
         changed.bare_step = changed.bare_reset = lambda: None
-    watched(lambda: is_closed, late)
+    end = watched(late)

@@ -19,7 +19,7 @@ import socket
 import time
 from math import ceil
 from pathlib import Path
-from threading import Lock, Thread, current_thread, main_thread
+from threading import Lock, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import gymnasium as gym
@@ -165,7 +165,7 @@ class RemoteEnvClient:
         self._using_sockets = Lock()
         self._is_at_work = False
         self._late_events: list[Event] = []
-        self._watcher: Thread | None = None
+        self._end_watch: Callable[[], None] | None = None
         self._request: StepRequest | ResetRequest | None = None
         # The env was reset or stepped, or a session has ended, since it was asked that last.
         self._asks_if_finished = False
@@ -241,6 +241,8 @@ class RemoteEnvClient:
             return
         self._closed = True
         self._leave("the client was closed")
+        if self._end_watch is not None:
+            self._end_watch()
         self._context.destroy(linger=0)
         self._env.close()
 
@@ -427,8 +429,8 @@ class RemoteEnvClient:
         if not self._is_hardware:
             yield
             return
-        if self._watcher is None:
-            self._watcher = watched(lambda: self._closed, self._to_stop)
+        if self._end_watch is None:
+            self._end_watch = watched(self._to_stop)
         try:
             self._is_at_work = True
             yield

@@ -184,20 +184,26 @@ class Intake:
         wanted = completion.entry and self._requests.end(host_id, completion.entry) is not None
         if not wanted:
             if self._episodes.why_lost(slot) is None:  # Else that is known, as after an abort.
-                self._episodes.lose([slot], why)
+                self._lose(slot, why)
                 entry = self._requests.numbering.entry.item(slot)
                 is_stepped = op_of(entry) == Operation.STEP and self._requests.is_current(entry)
                 if not is_stepped:  # Else its step is lost, too.
                     self._supervisor.losses.count_env(slot, why, completion.message)
             return
-        self._episodes.lose([slot], why)
+        self._lose(slot, why)
         replaced, fault = self._supervisor.losses.count_env(slot, why, completion.message)
         alone = self._requests.alone(slot)
-        if replaced and self._requests.numbering.op(slot) in _ASKED_AGAIN:
+        resets = not self._record_of(slot).is_hardware
+        if replaced and resets and self._requests.numbering.op(slot) in _ASKED_AGAIN:
             self._requests.anything_ended = True
             self._send_again(host_id, alone)
         else:
             self._fail(alone, lambda _: fault)
+
+    def _lose(self, slot: int, why: Loss) -> None:
+        """Note that an episode is lost; only its user resets what moves something real."""
+        if not self._record_of(slot).is_hardware:
+            self._episodes.lose([slot], why)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
         self._requests.end(completion.host_id, completion.entry)

@@ -76,6 +76,8 @@ class EnvLosses:
         """
         record = self._tables.record_of(slot)
         is_borne, then = record.restart_policy.count(self._counted(slot), pauses=False)
+        if is_borne and record.is_hardware:
+            then += "; it moves nothing until you reset it"
         if is_borne:
             self._note_restart(slot, f"{message}; {then}")
         elif not record.restart_policy.raises:

@@ -8,7 +8,6 @@ Left out: which request comes when, and what takes the place of an env (see `Awa
 from __future__ import annotations
 
 import asyncio
-import inspect
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from rlightning_aio._core.hosts.awaiting.event_loop import OWNER, new_task, wait_fairly
@@ -162,9 +161,7 @@ class AwaitedEnv:
 
     async def _close(self) -> None:
         try:
-            closing: Any = self.runner.close()
-            if inspect.isawaitable(closing):
-                await closing
+            await self.runner.close()
         except BaseException as error:  # Whoever closes it gets it.
             self._close_error = self._close_error or ErrorText.of(error)
 

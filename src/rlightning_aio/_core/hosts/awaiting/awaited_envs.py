@@ -39,13 +39,14 @@ from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raise
 from rlightning_aio._core.hosts.running.build_env import built_env, check_distinct
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
+from rlightning_aio.envs.hardware import begin_stops
 from rlightning_aio.errors import EnvAway
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable, MutableSequence
+    from collections.abc import Callable, Coroutine, MutableSequence
 
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
@@ -104,6 +105,7 @@ class AwaitedEnvs:
 
     Attributes:
         num_busy: how many envs execute a request now.
+        runners: of the envs, by index; that of one that is gone until another takes its place.
     """
 
     def __init__(
@@ -128,6 +130,7 @@ class AwaitedEnvs:
         self._enter = enter
         self._watch = partial(watched, report=self._report, enter=enter)
         self._loop: asyncio.AbstractEventLoop
+        self.runners: list[AwaitedRunner] = []
         self._records: list[_EnvRecord] = []
         self._queue: deque[tuple[_EnvRecord, int, Any]] = deque()
         self.num_busy = 0
@@ -147,15 +150,14 @@ class AwaitedEnvs:
         self._closed: dict[object, str] = {}
         self._look: asyncio.TimerHandle | None = None
 
-    @property
-    def runners(self) -> list[AwaitedRunner]:
-        """The envs' runners, by index."""
-        return [record.runner for record in self._records]
-
     # -- life ---------------------------------------------------------------------
 
-    def adopt(self, runners: Iterable[AwaitedRunner]) -> None:
-        """Take over envs that were built elsewhere, by index; they belong to the running loop."""
+    def adopt(self, runners: list[AwaitedRunner]) -> None:
+        """Take over envs that were built elsewhere, by index; they belong to the running loop.
+
+        The list is that of `runners` from now on.
+        """
+        self.runners = runners
         self._loop = asyncio.get_running_loop()
         context = copy_context()
         for index, runner in enumerate(runners):
@@ -205,6 +207,7 @@ class AwaitedEnvs:
             if record.runner is not None:
                 env.runner.use_rows_of(record.runner)
             record.env, record.runner = env, env.runner
+            self.runners[record.index : record.index + 1] = [env.runner]
         return error
 
     async def close(self) -> list[tuple[int, ErrorText]]:
@@ -244,6 +247,7 @@ class AwaitedEnvs:
         for env in self._envs if self._envs and not self._loop.is_running() else ():
             leave_behind(env.task)  # The warning about the group says enough.
         self._records.clear()
+        self.runners.clear()
 
     def _end(self) -> None:
         """Begin nothing more, and post nothing more."""
@@ -281,8 +285,9 @@ class AwaitedEnvs:
             elif record.is_ending:
                 continue  # Its end takes the request along.
             elif op_of(entry) == Operation.STEP and record.lost is not None:
-                # It was sent before the trainer knew, and another env has no episode for it.
-                self._report_loss(record, *record.lost)
+                # Another env has no episode for it: it was sent before the trainer knew, or it is
+                # hardware. The trainer may be sending more now, and would not hear of this.
+                self._loop.call_soon(self._report_again, record, entry, *record.lost)
             else:
                 record.rebuilding = self._spawn(self._rebuild(record))
 
@@ -385,6 +390,10 @@ class AwaitedEnvs:
         self._post(Lost(self._host_id, record.index, why, entry, message, answered))
         self._begin_queued()
 
+    def _report_again(self, record: _EnvRecord, entry: int, why: Loss, message: str) -> None:
+        if record.entry == entry:
+            self._report_loss(record, why, message)
+
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""
         record = self._records[env.index]
@@ -410,6 +419,8 @@ class AwaitedEnvs:
 
     def _put_away(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
+        if self._order.is_hardware:
+            begin_stops([env.runner.env])
         env.leave()
         record.env = None
         record.leaving = self._spawn(self._close(env))

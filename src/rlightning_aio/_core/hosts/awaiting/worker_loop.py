@@ -17,7 +17,7 @@ from rlightning_aio._core.hosts.limits import limits_of
 
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Callable, MutableSequence, Sequence
+    from collections.abc import Callable, MutableSequence
 
     from rlightning_aio._core.hosts.messages import Completion, ErrorText, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
@@ -29,7 +29,7 @@ class Awaiting:
 
     Args:
         order, first_slot: of the worker.
-        runners: of its envs.
+        runners: of its envs; the list changes when one takes the place of another.
         made: how often each was made, counted on here.
         report: takes the entries of requests whose results are all in their rows.
         post: sends a completion.
@@ -43,7 +43,7 @@ class Awaiting:
         self,
         order: StartOrder,
         first_slot: int,
-        runners: Sequence[EnvRunner],
+        runners: list[EnvRunner],
         made: MutableSequence[int] | memoryview[int],
         report: Callable[[int], None],
         post: Callable[[Completion], None],
@@ -59,7 +59,7 @@ class Awaiting:
             done=report,
             enter=enter,
         )
-        self._runners = cast("Sequence[AwaitedRunner]", runners)
+        self._runners = cast("list[AwaitedRunner]", runners)
         self._beat_seconds = min(limits_of(order.config).values(), default=0.0) / 4
 
     def serve(

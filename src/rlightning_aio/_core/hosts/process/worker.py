@@ -91,6 +91,7 @@ class Worker:
         self._order: StartOrder
         self._shared = list(shared)
         self._is_child = False
+        self._unwatch: Callable[[], None] | None = None
 
     def serve(self) -> None:
         """Serve until it gets `CLOSE` or the trainer is gone; close the envs in any case."""
@@ -131,6 +132,7 @@ class Worker:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:
             self._closing = True  # The event loop has closed them.
+            self._end_watch()
         self._post(Closed(SENDER, errors))
 
     def _take_requests(self) -> bool:
@@ -275,7 +277,7 @@ class Worker:
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
             if order.is_hardware:
-                watched(lambda: self._closing, self._to_stop)
+                self._unwatch = watched(self._watch())
             self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
             started = [runner.started() for runner in self._runners]
         except BaseException as error:
@@ -286,14 +288,24 @@ class Worker:
         gc.collect()
         self._post(Built(SENDER, started))
 
-    def _to_stop(self) -> list[BaseEnv]:
-        """Return the envs that must stop now; all, whatever they do, once the trainer is gone."""
+    def _watch(self) -> Callable[[], list[BaseEnv]]:
+        """Return what says which envs must stop now: all, once the trainer is gone."""
         poll = select.poll()
         poll.register(self._channel, select.POLLRDHUP)
-        runners = self._runners
-        if not poll.poll(0):
-            runners = [self._runners[k] for k in self._rings.to_stop(self._first_slot)]
-        return [runner.env for runner in runners]
+
+        def to_stop() -> list[BaseEnv]:
+            runners = self._runners
+            if not poll.poll(0):
+                runners = [self._runners[k] for k in self._rings.to_stop(self._first_slot)]
+            return [runner.env for runner in runners if not runner.has_closed]
+
+        return to_stop
+
+    def _end_watch(self) -> None:
+        """Stop nothing any more but what must stop now, and keep no env for that."""
+        end, self._unwatch = self._unwatch, None
+        if end is not None:
+            end()
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs from the inherited descriptor of the arena."""
@@ -348,6 +360,7 @@ class Worker:
     }
 
     def _close_envs(self) -> list[tuple[int, ErrorText]]:
+        self._end_watch()
         return close_all(self._runners, self._begin_with)
 
     def _write(self, data: bytes) -> None:

@@ -5,6 +5,7 @@ It is an `EnvRunner` that awaits what its env returns, and that another env may 
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import pickle
 import time
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
+from rlightning_aio.envs.hardware import stop
 from rlightning_aio.protocol.entries import answers_with_value
 from rlightning_aio.trees import copied
 
@@ -61,6 +63,14 @@ class AwaitedRunner(EnvRunner):
         if self.is_abandoned:
             raise Abandoned
         return finish(returned, time.monotonic_ns() - began)
+
+    async def close(self) -> None:  # type: ignore[override]
+        """Close the env, once; hardware is stopped before."""
+        if self.is_hardware:
+            await asyncio.to_thread(stop, self.env)
+        closing = super().close()
+        if inspect.isawaitable(closing):
+            await closing
 
     def _snapshot(self) -> EnvState:
         versions, state = super()._snapshot()

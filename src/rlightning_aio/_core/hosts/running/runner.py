@@ -29,7 +29,7 @@ from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.hardware import begin_stops, checked_input_of, stop
+from rlightning_aio.envs.hardware import begin_stops, checked_input_of, stop, stop_all
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -39,6 +39,7 @@ from rlightning_aio.envs.results import (
     step_of,
 )
 from rlightning_aio.envs.state import versions_of
+from rlightning_aio.errors import ResetNeeded
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
 from rlightning_aio.protocol.info import InfoSchemas
@@ -87,15 +88,17 @@ class EnvRunner:
             returned without a copy; all other tensors become NumPy arrays on the CPU.
         rebuild: makes the env again; None: that is left to its host, or it moves something real.
         renews: an exception of its reset or step has it rebuilt.
-        is_hardware: the env moves something real, and stops whatever goes wrong.
+        is_hardware: it moves something real, stops whatever goes wrong, and before it is closed,
+            and makes no step before its first reset.
 
     Attributes:
         inline: it lives in the trainer's process.
         fast_path: what the env offers to save time.
+        is_hardware: see above.
         step: steps with the action in the row.
         is_awaitable: its requests are awaited, together with those of other envs.
         is_spent: another env takes its place before the next request.
-
+        has_closed: it was closed, or is being closed.
     """
 
     is_awaitable: ClassVar[bool] = False
@@ -110,10 +113,10 @@ class EnvRunner:
         is_hardware: bool = False,
     ) -> None:
         self.inline = inline
-        self._is_hardware = is_hardware
+        self.is_hardware = is_hardware
         self._rebuild, self._renews = rebuild, renews
         # It is to be rebuilt, such as after an exception; it was closed for that.
-        self.is_spent = self._has_closed = False
+        self.is_spent = self.has_closed = False
         self.step: Execute = self._not_attached
         self._read_action: Callable[[], Any] = _no_action
         self._has_result = False
@@ -131,9 +134,23 @@ class EnvRunner:
         )
         self._is_bare = bare is not None
         self._bare_reset = self.fast_path.bare_reset() if self._is_bare else None
-        self._input = checked_input_of(env) if self._is_hardware else input_of(env)
+        self._input = self._checked_input() if self.is_hardware else input_of(env)
         free = env.transforms_actions or has_preprocess_fn(env)
         self._actions_beside_row = free or self.layout.action_leaves is None
+
+    def _checked_input(self) -> Callable[[Any, dict[str, Any]], Any]:
+        """Return `checked_input_of` the env, which makes no step before its first reset."""
+        make = checked_input_of(self.env)
+
+        def checked(action: Any, extras: dict[str, Any]) -> Any:
+            if not self._has_result:
+                raise ResetNeeded(
+                    f"{self.env.env_id}: it moves something real, and makes no step before its "
+                    "first reset()"
+                )
+            return make(action, extras)
+
+        return checked
 
     def started(self) -> EnvStarted:
         """Return the description of the env that the trainer gets."""
@@ -209,7 +226,7 @@ class EnvRunner:
         return partial(call_env, self.env, *arguments), _outcome
 
     def _spend(self) -> None:
-        self.is_spent = True
+        self.is_spent = not self.is_hardware
 
     def _snapshot(self) -> EnvState:
         versions = versions_of(self.env)
@@ -251,7 +268,7 @@ class EnvRunner:
 
     def note_error(self, op: int, error: ErrorText) -> None:
         """Record what a request has raised; hardware stops, unless a method call raised it."""
-        if self._is_hardware and not answers_with_value(op):
+        if self.is_hardware and not answers_with_value(op):
             stop(self.env)
         self.is_spent |= self._renews and error.ends_env(op)
 
@@ -270,7 +287,7 @@ class EnvRunner:
             _log.warning(text, self.env.env_id, ErrorText.of(error).summary)
         key = self.layout.key
         self._adopt(self._rebuild())
-        self._has_closed = False
+        self.has_closed = False
         if self.layout.key != key:
             raise ValueError("its spaces changed with the restart")
         self._attach_again()
@@ -278,9 +295,9 @@ class EnvRunner:
 
     def close(self) -> Awaitable[None] | None:
         """Close the env, once."""
-        if self._has_closed:
+        if self.has_closed:
             return None
-        self._has_closed = True
+        self.has_closed = True
         return self.env.close()
 
     def _not_attached(self) -> OutOfBand | None:
@@ -292,7 +309,7 @@ class EnvRunner:
         """Return a function that steps with the action in the row."""
         step_env, store, clock = self._step_env, self._store_step, time.monotonic_ns
         read_action, make = self._read_action, self._input
-        is_action = self._is_bare and not (self._is_hardware or has_preprocess_fn(self.env))
+        is_action = self._is_bare and not (self.is_hardware or has_preprocess_fn(self.env))
         get_input = read_action if is_action else lambda: make(read_action(), {})
         if self._is_bare:
             store = self._writer.write_step
@@ -437,7 +454,7 @@ def attach_all(
 def close_all(
     runners: list[EnvRunner], begin: Callable[[int], None] | None = None
 ) -> list[tuple[int, ErrorText]]:
-    """Close the envs of a host, and empty the list.
+    """Close the envs of a host, hardware after it was stopped, and empty the list.
 
     Args:
         runners: of the host's envs.
@@ -445,6 +462,7 @@ def close_all(
 
     Returns what closing raised, with the env's index.
     """
+    stop_all([runner.env for runner in runners if runner.is_hardware])
     errors: list[tuple[int, ErrorText]] = []
     for index, runner in enumerate(runners):
         if begin is not None:
