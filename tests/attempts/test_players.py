@@ -50,7 +50,9 @@ def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more() -> No
         batch, _ = group.reset()
         queue = AttemptQueue(group, Rules())
         assert [*queue.free] == ["robots-0/0"]
-        client.env.finished = True  # It leaves after this step.
+        client.env.on_step = lambda env=client.env: setattr(
+            env, "finished", True
+        )  # Then it leaves.
         group.step(batch.respond(action=[[0.0, 0.0]]))
         client.join()
         until_it_is("empty", group)
@@ -73,7 +75,9 @@ def test_what_moves_something_real_and_was_lost_is_left_alone_until_its_user_res
         client = ClientThread(address, "arm", CountingEnv(), hardware=True)
         batch, _ = group.reset()
         assert Players(group).present == {"robots-0/0"}
-        client.env.finished = True  # It leaves after this step.
+        client.env.on_step = lambda env=client.env: setattr(
+            env, "finished", True
+        )  # Then it leaves.
         group.step(batch.respond(action=[[0.0, 0.0]]))
         client.join()
         until_it_is("empty", group)

@@ -1069,6 +1069,40 @@ async def test_time_in_which_the_trainer_blocks_the_loop_is_not_the_attempts() -
     assert all(attempts.is_complete for attempts in found)
 
 
+async def test_the_metrics_say_who_waits_for_whom() -> None:
+    def numbers() -> dict[str, float]:
+        found = group.metrics()
+        return {name[9:]: found[name] for name in found if name.startswith("attempts/")}
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await asyncio.sleep(0.02)
+        if (episode.spec.seed, episode.index) == (0, 0) and (0, 0) not in tried:
+            tried.add((0, 0))
+            await episode.step("raise")
+        if episode.spec.seed == 1:
+            raise ValueError
+        await earner(episode)
+
+    tried = set[tuple[int, int]]()
+    async with rooms(PLACES["loop"], num_workers=2) as group:
+        assert numbers() == {}
+        for _ in range(2):
+            tried.clear()
+            playing = play(group, tasks(4), agent, 2, Rules(retries=1, max_concurrency=1))
+            async for _ in playing:
+                time.sleep(0.1)  # noqa: ASYNC251  # The update of the weights.
+                now = numbers()
+                assert 0 <= now["playing"] + now["waiting"] <= 4
+        found = numbers()
+        assert group.get_env_stats()["room-0"]["outcomes_env_raised"] in (0, 1, 2)
+    assert (found["playing"], found["waiting"], found["groups_waiting"]) == (0, 0, 0)
+    assert (found["outcomes_terminated"], found["outcomes_agent_raised"]) == (12, 4)
+    assert found["retries"] == 2
+    assert found["seconds_in_agents"] > 0.02 * 16
+    assert found["seconds_blocked"] > 0.1
+    assert found["outcomes_timed_out"] == 0
+
+
 async def test_time_in_the_queue_of_the_entry_is_not_the_attempts() -> None:
     """Each step takes a twentieth of the limit, and eight wait for the one that is executed."""
 

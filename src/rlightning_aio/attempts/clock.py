@@ -15,10 +15,14 @@ _TICK: Final = 0.05
 
 
 class Clock:
-    """See the module. A timer ticks from `start` to `stop`; what it is late by doesn't count."""
+    """See the module. A timer ticks from `start` to `stop`; what it is late by doesn't count.
+
+    Attributes:
+        blocked: seconds that don't count; lag: those of the last tick.
+    """
 
     def __init__(self) -> None:
-        self._blocked = 0.0
+        self.blocked = self.lag = 0.0
         self._due = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
@@ -35,11 +39,12 @@ class Clock:
             self._timer = None
 
     def _tick(self) -> None:
-        self._blocked += max(time.monotonic() - self._due, 0.0)
+        self.lag = max(time.monotonic() - self._due, 0.0)
+        self.blocked += self.lag
         self.start()
 
     def now(self) -> float:
         """Seconds since any moment."""
         now = time.monotonic()
         late = max(now - self._due, 0.0) if self._timer is not None else 0.0
-        return now - self._blocked - late
+        return now - self.blocked - late

@@ -7,7 +7,6 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.batch.contents import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, EnvRaised, RLightningError
 from rlightning_aio.outcomes import Outcome
@@ -17,6 +16,7 @@ from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvEpisode
+    from rlightning_aio.attempts.clock import Clock
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
@@ -39,11 +39,9 @@ class AttemptEpisode:
 
     first: Any = None
 
-    def __init__(
-        self, episode: EnvEpisode, spec: EpisodeSpec, index: int, clock: Clock | None = None
-    ) -> None:
-        self._episode, self._clock = episode, clock or Clock()
-        self._queues = clock is not None and episode.queues
+    def __init__(self, episode: EnvEpisode, spec: EpisodeSpec, index: int, clock: Clock) -> None:
+        self._episode, self._clock = episode, clock
+        self._queues = episode.queues
         self._began, self._queued = self._clock.now(), 0.0
         self._asked_at: float | None = None  # What is in flight, by the clock.
         self._over = ""  # Why it can't be stepped.

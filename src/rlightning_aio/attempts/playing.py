@@ -19,6 +19,7 @@ from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.health import Health
+from rlightning_aio.attempts.numbers import Numbers
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
@@ -159,7 +160,8 @@ class _Engine:
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._health = health = Health()
-        self._clock = None if rules.attempt_timeout is None else Clock()
+        self._clock = Clock()
+        self._numbers = Numbers(group)
         self._queue.may_play = lambda env_id: not health.rests(env_id, time.monotonic())
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)
@@ -175,12 +177,13 @@ class _Engine:
             await self._results.written()
             self._results.hand_out(self.done[0].spec)
         self._wake.set()
-        return self.done.popleft()
+        taken = self.done.popleft()
+        self._count()
+        return taken
 
     async def run(self) -> None:
         """Play all tasks."""
-        if self._clock is not None:
-            self._clock.start()
+        self._clock.start()
         try:
             while True:
                 self._wake.clear()
@@ -190,6 +193,7 @@ class _Engine:
                     await asyncio.sleep(0)
                     continue
                 self._check_envs()
+                self._count()
                 waiting = len(self._queue)  # Some may wait until an env has rested.
                 if not (self._playing or waiting) and self._source.is_at_end:
                     return
@@ -202,10 +206,18 @@ class _Engine:
                 if self._has_clients:
                     self._look()
         finally:
-            if self._clock is not None:
-                self._clock.stop()
+            self._clock.stop()
             await self._end_all()
+            self._playing.clear()
+            self._queue.withdraw_all()
+            self._count()
             self.news.set()
+
+    def _count(self) -> None:
+        """Write the numbers of the moment."""
+        playing, waiting = len(self._playing), len(self._queue)
+        groups = len(self.done)
+        self._numbers.note(self._clock, playing=playing, waiting=waiting, groups_waiting=groups)
 
     async def _end_all(self) -> None:
         """Read no more tasks, and end what plays."""
@@ -289,7 +301,10 @@ class _Engine:
         for env_id in queue.players.gone | queue.players.left_alone:
             queue.free.pop(env_id, None)
         self._health.note(attempt.outcome, self._most, time.monotonic())
-        if queue.end(job, attempt):
+        has_ended = queue.end(job, attempt)
+        is_retried = not (has_ended or job.task.is_settled)
+        self._numbers.note_end(attempt.outcome, is_retried=is_retried)
+        if has_ended:
             self._check_failures(attempt.outcome)
             if queue.is_done(job.task):
                 self._settle(job.task, one.error)

@@ -114,6 +114,11 @@ def is_lost(group: Any, env_id: str) -> bool:
     return core.tables.record_of(core.envs.find_one(env_id)).lost_client
 
 
+def numbers_of_attempts(group: Any) -> dict[str, float]:
+    """Return what `metrics` of a group has besides its own numbers, to be written to."""
+    return group._core.sums.of_attempts  # noqa: SLF001
+
+
 def default_min_results(group: Any) -> int:
     """Number of results that a policy waits for: half of the envs."""
     return max(1, len(group.env_ids) // 2)

@@ -49,12 +49,14 @@ class Sums:
 
     Attributes:
         num_batches: the number of returned batches.
+        of_attempts: the numbers of `play` by their whole names, if it was used.
         ended_ns: when the group was closed, on the monotonic clock; None before.
     """
 
     def __init__(self, envs: EnvTable, requests: Requests, records: Sequence[HostRecord]) -> None:
         self._envs, self._requests, self._records = envs, requests, records
         self.num_batches = 0
+        self.of_attempts: dict[str, float] = {}
         self.ended_ns: int | None = None
         # A row for each of `_NAMES`, with seconds in ns; a column for each slot.
         self._sums = np.zeros((len(_NAMES), len(envs)))
@@ -202,7 +204,7 @@ class Sums:
         found = self._numbers("envs/", np.arange(len(entries)))
         for k, name in enumerate(names if by_entry else ()):
             found |= self._numbers(f"envs/{name}/", np.flatnonzero(entries == k))
-        return found
+        return found | self.of_attempts
 
     def _numbers(self, prefix: str, slots: NDArray[np.intp]) -> dict[str, float]:
         return {prefix + name: value for name, value in self.of(slots).items()}
