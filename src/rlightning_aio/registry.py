@@ -64,8 +64,6 @@ class Backend:
         install: the command that installs the simulator.
         preload: modules that are slow to import and safe to import before workers are forked:
             they start no thread and open no device.
-        described_by: ``module:function`` that takes a config entry and returns what the envs'
-            own server says of them, as JSON; ``check`` then starts none. Empty if nothing does.
     """
 
     name: str
@@ -77,7 +75,6 @@ class Backend:
     hardware: bool = False
     install: str = "pip install rlightning-aio"
     preload: tuple[str, ...] = ()
-    described_by: str = ""
 
     def is_installed(self) -> bool:
         """Return True if this interpreter has the simulator; import nothing."""

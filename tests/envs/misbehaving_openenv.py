@@ -116,8 +116,6 @@ class Misbehaving:
         """Let a client talk, or answer it otherwise."""
         if request.headers.get("Authorization") != self._authorization:
             return socket.respond(401, "")
-        if request.path != "/ws":
-            return socket.respond(200, json.dumps({"name": "misbehaving", "path": request.path}))
         if self.connect_fates and self.connect_fates[0] == "unreachable":
             self.connect_fates.popleft()
             socket.transport.abort()

@@ -8,7 +8,6 @@ observations of another shape.
 
 from __future__ import annotations
 
-import asyncio
 import os
 import pickle
 from dataclasses import asdict, dataclass, field
@@ -32,11 +31,10 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import check_installed, load_config
-from rlightning_aio.json_text import json_of
 from rlightning_aio.policies.masks import allowed_action
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.registry import ENVS, load
+from rlightning_aio.registry import ENVS
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -70,7 +68,6 @@ class _Finding:
     Attributes:
         skipped: the reason why it was not started.
         steps: how many steps it made; none if only a policy can choose its actions.
-        offers: what the envs' own server says of them.
         is_played: with ``--steps``; episodes: number that have ended then; step_us: median time of
             a step in its env.
         problems: in words, each with what to do.
@@ -86,7 +83,6 @@ class _Finding:
     max_episode_steps: int | None = None
     skipped: str | None = None
     steps: int = 0
-    offers: dict[str, Any] | None = None
     is_played: bool = False
     episodes: int = 0
     step_us: float | None = None
@@ -132,8 +128,6 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
         )
         if config.backend == "env_server":
             found.skipped = "its envs live with its clients"
-        elif (backend := ENVS.described(config.backend)) and backend.described_by:
-            found.offers = await asyncio.to_thread(load(backend.described_by), config)
         elif ENVS.is_hardware(config.backend):
             found.skipped = "it would move"
         else:
@@ -322,9 +316,6 @@ def _lines(found: _Finding) -> Iterator[str]:
     yield head + (f", {found.task})" if found.task else ")")
     if found.skipped is not None:
         yield f"  not started: {found.skipped}"
-        return
-    if found.offers is not None:
-        yield from json_of(found.offers, indent=2).splitlines()
         return
     yield f"  observation  {found.observation_space}"
     yield f"  action       {found.action_space}"

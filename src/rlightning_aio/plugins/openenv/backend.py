@@ -13,5 +13,4 @@ BACKEND = Backend(
     awaitable=True,
     install="pip install 'rlightning-aio[websockets]'",
     preload=("rlightning_aio.plugins.openenv.env",),
-    described_by="rlightning_aio.plugins.openenv.env:description",
 )

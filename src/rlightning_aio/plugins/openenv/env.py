@@ -25,7 +25,6 @@ from rlightning_aio.plugins.openenv.session import (
     OpenEnvSession,
     ServerGone,
     check_headers,
-    get_json,
     pauses,
 )
 
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from rlightning_aio import EnvConfig, PolicyResponse
     from rlightning_aio.envs.base import PreprocessFn
 
-__all__ = ["OpenEnv", "OpenEnvOptions", "description"]
+__all__ = ["OpenEnv", "OpenEnvOptions"]
 
 
 class OpenEnvOptions(BaseModel):
@@ -72,21 +71,6 @@ class OpenEnvOptions(BaseModel):
         if self.columns and self.observation_field is not None:
             raise ValueError("columns and observation_field exclude each other")
         return self
-
-
-def description(config: EnvConfig) -> dict[str, Any]:
-    """Return the description and schemas of an entry's first server.
-
-    Raises:
-        ConfigError: the server can't be read.
-    """
-    headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers
-    try:
-        return {
-            path: get_json(config.task_name, f"/{path}", headers) for path in ("metadata", "schema")
-        }
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{config.name!r}: {config.task_name} can't be read: {error}") from error
 
 
 class OpenEnv(BaseEnv):

@@ -13,7 +13,6 @@ import json
 import logging
 import re
 import socket as sockets
-import urllib.request
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import urlsplit, urlunsplit
@@ -31,7 +30,6 @@ __all__ = [
     "ServerGone",
     "ServerRefused",
     "check_headers",
-    "get_json",
     "pauses",
 ]
 
@@ -136,7 +134,7 @@ class OpenEnvSession:
         secretly: dict[str, Any] = {"additional_headers": dict(self._headers), "logger": _LOG}
         try:
             socket = await connect(
-                _address(self.url, "ws", "/ws"),
+                _address(self.url),
                 open_timeout=_CONNECT_SECONDS,
                 close_timeout=_CLOSE_SECONDS,
                 max_size=_MAX_BYTES,
@@ -224,18 +222,8 @@ def check_headers(headers: Mapping[str, str]) -> None:
             raise ValueError(f"the value of {name} has characters that are none of a header")
 
 
-def _address(url: str, scheme: str, path: str) -> str:
-    """The address of one of the server's routes, with ``ws`` or ``http``, secure if `url` is."""
+def _address(url: str) -> str:
+    """The address of the server's WebSocket, secure if `url` is."""
     parts = urlsplit(url if "://" in url else f"http://{url}")
-    secure = "s" if parts.scheme in ("https", "wss") else ""
-    return urlunsplit((scheme + secure, parts.netloc, parts.path.rstrip("/") + path, "", ""))
-
-
-def get_json(url: str, path: str, headers: Mapping[str, str] = MappingProxyType({})) -> Any:
-    """Return the answer of a server to GET `path`."""
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    request = urllib.request.Request(_address(url, "http", path))  # noqa: S310  # It is http(s).
-    for name, value in headers.items():  # Not sent to where the server may redirect to.
-        request.add_unredirected_header(name, value)
-    with opener.open(request, timeout=_CONNECT_SECONDS) as reply:
-        return json.load(reply)
+    scheme = "wss" if parts.scheme in ("https", "wss") else "ws"
+    return urlunsplit((scheme, parts.netloc, parts.path.rstrip("/") + "/ws", "", ""))
