@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from gymnasium.wrappers.utils import RunningMeanStd
 
 from rlightning_aio.trees import Path, mapped, walked
 
@@ -30,28 +31,7 @@ _FIRST_COUNT: Final = 1e-4
 # Gymnasium's wrapper of observations starts its sum of squares as this float32.
 _FIRST_VARIANCE: Final = float(np.float32(_FIRST_COUNT)) / _FIRST_COUNT
 _RETURN: Final = "return"
-_SAVED: Final = ("mean", "variance", "count")
-
-
-class _Statistics:
-    """Mean and variance of values of one shape, and their number."""
-
-    def __init__(self, shape: tuple[int, ...], first_variance: float) -> None:
-        self.mean = np.zeros(shape)
-        self.variance = np.full(shape, first_variance)
-        self.count = np.array(_FIRST_COUNT)
-
-    def update(self, values: NDArray[Any]) -> None:
-        """Add values ``[n, *shape]``."""
-        if not len(values):
-            return
-        count, more = self.count, len(values)
-        total = count + more
-        delta = values.mean(axis=0) - self.mean
-        squares = self.variance * count + values.var(axis=0) * more
-        self.mean = self.mean + delta * more / total
-        self.variance = (squares + np.square(delta) * count * more / total) / total
-        self.count = total
+_SAVED: Final = ("mean", "var", "count")
 
 
 class Normalizer:
@@ -89,8 +69,9 @@ class Normalizer:
     ) -> None:
         self.gamma = gamma
         self._observations, self._rewards = observations, rewards
-        # By the keys that lead to an array; and that of the discounted returns.
-        self._statistics: dict[str, _Statistics] = {}
+        # By the keys that lead to an array; and that of the discounted returns. RunningMeanStd has
+        # no annotations.
+        self._statistics: dict[str, Any] = {}
         self._sums = np.zeros(0)  # By env: the discounted return so far.
 
     # -- with an update -----------------------------------------------------------
@@ -128,8 +109,11 @@ class Normalizer:
 
         def updated(path: str, leaf: NDArray[Any]) -> NDArray[np.float32]:
             shape = leaf.shape[axes:]
-            known = self._statistics.setdefault(path, _Statistics(shape, _FIRST_VARIANCE))
-            known.update(leaf.reshape(-1, *shape))
+            if path not in self._statistics:
+                known = self._statistics[path] = RunningMeanStd(_FIRST_COUNT, shape)
+                known.var = np.full(shape, _FIRST_VARIANCE)
+            if leaf.size:
+                self._statistics[path].update(leaf.reshape(-1, *shape))
             return self._normal(path, leaf)
 
         return self._normalised(updated, observation)
@@ -151,7 +135,9 @@ class Normalizer:
             return reward
         self._make_room(index)
         self._sums[index] = sums = self._sums[index] * self.gamma * (1 - starts) + reward
-        self._statistics.setdefault(_RETURN, _Statistics((), 1.0)).update(sums)
+        known = self._statistics.setdefault(_RETURN, RunningMeanStd(_FIRST_COUNT))
+        if len(sums):
+            known.update(sums)
         return self.scaled(reward)
 
     # -- without ------------------------------------------------------------------
@@ -170,7 +156,7 @@ class Normalizer:
         known = self._statistics.get(_RETURN)
         if not self._rewards or known is None:
             return reward
-        return np.clip(reward / np.sqrt(known.variance + _EPSILON), -_LIMIT, _LIMIT)
+        return np.clip(reward / np.sqrt(known.var + _EPSILON), -_LIMIT, _LIMIT)
 
     # -- saving -------------------------------------------------------------------
 
@@ -189,9 +175,9 @@ class Normalizer:
             KeyError: `state` lacks a part; nothing was changed.
         """
         sums = _copied(state["sums"])
-        found: dict[str, _Statistics] = {}
+        found: dict[str, Any] = {}
         for path in (name.removesuffix(".mean") for name in state if name.endswith(".mean")):
-            found[path] = _Statistics((), 1.0)
+            found[path] = RunningMeanStd()
             for name in _SAVED:
                 setattr(found[path], name, _copied(state[f"{path}.{name}"]))
         self._sums, self._statistics = sums, found
@@ -215,7 +201,7 @@ class Normalizer:
         known = self._statistics.get(path)
         if known is None:
             return values.astype(np.float32)
-        found = (values - known.mean) / np.sqrt(known.variance + _EPSILON)
+        found = (values - known.mean) / np.sqrt(known.var + _EPSILON)
         return np.clip(found.astype(np.float32), -_LIMIT, _LIMIT)
 
     def _make_room(self, index: NDArray[np.int64]) -> None:
