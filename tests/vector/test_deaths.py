@@ -297,9 +297,9 @@ def test_a_death_in_a_reset_or_a_call(twins: Any) -> None:
     assert infos["_worker_restarted"].tolist() == LOST
     np.testing.assert_array_equal(observations[2:], twins.reset(seed=7)[0][2:])
     assert not envs.step(ACTIONS)[3].any()
-    killed(envs.group, lambda: envs.call_async("get_wrapper_attr", "dt"))
+    killed(envs.group, lambda: None)
     with pytest.raises(WorkerDied, match="env 'env-0'"):
-        envs.call_wait()
+        envs.get_attr("dt")
     assert envs.step(ACTIONS)[3].tolist() == LOST
     mask = np.array([True, False, True, False])
     envs.reset(options={"reset_mask": mask})

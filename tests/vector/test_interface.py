@@ -74,7 +74,7 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
     gate = tmp_path / "open"
     env = VectorEnv([lambda: Held(gate)] * 2, max_concurrency=1)
     assert len(set(env.call("worker"))) == 1
-    for wait in (env.reset_wait, env.step_wait, env.call_wait):
+    for wait in (env.reset_wait, env.step_wait):
         with pytest.raises(NoAsyncCallError):
             wait()
     env.reset_async(seed=1)
@@ -91,10 +91,7 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         with pytest.raises(ResetNeeded, match=r"lost.*timed out"):
             ask()
     env.reset()
-    env.call_async("double", 2)
-    with pytest.raises(AlreadyPendingCallError, match="call_wait"):
-        env.step(np.zeros(2, np.int64))
-    assert env.call_wait(timeout=60) == (4, 4)
+    assert env.call("double", 2) == (4, 4)
     assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [1, 1]
     with pytest.raises(EnvRaised, match="no such action"):
         env.step(np.array([0, 2]))

@@ -122,7 +122,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self.autoreset_mode = checked_mode(autoreset_mode)
         self.closed = True  # Until it has started.
         self._pending: str | None = None
-        self._arguments: Any = None
+        self._mask: Any = None
         # Every call so far has returned what it was about, and nothing is in flight.
         self._is_whole = True
         config = adapted(env_fns, self.autoreset_mode, entry)
@@ -201,7 +201,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         options: dict[str, Any] | Sequence[dict[str, Any] | None] | None = None,
     ) -> None:
         """Send resets without waiting; `reset_wait` returns their results."""
-        self._arguments = self._send_resets(seed, options)
+        self._mask = self._send_resets(seed, options)
         self._pending = "reset"
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
@@ -213,7 +213,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """
         check_sent(self, self._pending, "reset")
         self._pending = None
-        return self._begun(self._collected("reset", timeout), self._arguments)
+        return self._begun(self._collected("reset", timeout), self._mask)
 
     def _send_resets(self, seed: Any, options: Any) -> NDArray[np.bool_] | None:
         """Send resets; return the mask of their envs, or None if it is all of them."""
@@ -403,26 +403,6 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """
         check_name(name)
         return tuple(self.ask(None, "call_wrapped", name, *args, **kwargs))
-
-    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
-        """Note a call, which `call_wait` makes."""
-        check_free(self, self._pending, "call_async")
-        check_name(name)
-        self._pending, self._arguments = "call", (name, args, kwargs)
-
-    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Call as `call_async` was told, and return one value for each env.
-
-        `timeout` is ignored: a call has no time limit.
-
-        Raises:
-            NoAsyncCallError: no call was noted.
-        """
-        del timeout
-        check_sent(self, self._pending, "call")
-        self._pending = None
-        name, args, kwargs = self._arguments
-        return self.call(name, *args, **kwargs)
 
     def ask(
         self, places: Sequence[int] | None, name: str, /, *args: Any, **kwargs: Any
