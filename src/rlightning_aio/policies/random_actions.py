@@ -17,23 +17,21 @@ from rlightning_aio.trees import index, mapped, stacked, tree_of, walked
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from rlightning_aio.batch import BatchedData
 
 __all__ = ["RandomPolicy", "sampler_of"]
 
 Sampler: TypeAlias = "Callable[[int], Any]"
 
-_UNBOUNDED_SCALE = 0.1
-"""Standard deviation for unbounded spaces. Their actions are usually in units of a joint's range,
-and larger ones would throw a robot about."""
+_UNBOUNDED = 0.2
+"""Largest size of numbers without bounds. They are usually in units of a joint's range, and larger
+ones would throw a robot about."""
 
 
 class RandomPolicy:
     """Samples actions from the envs' spaces.
 
-    Bounded numbers are uniform, unbounded ones normal with a small spread. Envs whose first
+    Numbers are uniform; without a bound they are small, or near the other bound. Envs whose first
     result has an ``action_mask`` (see `masks`) get discrete actions that it allows, or any if it
     allows none. One generator serves all envs in the order of their results.
 
@@ -123,25 +121,9 @@ def _box(space: Any, rng: np.random.Generator) -> Sampler:
     if np.issubdtype(space.dtype, np.integer):
         return _integers(space.low, space.high, space, rng)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
-    shape, dtype = space.shape, space.dtype
     with np.errstate(over="ignore"):
-        span = high - low
-    if np.isfinite(span).all():
-        return lambda n: (low + span * rng.random((n, *shape))).astype(dtype)
-    return lambda n: _partly_bounded(low, high, span, rng, (n, *shape)).astype(dtype)
-
-
-def _partly_bounded(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    span: NDArray[np.float64],
-    rng: np.random.Generator,
-    shape: tuple[int, ...],
-) -> NDArray[np.float64]:
-    """Draw uniformly between two bounds, and normally around 0 or away from a single bound."""
-    both = np.isfinite(span)
-    uniform = np.where(both, low, 0.0) + np.where(both, span, 0.0) * rng.random(shape)
-    normal = rng.normal(0.0, _UNBOUNDED_SCALE, shape)
-    normal = np.where(np.isfinite(low), low + abs(normal), normal)
-    normal = np.where(~np.isfinite(low) & np.isfinite(high), high - abs(normal), normal)
-    return np.where(both, uniform, normal)
+        ends = np.isfinite(high - low)
+    low = np.where(ends | np.isfinite(low), low, np.minimum(high, _UNBOUNDED) - 2 * _UNBOUNDED)
+    high = np.where(ends, high, low + 2 * _UNBOUNDED)
+    span, shape, dtype = high - low, space.shape, space.dtype
+    return lambda n: (low + span * rng.random((n, *shape))).astype(dtype)
