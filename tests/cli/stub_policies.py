@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Any
 
 import numpy as np
 
-furthest_seen: list[int] = []
 names_seen: list[frozenset[str]] = []
 
 not_callable = 3
-
-
-def furthest(batch: Any) -> list[int]:
-    """Record the highest step count in the observations of a batch."""
-    furthest_seen.append(int(batch.observation.max()))
-    return [0] * len(batch)
 
 
 def names(batch: Any) -> list[int]:
@@ -29,12 +21,6 @@ def names(batch: Any) -> list[int]:
 def respond(batch: Any) -> Any:
     """Attach a column to the actions."""
     return batch.respond(action=[1] * len(batch), value=[0.5] * len(batch))
-
-
-async def later(batch: Any) -> list[int]:
-    """Return actions after a pause, as a policy does that asks a server."""
-    await asyncio.sleep(0)
-    return [1] * len(batch)
 
 
 def too_few(batch: Any) -> list[int]:

@@ -15,43 +15,16 @@ STUB = {"name": "stub", "backend": "stub", "task": "any"}
 
 # A YAML text, overrides, and words of the message, which also names the file.
 WRONG: dict[str, tuple[str, list[str], list[str]]] = {
-    "no list": ("envs: 3", [], ["envs", "should be a list"]),
-    "an empty list": ("envs: []", [], ["envs", "no entries"]),
     "no YAML": ("envs: [", [], ["line ", "not valid YAML"]),
     "an unknown field": (
         "envs: [{name: a, backend: gymnasium, task: CartPole-v1, num_worker: 2}]",
         [],
         ["envs.0 ('a')", "num_worker", "num_workers"],
     ),
-    "a wrong type": (
-        "envs: [{name: a, backend: gymnasium, task: CartPole-v1, num_workers: many}]",
-        [],
-        ["envs.0 ('a')", "num_workers", "'many'"],
-    ),
-    "an unknown backend": (
-        "envs: [{name: a, backend: mujuco, task: HalfCheetah-v5}]",
-        [],
-        ["envs.0 ('a')", "backend", "'mujoco'"],
-    ),
-    "vectorised where there is no such thing": (
-        "envs: [{name: a, backend: piper, task: can0, num_envs: 4}]",
-        [],
-        ["envs.0 ('a')", "num_envs", "num_workers: 4"],
-    ),
-    "a missing module": (
-        "{imports: [no_such_module], envs: [{name: a, backend: gymnasium, task: CartPole-v1}]}",
-        [],
-        ["imports", "no_such_module"],
-    ),
     "an override of nothing": (
         "envs: [{name: a, backend: gymnasium, task: CartPole-v1}]",
         ["envs.3.num_workers=2"],
         ["override 'envs.3.num_workers=2'"],
-    ),
-    "an override that is none": (
-        "envs: [{name: a, backend: gymnasium, task: CartPole-v1}]",
-        ["num_workers"],
-        ["override 'num_workers'", "envs.0.num_workers=8"],
     ),
 }
 

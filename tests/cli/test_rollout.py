@@ -69,21 +69,6 @@ def test_a_rollout_can_have_a_time_limit(tmp_path: Path) -> None:
     assert document["seconds"] >= 0.05
 
 
-def test_a_rollout_without_results_prints_a_document(tmp_path: Path) -> None:
-    """The time limit may pass before the first result; the exit code says that."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    done = invoke("rollout", config, "--seconds", 0.001, "--min-results", 2, "--json")
-    assert done.exit_code == (0 if json.loads(done.stdout)["steps"] else 1)
-    assert " steps in " in invoke("rollout", config, "--seconds", 0.001).stdout
-
-
-def test_overrides_change_the_config(tmp_path: Path) -> None:
-    """They follow the file on the command line."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    document = invoke_json("rollout", config, "envs.0.num_workers=5", "--steps", 50)
-    assert document["metrics"]["envs/envs"] == 5
-
-
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("episode_length", [1, 4, 1000])
 def test_resets_are_not_counted_as_steps(
@@ -100,17 +85,6 @@ def test_resets_are_not_counted_as_steps(
     # Steps that were sent but not collected may have been executed or not.
     assert 90 <= Stub.steps <= 90 + 3 * num_envs
     assert document["metrics"]["envs/outcomes_terminated"] <= 90 // episode_length
-
-
-def test_configured_step_limits_end_episodes(tmp_path: Path) -> None:
-    """Every entry has one, and the envs never end by themselves."""
-    kwargs = {"episode_length": 10**9}
-    config = write_config(
-        tmp_path, {**STUB, "num_workers": 2, "env_kwargs": kwargs, "max_episode_steps": 5}
-    )
-    stub_policies.furthest_seen.clear()
-    invoke_json("rollout", config, "--steps", 100, "--policy", "cli.stub_policies:furthest")
-    assert max(stub_policies.furthest_seen) == 5
 
 
 def test_a_seed_repeats_a_rollout(tmp_path: Path) -> None:
@@ -140,22 +114,6 @@ def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
     assert 8 <= mean_length(json.loads(done.stdout)["metrics"]) <= 11
 
 
-def test_a_policy_may_return_a_batch_of_responses(tmp_path: Path) -> None:
-    """The return value of `respond` is sent unchanged."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    document = invoke_json(
-        "rollout", config, "--steps", 30, "--policy", "cli.stub_policies:respond"
-    )
-    assert document["steps"] == 30
-
-
-def test_a_policy_may_be_a_coroutine_function(tmp_path: Path) -> None:
-    """One that asks an inference server is an example."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    document = invoke_json("rollout", config, "--steps", 30, "--policy", "cli.stub_policies:later")
-    assert document["steps"] == 30
-
-
 @pytest.mark.parametrize("placement", ["process", "inline"])
 def test_printing_of_other_code_goes_to_stderr(tmp_path: Path, placement: str) -> None:
     """This includes envs, processes they start, and policies, until the end."""
@@ -181,19 +139,6 @@ def test_a_policy_gets_a_batch_for_each_entry_if_spaces_differ(
         *("--policy", "cli.stub_policies:names"),
     )
     assert set(stub_policies.names_seen) == {frozenset({"stub"}), frozenset({"other"})}
-
-
-def test_random_actions_fit_entries_with_different_spaces(tmp_path: Path) -> None:
-    """The entries are collected together."""
-    pendulum = {"name": "pendulum", "backend": "gymnasium", "task": "Pendulum-v1"}
-    config = write_config(
-        tmp_path,
-        {**CARTPOLE, "placement": "inline"},
-        {**pendulum, "placement": "inline", "num_workers": 2},
-    )
-    document = invoke_json("rollout", config, "--steps", 300)
-    numbers = document["metrics"]
-    assert min(numbers[f"envs/{name}/steps"] for name in ("pole", "pendulum")) > 50
 
 
 @pytest.mark.parametrize("name", ["model", "by_entry"])

@@ -142,31 +142,6 @@ def test_a_thousand_steps_with_any_options(task: str) -> None:
     compare_with_any_options(task, 6, 1000)
 
 
-@pytest.mark.usefixtures("implementation")
-@pytest.mark.parametrize("task", ["Ant-v5", "Hopper-v5", "InvertedDoublePendulum-v5"])
-def test_all_data_of_a_simulation_equal_gymnasiums(task: str) -> None:
-    """Positions of bodies, contacts and forces, after steps and after resets."""
-    options = {"max_episode_steps": 4}
-    ours = MujocoBatch(make(task, options)(), 2)
-    theirs: Any = make(task, options)()
-    ours.reset(seed=4)
-    theirs.reset(seed=5)
-    over = False
-    ours.action_space.seed(0)
-    for _ in range(12):
-        action = ours.action_space.sample()
-        ours.step(action)
-        if over:
-            theirs.reset()
-        over = not over and any(theirs.step(action[1])[2:4])
-        found, expected = ours.call_one(1, "data"), theirs.unwrapped.data
-        assert (found.time, found.ncon) == (expected.time, expected.ncon)
-        for name in ("qpos", "qacc", "xpos", "cfrc_ext", "cinert", "efc_force", "qacc_warmstart"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
-    ours.close()
-    theirs.close()
-
-
 def test_contact_forces_are_compiled_where_the_kernel_is(implementation: str) -> None:
     """So the tests of both implementations compare two ways to contact forces."""
     assert (compiled() is None) == (implementation == "python")
@@ -185,21 +160,6 @@ def test_a_field_that_is_elsewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(RuntimeError, match=r"mjData\.qpos is not where"):
         offset_of("qpos", env.data)
     env.close()
-
-
-@pytest.mark.usefixtures("implementation")
-@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, np.int64])
-@pytest.mark.parametrize("task", ["HalfCheetah-v5", "Ant-v5"])
-def test_actions_of_any_type_cost_the_same(task: str, kind: type[Any]) -> None:
-    """Costs are computed in the type of the actions, which may be a part of something else."""
-    ours, theirs = MujocoBatch(make(task, {})(), 3), SyncVectorEnv([make(task, {})] * 3)
-    assert_alike(ours.reset(seed=0), theirs.reset(seed=0))
-    width = ours.single_action_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
-    wide = np.random.default_rng(0).uniform(-2, 2, (20, 3, 2 * width))
-    for actions in wide.astype(kind)[..., ::2]:
-        assert_alike(ours.step(actions), theirs.step(actions))
-    ours.close()
-    theirs.close()
 
 
 def test_returned_arrays_are_used_again_when_nobody_has_them() -> None:

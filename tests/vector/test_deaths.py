@@ -155,41 +155,6 @@ def test_a_hang_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) -> 
     ours.close()
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_a_death_in_a_step_truncates_all_envs_of_its_worker(
-    mode: AutoresetMode, twins: Any
-) -> None:
-    """Their episodes end at the last observation; the step of the others doesn't change."""
-    envs = made(autoreset_mode=mode)
-    before, _ = envs.reset(seed=7)
-    killed(envs.group, lambda: envs.step_async(ACTIONS))
-    observations, rewards, terminated, truncated, infos = envs.step_wait()
-    expected = twins.step(ACTIONS)
-    assert truncated.tolist() == infos["_worker_restarted"].tolist() == LOST
-    assert not terminated.any()
-    assert rewards[:2].tolist() == [0, 0]
-    assert all("was killed by SIGKILL" in cause for cause in infos["worker_restarted"][:2])
-    last = observations
-    if mode == AutoresetMode.SAME_STEP:
-        assert infos["_final_obs"].tolist() == infos["final_info"]["_worker_restarted"].tolist()
-        last = np.array([*infos["final_obs"][:2], *observations[2:]])
-        assert not (observations[:2] == before[:2]).all(axis=1).any()
-    np.testing.assert_array_equal(last[:2], before[:2])
-    np.testing.assert_array_equal(last[2:], expected[0][2:])
-    np.testing.assert_array_equal(rewards[2:], expected[1][2:])
-    if mode == AutoresetMode.DISABLED:
-        envs.reset(options={"reset_mask": np.array(LOST)})
-    for turn in range(3):
-        observations, rewards, _, truncated, infos = envs.step(ACTIONS)
-        expected = twins.step(ACTIONS)
-        is_reset = turn == 0 and mode == AutoresetMode.NEXT_STEP
-        assert ((rewards == 0) == (np.array(LOST) & is_reset)).all()
-        assert not truncated.any()
-        assert "worker_restarted" not in infos
-        np.testing.assert_array_equal(observations[2:], expected[0][2:])
-    envs.close()
-
-
 def step_until_one_has_ended(envs: Any) -> int:
     """Step until one of the first two has ended; return its position."""
     envs.action_space.seed(0)

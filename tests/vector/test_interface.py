@@ -343,22 +343,6 @@ def test_errors_name_what_the_user_has_given() -> None:
         VectorEnv([partial(Sized, high=3)] * 2)
 
 
-def test_fields_of_the_runtime_are_arguments_of_make_vec() -> None:
-    """They reach its workers, and not the constructor of the task."""
-    fields: dict[str, Any] = {
-        "step_timeout": 3600,
-        "envs_per_process": 2,
-        "autoreset_mode": AutoresetMode.DISABLED,
-    }
-    env: Any = make_vec("CartPole-v1", 4, **fields)
-    with contextlib.closing(env):
-        assert [worker["env_ids"] for worker in env.group.get_workers()] == [
-            ["env-0", "env-1"],
-            ["env-2", "env-3"],
-        ]
-        assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
-
-
 def test_own_envs_step_all_at_once() -> None:
     """As in `AsyncVectorEnv`: none waits for a worker that another one uses."""
     with contextlib.closing(VectorEnv([Plain] * 3)) as env:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-import multiprocessing
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +24,6 @@ from rlightning_aio.errors import ConfigError, EnvRaised, SnapshotError, StartFa
 from rlightning_aio.vector import VectorEnv, make_vec
 from rlightning_aio.vector.making import steps_together
 from rlightning_aio.vector.mujoco import MujocoVectorEnv
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 INLINE: dict[str, Any] = {"placement": "inline"}
 PENDULUM = "InvertedPendulum-v5"
@@ -114,15 +110,6 @@ def test_a_mask_that_changes_before_the_resets_are_awaited() -> None:
     mask[:] = False, True
     after, _ = env.reset_wait()
     assert (after != before).any(axis=1).tolist() == [True, False]
-    env.close()
-
-
-@pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])
-def test_a_mask_that_resets_nothing_is_refused(fields: dict[str, Any]) -> None:
-    env = make_vec(PENDULUM, 2, autoreset_mode=AutoresetMode.DISABLED, **fields)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="at least one True"):
-        env.reset(options={"reset_mask": np.zeros(2, np.bool_)})
     env.close()
 
 
@@ -244,40 +231,6 @@ def test_a_callable_that_returns_a_vector_environment_raises(count: int) -> None
     make = functools.partial(SyncVectorEnv, [Toy] * count)
     with pytest.raises(StartFailed, match=r"must return one env, not a SyncVectorEnv: use that"):
         VectorEnv([make] * 2, **INLINE)
-
-
-class Gated(Toy):
-    """Its first step waits for the file."""
-
-    def __init__(self, gate: Path) -> None:
-        super().__init__()
-        self.gate = gate
-
-    def step(self, action: Any) -> Any:
-        while not self.gate.exists():
-            pass
-        observation, reward, _, _, info = super().step(action)
-        return observation, reward, False, False, info
-
-
-def test_results_after_a_timeout_are_dropped(tmp_path: Path) -> None:
-    """Also of envs that share a worker."""
-    gate = tmp_path / "open"
-    env = VectorEnv([functools.partial(Gated, gate)] * 4, envs_per_process=2)
-    env.reset(seed=0)
-    env.step_async(np.zeros(4, np.int64))
-    with pytest.raises(multiprocessing.TimeoutError):
-        env.step_wait(timeout=0.01)
-    gate.touch()
-    with pytest.raises(ResetNeeded):
-        env.step(np.zeros(4, np.int64))
-    env.reset(seed=0)
-    assert env.step(np.zeros(4, np.int64))[4]["count"].tolist() == [1, 1, 1, 1]
-    with pytest.raises(ValueError, match="has 3 rows for a batch of 4"):
-        env.step(np.zeros(3, np.int64))
-    with pytest.raises(TypeError, match="not a scalar"):
-        env.step(np.int64(0))
-    env.close()
 
 
 def test_an_entry_of_vector_environments_of_one_is_refused() -> None:
