@@ -17,8 +17,6 @@ from rlightning_aio.trees import index, mapped, stacked, tree_of, walked
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from numpy.typing import NDArray
-
     from rlightning_aio.batch import BatchedData
 
 __all__ = ["RandomPolicy", "sampler_of"]
@@ -124,9 +122,8 @@ def _box(space: Any, rng: np.random.Generator) -> Sampler:
         return _integers(space.low, space.high, space, rng)
     low, high = space.low.astype(np.float64), space.high.astype(np.float64)
     with np.errstate(over="ignore"):
-        span: NDArray[np.float64] = high - low
-    near = np.minimum(high, _UNBOUNDED) - 2 * _UNBOUNDED
-    first: NDArray[np.float64] = np.where(np.isfinite(low), low, near)
-    span = np.where(np.isfinite(span), span, 2 * _UNBOUNDED)
-    shape, dtype = space.shape, space.dtype
-    return lambda n: (first + span * rng.random((n, *shape))).astype(dtype)
+        span = high - low
+    known: Any = np  # Its annotations make nothing of the bounds, which have no types.
+    first = known.where(np.isfinite(low), low, np.minimum(high, _UNBOUNDED) - 2 * _UNBOUNDED)
+    span = known.where(np.isfinite(span), span, 2 * _UNBOUNDED)
+    return lambda n: (first + span * rng.random((n, *space.shape))).astype(space.dtype)
