@@ -1,7 +1,7 @@
 """Each program in ``examples/``, in the README and in the documents runs unchanged.
 
 New pages are found automatically. Programs that train, and so need torch, are run by
-examples/test_programs.py, those with aiohttp and examples/agent.py by examples/test_agent.py, the
+examples/test_programs.py, examples/agent.py and examples/http_env.py by examples/test_agent.py, the
 trainer of remote.md, which needs a client, by cli/test_remote_commands.py.
 """
 
@@ -47,7 +47,7 @@ def by_program(written: str) -> dict[str, str]:
 
 # Those of migrating.md are run by vector/test_pages.py, that on Ray by on_ray/test_pages.py.
 NEEDS_MORE = (
-    r"^(import (torch|aiohttp)$|from stable_baselines3|net = "
+    r"^(import torch$|from stable_baselines3|net = "
     r"|from (lerobot|ray|rl_zoo3|skrl|skyrl_gym|tianshou|tinker_cookbook|torchrl|trl)\b"
     r"| +import gym_pusht|    \"placement\": \"ray\")"
 )

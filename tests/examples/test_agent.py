@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
-OWN_ENV = ROOT / "docs" / "own_env.md"
 ERRORS = {
     "InternalServerError": "always 500",
     "AttributeError": "no JSON",
@@ -240,51 +239,7 @@ def test_a_request_is_sent_again_when_the_server_says_and_not_if_it_is_wrong(
     assert after(400) is after(401, retry_after="1") is None
 
 
-TANKS = """
-import asyncio
-
-from aiohttp import web
-
-import rlightning_aio as rl
-from rlightning_aio.evaluation import evaluate
-
-levels = {}
-
-
-async def change(request):
-    tank, asked = request.match_info["tank"], await request.json()
-    await asyncio.sleep(0.005)  # It computes.
-    levels[tank] = asked.get("level", levels.get(tank, 0) + 0.5 * asked.get("valve", 0) - 0.05)
-    return web.json_response({"level": levels[tank]})
-
-
-def controller(batch):
-    return np.clip(-2 * batch.observation, -1, 1).astype(np.float32)
-
-
-async def main():
-    app = web.Application()
-    app.add_routes([web.post("/tanks/{tank}", change)])
-    runner = web.AppRunner(app)
-    await runner.setup()
-    await web.TCPSite(runner, "127.0.0.1", 0).start()
-    url = "http://127.0.0.1:{}".format(runner.addresses[0][1])
-    options = {"num_workers": 16, "placement": "loop", "step_timeout": 10, "max_concurrency": 8}
-    async with rl.build_env_group(Tank, env_kwargs={"url": url}, **options) as group:
-        found = await evaluate(group, controller, episodes=4, seed=1000)
-    await runner.cleanup()
-    print(f"{found.total_reward.mean:.2f} in {found.total_reward.count} episodes")
-
-
-rl.run(main())
-"""
-
-
-def test_the_env_with_aiohttp_of_the_page_on_own_envs_runs(tmp_path: Path) -> None:
-    """Sixteen of them are evaluated, with a real HTTP server."""
-    blocks = re.findall(r"^```python\n(.*?)^```", OWN_ENV.read_text(), re.MULTILINE | re.DOTALL)
-    (block,) = [block for block in blocks if "import aiohttp\n" in block]
-    program = tmp_path / "program.py"
-    program.write_text(block + TANKS)
-    printed = output_of("-W", "error", program, asyncio_debug=False)
+def test_the_environment_behind_http_is_evaluated() -> None:
+    """Its simulator is a real HTTP server."""
+    printed = output_of("-W", "error", EXAMPLES / "http_env.py", asyncio_debug=False)
     assert printed == "-1.05 in 64 episodes\n"
