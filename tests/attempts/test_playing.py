@@ -1139,5 +1139,5 @@ async def test_what_is_not_asynchronous_is_refused() -> None:
     with sync.build_env_group(CountedRoom, num_workers=1, placement="inline") as group, refused:
         await played(group, tasks(1), earner)
     async with rooms(PLACES["loop"]) as group:
-        with pytest.raises(rl.RLightningError, match="returned 7; it must be a coroutine function"):
+        with pytest.raises(TypeError, match="returned 7; it must be a coroutine function"):
             await played(group, tasks(1), wrong)

@@ -688,9 +688,21 @@ async def test_an_env_that_blocks_the_event_loop_is_reported(
     (report,) = [r for r in caplog.records if "blocked the event loop" in r.getMessage()]
     assert report.levelno == logging.WARNING
     args: Any = report.args
-    env_id, entry_name, milliseconds, doing = args
+    env_id, entry_name, milliseconds, doing, _ = args
     assert (env_id, entry_name, doing) == ("slow-1", "slow", "step")
     assert milliseconds >= 120
+
+
+async def test_few_of_many_turns_that_block_the_event_loop_are_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with rl.build_env_group(entry("slow")) as group:
+        await group.reset()
+        for _ in range(5):
+            await group.step(steps(slow_0=BLOCK))
+    reports = [one for one in caplog.messages if "blocked the event loop" in one]
+    assert len(reports) == 3
+    assert reports[-1].endswith("every 100th such turn is logged")
 
 
 async def test_the_garbage_collectors_time_is_nobodys(caplog: pytest.LogCaptureFixture) -> None:

@@ -87,7 +87,8 @@ class Try:
         """Play; the env is idle after that.
 
         Raises:
-            RLightningError, TypeError, ValueError: the env can't be reset like this at all.
+            RLightningError, TypeError, ValueError: the env can't be reset like this at all, or the
+                agent is no coroutine function.
         """
         began = time.monotonic()
         limit = self._rules.attempt_timeout
@@ -123,6 +124,8 @@ class Try:
         if ended.kind in ("env_raised", "not_started"):
             await surely({asyncio.ensure_future(view.renew())})
         self._has_ended = True
+        if isinstance(self.error, _NoCoroutine):
+            raise TypeError(*self.error.args)
         return self._record(ended, result, time.monotonic() - began)
 
     async def _within(self, task: asyncio.Task[Any], limit: float | None) -> None:
@@ -223,7 +226,7 @@ class Try:
         blame: Any = getattr(error, "blame", None)
         if blame not in BLAMES:
             blame = "infrastructure" if is_connections(error) else "caller"
-        if blame == "caller" and type(error) not in self._logged:
+        if blame == "caller" and type(error) not in (*self._logged, _NoCoroutine):
             self._logged.add(type(error))
             _log.warning(
                 "the agent of env %r has raised; it isn't said again of this type of error:\n%s",
@@ -253,10 +256,14 @@ class Try:
         )
 
 
+class _NoCoroutine(TypeError):
+    """An agent is no coroutine function."""
+
+
 async def _awaited(agent: Agent, view: AttemptEpisode) -> Any:
     answer: Any = agent(view)
     if not inspect.isawaitable(answer):
-        raise TypeError(f"the agent returned {answer!r}; it must be a coroutine function")
+        raise _NoCoroutine(f"the agent returned {answer!r}; it must be a coroutine function")
     return await answer
 
 

@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
+_LINES, _EVERY = 3, 100
+"""Turns that hold the event loop for long: the first ones are logged, then each of this number."""
 _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
@@ -133,7 +135,7 @@ class AwaitedEnvs:
         self.runners: list[AwaitedRunner] = []
         self._records: list[_EnvRecord] = []
         self._queue: deque[tuple[_EnvRecord, int, Any]] = deque()
-        self.num_busy = 0
+        self.num_busy = self._num_held = 0
         self._queues = order.config.max_concurrency is not None
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
@@ -333,14 +335,18 @@ class AwaitedEnvs:
         self._begin_queued()
 
     def _report(self, entry: int, seconds: float) -> None:
-        """Report an env that has held the event loop for long."""
+        """Report an env that has held the event loop for long: the first ones, and then few."""
+        self._num_held += 1
+        if self._num_held > _LINES and self._num_held % _EVERY:
+            return
         log.warning(
             "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
-            "meanwhile: await what it waits for, or run it by asyncio.to_thread()",
+            "meanwhile: await what it waits for, or run it by asyncio.to_thread()%s",
             self._records[slot_of(entry) - self._first_slot].name,
             self._order.config.name,
             1e3 * seconds,
             Operation(op_of(entry)).name.lower(),
+            f"; every {_EVERY}th such turn is logged" if self._num_held >= _LINES else "",
         )
 
     def abort(self, entry: int) -> None:
