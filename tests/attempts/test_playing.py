@@ -883,6 +883,56 @@ async def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
             assert sorted(broken) == [f"room-{k}" for k in range(4)]
 
 
+class Slow(Sandbox):
+    """Counts its resets."""
+
+    began = 0
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        type(self).began += 1
+        return await super().reset(seed=seed, options=options)
+
+
+async def test_free_envs_prepare_while_others_play() -> None:
+    """As many as may play are reset before they are asked to; more are not."""
+    playing = most = 0
+    prepared = set[int]()
+
+    async def agent(episode: AttemptEpisode) -> None:
+        nonlocal playing, most
+        playing += 1
+        most = max(most, playing)
+        while not prepared and Slow.began < 4:  # noqa: ASYNC110  # Two play, and two are ready.
+            await asyncio.sleep(0)
+        prepared.add(Slow.began)
+        await once(episode)
+        playing -= 1
+
+    Slow.began = 0
+    async with rl.build_env_group(Slow, name="box", num_workers=8, placement="loop") as group:
+        rules = Rules(max_concurrency=2, attempt_timeout=HANG)
+        found = await played(group, tasks(8), agent, 2, rules)
+    assert most == 2
+    assert min(prepared) == 4
+    assert all(attempts.is_complete for attempts in found)
+
+
+async def test_an_attempt_whose_turn_never_came_is_cancelled() -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        while Slow.began < 2 or not episode.spec.seed:  # noqa: ASYNC110  # The others wait.
+            await asyncio.sleep(0)
+        await once(episode)
+
+    Slow.began = 0
+    async with rl.build_env_group(Slow, name="box", num_workers=4, placement="loop") as group:
+        specs = [EpisodeSpec("", 1)]
+        rules = Rules(max_concurrency=1, first=1)
+        (found,) = await played(group, specs, agent, 2, rules)
+        assert [one.outcome.kind for one in found] == ["terminated", "cancelled"]
+        assert group.pending == []
+        assert len(await played(group, specs, once, 4)) == 1
+
+
 class Poisoned(AwaitedRoom):
     """An action may end its worker, while all envs in that wait."""
 

@@ -42,7 +42,8 @@ class AttemptEpisode:
     def __init__(self, episode: EnvEpisode, spec: EpisodeSpec, index: int, clock: Clock) -> None:
         self._episode, self._clock = episode, clock
         self._queues = episode.queues
-        self._began, self._queued = self._clock.now(), 0.0
+        self._began: float = self._clock.now()
+        self._queued: float = 0.0
         self._asked_at: float | None = None  # What is in flight, by the clock.
         self._over = ""  # Why it can't be stepped.
         self.spec, self.index = spec, index
@@ -198,6 +199,10 @@ class AttemptInPlay(AttemptEpisode):
             inside = self._episode.seconds_in_env or 0.0
             queued += max(self._clock.now() - self._asked_at - inside, 0.0)
         return self._clock.now() - self._began - queued
+
+    def note_wait(self, seconds: float) -> None:
+        """Don't count seconds for which others kept its agent waiting."""
+        self._queued += seconds
 
     @property
     def in_step(self) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 import time
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
@@ -159,6 +160,7 @@ class _Engine:
         self._ended = deque[asyncio.Task[Attempt]]()
         self._look_at = 0.0
         self._logged = set[type[BaseException]]()
+        self._turns = asyncio.Semaphore(rules.max_concurrency or sys.maxsize)
         self._health = health = Health()
         self._clock = Clock()
         self._numbers = Numbers(group)
@@ -233,9 +235,9 @@ class _Engine:
 
     @property
     def _most(self) -> int:
-        """Number of attempts that may play at once."""
+        """Number of attempts that may play at once, and of envs that prepare for the next ones."""
         envs = len(self._queue.free) + len(self._playing)
-        return min(envs, self._rules.max_concurrency or envs)
+        return min(envs, 2 * (self._rules.max_concurrency or envs))
 
     def _begin(self) -> bool:
         """Begin attempts on idle envs, and read more tasks while envs are idle.
@@ -274,7 +276,8 @@ class _Engine:
         options = self._queue.players.options(env_id, job.spec)
         episode = self._group.episode(env_id, job.spec.seed, options)
         view = AttemptInPlay(episode, job.spec, job.index, self._clock)
-        one = Try(view, self._agent, self._rules, time.monotonic() - job.since, self._logged)
+        waited = time.monotonic() - job.since
+        one = Try(view, self._agent, self._rules, waited, self._logged, self._turns)
         if self._health.is_slow:
             self._probes.append(one)
             self._health.note_begin(time.monotonic())

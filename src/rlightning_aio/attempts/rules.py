@@ -60,7 +60,8 @@ class Rules:
             worker where nobody else plays.
         first: as soon as this many attempts have not failed, the group is complete, and the others
             are cancelled; None: it is complete if none has failed.
-        max_concurrency: how many attempts may play at once; None for one on each env.
+        max_concurrency: how many attempts may play at once; None for one on each env. As many
+            other envs, if there are, reset meanwhile for the attempts that come next.
         max_failures: the share of the last hundred attempts that may fail, after their last try. If
             more have failed, `play` ends with an error that counts them by kind; None never ends
             it.

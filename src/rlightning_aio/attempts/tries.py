@@ -46,6 +46,7 @@ class Try:
         rules: of the attempts.
         waited: seconds until an env was free.
         logged: types of agents' errors that are in the log; more are added.
+        turns: lets as many agents play as may at once; its env is reset before that.
 
     Attributes:
         error: what the agent or the reset has raised, if they have.
@@ -58,14 +59,16 @@ class Try:
         rules: Rules,
         waited: float,
         logged: set[type[BaseException]],
+        turns: asyncio.Semaphore,
     ) -> None:
         self._view, self._agent, self._rules, self._waited = view, agent, rules, waited
-        self._logged = logged
+        self._logged, self._turns = logged, turns
         # Why it was stopped, if it was; and what `_either` waits for.
         self._stopped: str | None = None
         self._woken: asyncio.Future[None] | None = None
         self.error: BaseException | None = None
         self._has_ended = False
+        self._prepared = 0.0  # Seconds for which its env was ready before its agent could play.
 
     @property
     def env_id(self) -> str:
@@ -109,17 +112,7 @@ class Try:
             await self._leave()
         else:
             del begin  # A task keeps its coroutine.
-            playing = asyncio.ensure_future(_awaited(self._agent, view))
-            await self._within(playing, limit)
-            ended = self._end_of(playing)
-            if not playing.done():
-                playing.cancel()
-                await surely({playing}, _PATIENCE_SECONDS)
-                self._abandon(playing)
-                if not ended.is_failure:  # Its time was over, but its env was lost before that.
-                    ended = view.fault or ended
-            elif not ended.is_failure:
-                result = playing.result()
+            ended, result = await self._play(limit)
             await self._leave()
         if ended.kind in ("env_raised", "not_started"):
             await surely({asyncio.ensure_future(view.renew())})
@@ -127,6 +120,37 @@ class Try:
         if isinstance(self.error, _NoCoroutine):
             raise TypeError(*self.error.args)
         return self._record(ended, result, time.monotonic() - began)
+
+    async def _play(self, limit: float | None) -> tuple[Outcome, Any]:
+        """Have the agent play once its turn has come; return how that ended, and its result."""
+        if not await self._enter():
+            return self._cut_short(has_begun=True), None
+        playing = asyncio.ensure_future(_awaited(self._agent, self._view))
+        await self._within(playing, limit)
+        ended = self._end_of(playing)
+        is_cut = not playing.done()
+        if is_cut:
+            playing.cancel()
+            await surely({playing}, _PATIENCE_SECONDS)
+            self._abandon(playing)
+            if not ended.is_failure:  # Its time was over, but its env was lost before that.
+                ended = self._view.fault or ended
+        self._turns.release()
+        return ended, None if is_cut or ended.is_failure else playing.result()
+
+    async def _enter(self) -> bool:
+        """Wait until its agent may play; its time stands still. False if it is stopped."""
+        began = self._view.ran()
+        entering = asyncio.ensure_future(self._turns.acquire())
+        await self._either(entering, None)
+        if not entering.done():
+            entering.cancel()
+            await surely({entering})
+        if entering.cancelled():
+            return False
+        self._prepared = self._view.ran() - began
+        self._view.note_wait(self._prepared)
+        return True
 
     async def _within(self, task: asyncio.Task[Any], limit: float | None) -> None:
         """Wait for a task, until this try is stopped, or has run for `limit` seconds."""
@@ -238,8 +262,8 @@ class Try:
 
     def _record(self, ended: Outcome, result: Any, seconds: float) -> Attempt:
         view = self._view
-        agent = max(seconds - view.seconds, 0.0)
-        spent = TimeSpent(env=view.seconds, agent=agent, waiting=self._waited)
+        agent = max(seconds - view.seconds - self._prepared, 0.0)
+        spent = TimeSpent(view.seconds, agent, waiting=self._waited + self._prepared)
         last = None if view.first is None else copied(view.last.observation)
         return Attempt(
             view.spec,
