@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import subprocess
+import time
 from collections import Counter
 from concurrent.futures import Executor, Future
 from dataclasses import replace
@@ -236,6 +237,35 @@ def test_only_the_env_at_fault_is_charged_an_attempt(breaks: int) -> None:
     assert found.failures.total() == 1
     played = sorted((one.spec.task, one.spec.seed) for one in found.played)
     assert played == [("1", 8), ("1", 9), ("3", 8), ("3", 9)]
+
+
+class Bad(gym.Env[Any, Any]):
+    """Its steps take a while, and those of the first env fail at once."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, *, is_bad: bool) -> None:
+        self.is_bad = is_bad
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        if self.is_bad:
+            raise OSError("it is broken")
+        time.sleep(0.01)
+        return 0, 1.0, True, False, {}
+
+
+def test_an_env_that_is_broken_rests_while_others_play() -> None:
+    makers = [partial(Bad, is_bad=k == 0) for k in range(3)]
+    group = sync.build_env_group(makers, envs_per_process=1, max_restarts=99)
+    queue = [EpisodeSpec("", seed) for seed in range(60)]
+    with group:
+        found = evaluate(group, None, queue, min_results=1, retries=0)
+        assert {one.env_id for one in found.failed} == {group.env_ids[0]}
+    assert 3 <= len(found.failed) <= 6
 
 
 class AwaitableTasks:

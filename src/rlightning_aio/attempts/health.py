@@ -11,7 +11,7 @@ import logging
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.attempts.rules import is_of_env
+from rlightning_aio.attempts.rules import is_final, is_of_env
 
 if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
@@ -45,18 +45,22 @@ class Health:
 
     def note(self, outcome: Outcome, num_playing: int, now: float) -> None:
         """Note the end of a try; `num_playing` may play at once."""
-        if not outcome.is_failure or outcome.blame == "policy":
+        self.note_env(outcome, now)
+        if is_final(outcome):
+            self._note_recent("", num_playing, now)
+        elif outcome.blame != "caller" and outcome.kind != "timed_out":
+            self._note_recent(outcome.kind, num_playing, now)
+
+    def note_env(self, outcome: Outcome, now: float) -> None:
+        """Note the end of a try for its env alone, which rests if it has failed too often."""
+        if is_final(outcome):
             self._in_a_row.pop(outcome.env_id, None)
             self._rests.pop(outcome.env_id, None)
-            self._note_recent("", num_playing, now)
-            return
-        if is_of_env(outcome):
+        elif is_of_env(outcome):
             self._in_a_row[outcome.env_id] += 1
             if (more := self._in_a_row[outcome.env_id] - _BORNE) > 0:
                 rest = min(_REST * 2.0 ** min(more - 1, 10), _LONGEST_REST)
                 self._rests[outcome.env_id] = now + rest
-        if outcome.blame != "caller" and outcome.kind != "timed_out":
-            self._note_recent(outcome.kind, num_playing, now)
 
     def _note_recent(self, kind: str, num_playing: int, now: float) -> None:
         if self.is_slow:

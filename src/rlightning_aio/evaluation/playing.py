@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import time
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents, readable, summed_rewards
 from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
@@ -96,6 +98,8 @@ class PolicyPlay:
         """Episodes that the last results ended, to be noted."""
         self._has_warned = False
         self._films = options.films
+        self._health = Health()
+        queue.may_play = lambda env_id: not self._health.rests(env_id, time.monotonic())
 
     # -- the loop ---------------------------------------------------------------------
 
@@ -159,6 +163,7 @@ class PolicyPlay:
     def _end_waiting(self) -> None:
         """End what waits while no env plays: only envs that are not there could play it."""
         self._look()
+        self._health = Health()  # Envs rest only while others play.
         if self._queue.next_env() is not None:
             return
         players = self._queue.players
@@ -185,6 +190,7 @@ class PolicyPlay:
 
     def _keep(self, job: Job, attempt: Attempt, *, is_last: bool = False) -> None:
         """Note what came of an episode."""
+        self._health.note_env(attempt.outcome, time.monotonic())
         if self._films is not None and not attempt.outcome.is_failure:
             self._films.keep(attempt)
         if not self._queue.end(job, attempt, is_last=is_last):
