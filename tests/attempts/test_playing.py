@@ -9,6 +9,7 @@ import json
 import math
 import os
 import signal
+import threading
 import time
 import tracemalloc
 from collections import Counter
@@ -23,7 +24,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, play
+from rlightning_aio.attempts import Attempt, EpisodeSpec, ResultsFile, Rules, play
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
@@ -1073,6 +1074,34 @@ async def test_groups_that_were_not_handed_out_come_after_a_resume(tmp_path: Pat
                         if len(found) % 5 == most % 5:
                             break
     assert sorted(found) == [*range(10)]
+
+
+async def test_lines_are_written_beside_the_event_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Attempts go on while the disk is slow; no group comes before it is in the file."""
+    disk, to_json = threading.Event(), Attempt.to_json
+    ended, most_have_ended = Counter[int](), asyncio.Event()
+
+    def slow(attempt: Attempt) -> dict[str, Any]:
+        assert disk.wait(HANG)
+        return to_json(attempt)
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await earner(episode)
+        ended[episode.spec.seed] += 1
+        if ended.total() == 4:
+            most_have_ended.set()
+
+    monkeypatch.setattr(Attempt, "to_json", slow)
+    async with rooms(PLACES["loop"]) as group:
+        with ResultsFile(tmp_path / "results") as results:
+            playing = asyncio.ensure_future(played(group, tasks(6), agent, 2, results=results))
+            await most_have_ended.wait()
+            assert not playing.done()
+            disk.set()
+            assert len(await playing) == 6
+            assert len(results) == 12
 
 
 async def test_a_file_keeps_no_columns_in_memory(tmp_path: Path) -> None:
