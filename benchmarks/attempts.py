@@ -1,18 +1,18 @@
-"""Attempts of agents while envs, agents and a model's server fail.
+"""Attempts of agents: while much fails, and thousands at once.
 
-64 tasks are attempted 8 times each, on 256 awaitable envs, and on 16 envs in worker processes. Of
-the attempts, 5 % each meet an env that raises, one that hangs, one whose process dies (in workers),
-a reset that fails, an agent that is stuck, and a model's server that is away. `play` tries all but
-stuck agents again. The report counts outcomes against what was injected.
+    python benchmarks/attempts.py --faults
 
-Then 2,000 attempts of ten steps in flight, whose steps wait for a second on average on the event
-loop, or for a tenth of it in worker processes (log-normal): how late the event loop is, with the
-start of all of them, and what a step costs the trainer's thread, with its share of the starts and
-ends.
+200 tasks are attempted 8 times each in 64 sandboxes of an HTTP server, a process of its own with a
+ledger. Of the attempts, 2 % meet an error and 1 % a step that hangs; one sandbox is broken for
+good, the server is away for 3 s, and the trainer holds the event loop after each group.
 
     python benchmarks/attempts.py
 
-A run that is killed ten times, and goes on from its file, is a test:
+2,000 attempts of ten steps in flight, whose steps wait for a second on average on the event loop,
+or for a tenth of it in worker processes (log-normal): how late the loop is, with the start of all
+of them, and what a step costs the trainer's thread, with its share of the starts and ends.
+
+A run that is interrupted ten times, and goes on from its file, is a test:
 
     RLIGHTNING_AIO_KILLS=10 python -m pytest tests/attempts/test_killed.py
 """
@@ -21,152 +21,169 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import itertools
 import json
-import os
+import multiprocessing
 import random
-import tempfile
 import time
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import gymnasium as gym
 from harness import machine_facts
 from waiting import IDLE, MEAN, Waits
 
 import rlightning_aio as rl
-from rlightning_aio.attempts import AttemptGroup, EpisodeSpec, Rules, play
-from rlightning_aio.spaces import Anything
+from rlightning_aio.attempts import EpisodeSpec, Rules, play
+from rlightning_aio.errors import EnvError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from multiprocessing.connection import Connection
 
-TASKS, SIZE, STEPS, STEP_SECONDS = 64, 8, 4, 0.002
-SHARE: Final = 0.05
-FAULTS: Final = {
-    "raises": ("env_raised", "either"),
-    "hangs": ("env_hung", "either"),
-    "dies": ("env_died", "env"),
-    "fails to reset": ("not_started", "env"),
-    "agent is stuck": ("timed_out", "either"),
-    "server is away": ("agent_raised", "infrastructure"),
-}
-"""What goes wrong, and the outcome that is to say so."""
+SANDBOXES, SIZE, STEPS, STEP_SECONDS = 64, 8, 4, 0.02
+FAILING, HANGING, AWAY_AFTER = 0.02, 0.01, 0.5
+"""Shares of the attempts, and after how many seconds the server is away."""
 IN_FLIGHT, LONG = 2000, 10
 FLIGHTS: Final = {"loop": 1.0, "process": 0.1}
 """Of attempts: the placement, and the mean seconds of a step."""
 
 
-def fault_of(seed: int, index: int, faults: list[str]) -> str:
-    """What goes wrong in the first try of an attempt; empty for nothing."""
-    rng = random.Random(f"{seed}-{index}")
-    number = int(rng.random() / SHARE)
-    return faults[number] if number < len(faults) else ""
+class Service:
+    """What the server knows: the sum of rewards by session, and which sessions are open."""
+
+    def __init__(self, away: float) -> None:
+        self.ledger: dict[str, float] = {}
+        self.open = set[str]()
+        self.faults, self.random = away > 0, random.Random(0)
+        self.away, self.back = away, time.monotonic() + AWAY_AFTER + away
+
+    async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request: its path is what is to be done, and with what."""
+        what, *about = (await reader.readline()).decode().split()[1].strip("/").split("/")
+        if not 0 < self.back - time.monotonic() < self.away or what == "ledger":
+            reply = await self.done(what, *about)
+            writer.write(f"HTTP/1.0 {200 if reply is not None else 500}\r\n\r\n".encode())
+            writer.write(json.dumps(reply).encode())
+        writer.close()
+
+    async def done(self, what: str, *about: str) -> Any:
+        if what == "ledger":
+            return {"ledger": self.ledger, "open": sorted(self.open)}
+        if what == "delete":
+            return self.open.discard(about[0]) or True
+        chance = self.random.random() * STEPS if self.faults else 1.0
+        if (self.faults and about[0] == "broken") or (what == "step" and chance < FAILING):
+            return None
+        if what == "create":
+            self.open.add(session := str(len(self.ledger)))
+            self.ledger[session] = 0.0
+            return session
+        await asyncio.sleep(3600 if chance < FAILING + HANGING else STEP_SECONDS)
+        reward = float(self.random.randrange(5))
+        self.ledger[about[0]] += reward
+        return reward
 
 
-class Tool(gym.Env[Any, Any]):
-    """Ends after some steps, each of which earns 1; an action may be a fault.
+def serve(pipe: Connection, away: float) -> None:
+    async def main() -> None:
+        server = await asyncio.start_server(Service(away).answer, "127.0.0.1")
+        pipe.send(server.sockets[0].getsockname()[1])
+        await server.serve_forever()
 
-    A reset fails for each file of the folder in its options whose name begins with the seed.
-    """
+    asyncio.run(main())
 
-    observation_space = action_space = Anything()
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.steps = 0
-        for file in Path(options["folder"]).glob(f"{seed}-*"):
-            with contextlib.suppress(FileNotFoundError):  # Another attempt may have had it.
-                file.unlink()
-                raise RuntimeError("the tool could not be prepared")
-        return {}, {}
+async def asked(port: int, *words: str) -> Any:
+    """Ask the server; its failures are those of the infrastructure."""
+    try:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(f"GET /{'/'.join(words)} HTTP/1.0\r\n\r\n".encode())
+        head, _, body = (await reader.read()).decode().partition("\r\n\r\n")
+        writer.close()
+    except OSError as error:
+        raise EnvError(f"no answer: {error}", blame="infrastructure") from error
+    if " 200" not in head:
+        raise EnvError(f"the server said {head or 'nothing'}", blame="infrastructure")
+    return json.loads(body)
 
-    def step(self, action: Any) -> Any:
-        if action == "raises":
-            raise RuntimeError("the tool has failed")
-        if action == "hangs":
-            time.sleep(3600)
-        if action == "dies":
-            os._exit(3)
+
+class Sandbox:
+    """One of the server, of which one is broken; its observation is the number of its session."""
+
+    broken: Sandbox | None = None
+
+    def __init__(self, port: int) -> None:
+        self.port, self.session = port, ""
+        Sandbox.broken = Sandbox.broken or self
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
+        await self.delete()
+        kind = "broken" if Sandbox.broken is self else "whole"
+        self.steps, self.session = 0, await asked(self.port, "create", kind)
+        return self.session, {}
+
+    async def step(self, action: Any) -> Any:  # noqa: ARG002
         self.steps += 1
-        return {}, 1.0, self.steps == STEPS, False, {}
+        reward = await asked(self.port, "step", self.session)
+        return self.session, reward, self.steps == STEPS, False, {}
+
+    async def delete(self) -> None:
+        while self.session:  # Whatever it takes: a sandbox costs money.
+            try:
+                await asked(self.port, "delete", self.session)
+                self.session = ""
+            except EnvError:
+                await asyncio.sleep(0.2)
+
+    async def close(self) -> None:
+        if Sandbox.broken is self:  # The one that takes its place is.
+            Sandbox.broken = None
+        await self.delete()
 
 
-class AwaitedTool:
-    """The same on an event loop."""
-
-    observation_space = action_space = Anything()
-
-    def __init__(self) -> None:
-        self.tool = Tool()
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return self.tool.reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.sleep(3600 if action == "hangs" else STEP_SECONDS)
-        return self.tool.step(action)
-
-
-class Agent:
-    """Steps to the end; the first try of some attempts goes wrong."""
-
-    def __init__(self, faults: dict[tuple[int, int], str]) -> None:
-        self.faults = dict(faults)
-
-    async def __call__(self, episode: Any) -> None:
-        fault = self.faults.pop((episode.spec.seed, episode.index), "")
+async def agent(episode: Any) -> str:
+    while not episode.is_over:
         await episode.step("go")
-        if fault == "agent is stuck":
-            await asyncio.Event().wait()
-        if fault == "server is away":
-            raise ConnectionError("the model's server is away")
-        if fault in ("raises", "hangs", "dies"):
-            await episode.step(fault)
-        while not episode.is_over:
-            await episode.step("go")
+    return episode.last.observation
 
 
-def entry(place: str) -> dict[str, Any]:
-    """256 envs on the event loop, or 16 in workers of their own."""
-    if place == "loop":
-        return {"task": AwaitedTool, "placement": "loop", "num_workers": 256}
-    return {"task": Tool, "envs_per_process": 1, "num_workers": 16}
-
-
-async def played(
-    place: str, tasks: list[EpisodeSpec], faults: dict[tuple[int, int], str]
-) -> dict[str, Any]:
-    """Play all attempts by `play`; return what was found."""
-    found = Counter[str]()
-    groups: list[AttemptGroup] = []
-    lags: list[float] = []
-    began = time.monotonic()
-    rules = Rules(attempt_timeout=8, max_concurrency=256)
-    agent = Agent({key: fault for key, fault in faults.items() if fault != "fails to reset"})
-    limits: dict[str, Any] = {"step_timeout": 2.0, "max_restarts": 100}
-    async with rl.build_env_group(name="tool", **entry(place), **limits) as group:
-        watching = asyncio.create_task(watch(lags))
-        async for attempts in play(group, tasks, agent, SIZE, rules):
+async def in_sandboxes(port: int, number: int, blocked: float) -> dict[str, Any]:
+    """Play all attempts, and compare them with the ledger."""
+    groups, began = list[Any](), time.monotonic()
+    limits = {"step_timeout": 2.0, "reset_timeout": 10.0, "max_restarts": 100}
+    fields: dict[str, Any] = {"placement": "loop", "env_kwargs": {"port": port}, **limits}
+    async with rl.build_env_group(Sandbox, num_workers=SANDBOXES, **fields) as group:
+        specs = (EpisodeSpec("", seed) for seed in range(number))
+        async for attempts in play(group, specs, agent, SIZE, Rules(attempt_timeout=20)):
+            time.sleep(blocked)  # noqa: ASYNC251  # The update of the weights.
             groups.append(attempts)
-            for attempt in attempts:
-                last = [attempt.outcome] if attempt.outcome.is_failure else []
-                for outcome in [*attempt.failures, *last]:
-                    found[f"{outcome.kind} ({outcome.blame})"] += 1
-        watching.cancel()
-        left = len(group.pending)
-    left += len(asyncio.all_tasks() - {asyncio.current_task(), watching})
-    rewards = Counter(attempt.reward for attempts in groups for attempt in attempts)
+    seconds = time.monotonic() - began
+    known = await asked(port, "ledger")
+    each = [one for attempts in groups for one in attempts]
+    whole = [one for one in each if one.reward is not None]
+    failed = [one.outcome for one in each if one.reward is None]
     return {
         "groups": len(groups),
         "complete": sum(attempts.is_complete for attempts in groups),
-        "rewards": {str(reward): count for reward, count in rewards.items()},
-        "failures": dict(sorted(found.items())),
-        "left": left,
-        "seconds": time.monotonic() - began,
-        **lag_of(lags),
+        "failed": Counter(f"{one.kind}: {one.cause}" for one in failed),
+        "tries that failed": Counter(own.kind for one in each for own in one.failures),
+        "wrong rewards": sum(one.reward != known["ledger"][one.result] for one in whole),
+        "sandboxes left": len(known["open"]),
+        "seconds": seconds,
     }
+
+
+def faulty(number: int, away: float, blocked: float) -> dict[str, Any]:
+    """Play with faults, and without."""
+    found: dict[str, Any] = {}
+    for name, lasts in (("with faults", away), ("without", 0.0)):
+        ours, theirs = multiprocessing.Pipe()
+        process = multiprocessing.Process(target=serve, args=(theirs, lasts))
+        process.start()
+        found[name] = rl.run(in_sandboxes(ours.recv(), number, blocked if lasts else 0.0))
+        process.kill()
+        process.join()
+    return found
 
 
 async def watch(lags: list[float]) -> None:
@@ -180,22 +197,6 @@ async def watch(lags: list[float]) -> None:
 def lag_of(lags: list[float]) -> dict[str, float]:
     lags.sort()
     return {"lag_p99_ms": 1e3 * lags[int(0.99 * len(lags))], "lag_max_ms": 1e3 * lags[-1]}
-
-
-def injected(place: str, number: int) -> dict[str, Any]:
-    """Inject faults into a run."""
-    possible = [name for name in FAULTS if place == "workers" or name != "dies"]
-    with tempfile.TemporaryDirectory() as folder:
-        tasks = [EpisodeSpec("", seed, {"folder": folder}) for seed in range(number)]
-        faults: dict[tuple[int, int], str] = {}
-        for seed, index in itertools.product(range(number), range(SIZE)):
-            if fault := fault_of(seed, index, possible):
-                faults[seed, index] = fault
-            if fault == "fails to reset":
-                Path(folder, f"{seed}-{index}").touch()
-        found = rl.run(played(place, tasks, faults))
-    kinds = Counter("{} ({})".format(*FAULTS[fault]) for fault in faults.values())
-    return {**found, "injected": dict(sorted(kinds.items()))}
 
 
 class Waiting(Waits):
@@ -248,18 +249,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--tasks", type=int, default=TASKS)
+    parser.add_argument("--faults", action="store_true", help="play while much fails")
+    parser.add_argument("--tasks", type=int, default=200, help="with --faults")
+    parser.add_argument("--away", type=float, default=3.0, help="seconds of the server")
+    parser.add_argument("--blocked", type=float, default=2.0, help="seconds after each group")
     parser.add_argument("--seconds", type=float, default=10.0, help="of attempts in flight")
-    parser.add_argument(
-        "--in-flight", type=int, default=IN_FLIGHT, help="how many, 8 or a multiple"
-    )
+    parser.add_argument("--in-flight", type=int, default=IN_FLIGHT, help="8 or a multiple")
     args = parser.parse_args()
     report: dict[str, Any] = {"machine": machine_facts(("rlightning_aio", "uvloop"))}
-    report |= {place: injected(place, args.tasks) for place in ("loop", "workers")}
-    report["in_flight"] = {
-        placement: rl.run(many(args.in_flight, args.seconds, placement, mean))
-        for placement, mean in FLIGHTS.items()
-    }
+    if args.faults:
+        report |= faulty(args.tasks, args.away, args.blocked)
+    else:
+        report["in_flight"] = {
+            placement: rl.run(many(args.in_flight, args.seconds, placement, mean))
+            for placement, mean in FLIGHTS.items()
+        }
     print(json.dumps(report, indent=1))
 
 

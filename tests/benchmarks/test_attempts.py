@@ -1,4 +1,4 @@
-"""benchmarks/attempts.py: what was injected is what is found, and nothing is left behind."""
+"""benchmarks/attempts.py: every reward is that of the ledger, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -6,23 +6,30 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "attempts.py"
 
 
-def test_outcomes_equal_the_faults_that_were_injected() -> None:
-    """No failure has a reward; every group is complete but those whose agent is stuck."""
-    few = ["--tasks", "6", "--in-flight", "400", "--seconds", "1"]
-    command = [sys.executable, str(SCRIPT), *few]
+def reported(*words: str) -> dict[str, Any]:
+    command = [sys.executable, str(SCRIPT), *words]
     ended = subprocess.run(command, capture_output=True, check=True, text=True)
-    report = json.loads(ended.stdout)
-    for found in (report["loop"], report["workers"]):
-        assert found["injected"]
-        assert found["failures"] == found["injected"]
-        stuck = found["injected"]["timed_out (either)"]  # Which isn't tried again.
-        assert found["rewards"] == {"4.0": 48 - stuck, "None": stuck}
-        assert (found["groups"], found["left"]) == (6, 0)
-        assert 6 - stuck <= found["complete"] < 6
-    for found in report["in_flight"].values():
+    return json.loads(ended.stdout)
+
+
+def test_no_reward_differs_from_the_ledger_while_much_fails() -> None:
+    """Groups are complete but for reasons that are named; no sandbox is left."""
+    report = reported("--faults", "--tasks", "30", "--away", "0.5", "--blocked", "0.01")
+    for found in (report["with faults"], report["without"]):
+        assert found["groups"] == 30
+        assert found["wrong rewards"] == found["sandboxes left"] == 0
+        assert 30 - sum(found["failed"].values()) <= found["complete"]
+    assert report["with faults"]["tries that failed"]
+    assert report["without"]["failed"] == report["without"]["tries that failed"] == {}
+    assert report["without"]["complete"] == 30
+
+
+def test_attempts_in_flight_are_measured() -> None:
+    for found in reported("--in-flight", "400", "--seconds", "1")["in_flight"].values():
         assert 0 < found["lag_p99_ms"] <= found["lag_max_ms"]
         assert found["us_per_step"] > 0
