@@ -150,8 +150,36 @@ def test_an_awaitable_env_is_no_client() -> None:
         RemoteEnvClient(Awaitable, "127.0.0.1", 9)
 
 
-@pytest.mark.parametrize("heartbeat", [0, 0.05, -1, math.inf, math.nan])
+def test_an_env_of_gyms_old_kind_is_named_as_such() -> None:
+    class Old:
+        observation_space = action_space = gym.spaces.Discrete(2)
+
+        def reset(self) -> int: ...
+
+        def step(self, action: Any) -> Any: ...
+
+    with pytest.raises(TypeError, match=r"shimmy\.GymV21CompatibilityV0"):
+        RemoteEnvClient(Old, "127.0.0.1", 9)
+
+
+def test_an_env_that_can_not_be_a_client_is_closed() -> None:
+    """Nobody else has what a callable has made."""
+    closed: list[bool] = []
+
+    class Unsupported(gym.Env[Any, Any]):
+        observation_space = gym.spaces.Graph(gym.spaces.Discrete(2), None)
+        action_space = gym.spaces.Discrete(2)
+
+        def close(self) -> None:
+            closed.append(True)
+
+    with pytest.raises(ConfigError, match="can't be a remote client"):
+        RemoteEnvClient(Unsupported, "127.0.0.1", 9)
+    assert closed
+
+
+@pytest.mark.parametrize("heartbeat", [0, 0.05, -1, 86401, math.inf, math.nan])
 def test_a_heartbeat_is_a_number_of_seconds(heartbeat: float) -> None:
     """Too short a one would end every session."""
-    with pytest.raises(ConfigError, match=r"heartbeat: should be at least 0\.1 seconds"):
+    with pytest.raises(ConfigError, match=r"heartbeat: should be 0\.1 to 86400 seconds"):
         RemoteEnvClient(CountingEnv(), "127.0.0.1", 9, heartbeat=heartbeat)

@@ -24,6 +24,7 @@ from rlightning_aio import (
     sync,
 )
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -192,3 +193,41 @@ def test_a_client_gives_the_results_of_a_local_env(kind: type[_Sampling]) -> Non
         assert same(one, other)
     if kind is not Agents:
         assert stats["episodes"] > 0
+
+
+class Braked(gym.Wrapper[Any, Any, Any, Any]):
+    """Knows how to stop the robot, which does not."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.num_stops = 0
+
+    def stop(self) -> None:
+        self.num_stops += 1
+
+
+class FourValues(gym.Env[Any, Any]):
+    """Returns what Gym's envs did."""
+
+    observation_space = action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        return 0, 0.0, False, {}
+
+
+def test_a_robot_whose_wrapper_stops_it_says_what_a_step_returns() -> None:
+    """Its step is refused, so that it stops; the words are those of a local env."""
+    entry = {"name": "s", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+    robot = Braked(FourValues())
+    with sync.build_env_group(entry) as group:
+        outer: Any = gym.wrappers.TimeLimit(robot, 9)
+        client = ClientThread(group["s-0"].address, "one", outer)
+        batch, _ = group.reset()
+        with pytest.raises(EnvRaised, match="GymV21CompatibilityV0"):
+            group.step(batch.respond(action=[0]))
+        assert robot.num_stops
+        client.client._env.is_finish = lambda: True  # noqa: SLF001
+    client.join()

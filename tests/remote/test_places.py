@@ -317,6 +317,29 @@ def test_an_arm_at_work_is_stopped_when_its_session_is_over(
             time.sleep(0.01)
 
 
+def test_a_client_misses_a_silent_server_as_soon_as_that_would_miss_it() -> None:
+    """In its first session, too, however patient it is itself."""
+    with contextlib.ExitStack() as stack:
+        group = stack.enter_context(sync.build_env_group(entry(heartbeat=1)))
+        proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
+        client = ClientThread(proxy.address, "one", heartbeat=86400)
+        group.reset()
+        send, pinged = proxy._send, threading.Event()
+
+        def sending(flow: Any, message: bytes) -> None:
+            send(flow, message)
+            if flow is flow.pair.flows[1] and b"\4PING" in message:
+                pinged.set()
+
+        proxy._send = sending
+        assert pinged.wait(HANG)
+        close, proxy._close = proxy._close, lambda pair: None  # Nor does it hear of the end.
+        for pair in proxy._pairs:
+            pair.silent = True
+        client.join()  # It ends when its session does.
+        proxy._close = close
+
+
 @pytest.mark.parametrize("action", [None, np.full((1, 2), 3.0), np.zeros((2, 2)), np.zeros((1, 3))])
 def test_a_clients_arm_stops_when_an_action_is_refused(tmp_path: Path, action: Any) -> None:
     """By the group, which sends it away, or by the client itself; a reset moves it again."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import gymnasium as gym
@@ -356,6 +357,7 @@ def test_extras_are_sent_to_a_client_that_reads_them() -> None:
     "stray",
     [
         Welcome(env_id="x", heartbeat=5.0),
+        Welcome(env_id="x", heartbeat=0.0),
         Refusal(text="no", retry=False),
         Step(number=1),
     ],
@@ -364,6 +366,15 @@ def test_a_client_ends_a_session_whose_server_breaks_the_rules(world: World, str
     client = world.clients["a"]
     client.receive(Writer().write(stray))
     assert client.ended
+
+
+@pytest.mark.parametrize("heartbeat", [-1.0, 0.0, 0.39, 86401.0, math.inf, math.nan])
+def test_a_welcome_whose_heartbeat_can_not_be_kept_is_refused(heartbeat: float) -> None:
+    """The client would take it for its connections, and not come back."""
+    session = ClientSession(meta(), "a")
+    session.connected()
+    event: Any = session.receive(Writer().write(Welcome(env_id="x", heartbeat=heartbeat)))
+    assert "a message of the server is malformed" in event.text
 
 
 def test_a_request_before_the_welcome_is_refused() -> None:

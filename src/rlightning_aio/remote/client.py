@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import os
 import re
 import signal
@@ -31,6 +30,7 @@ from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.hardware import checked_input_of, stop, watched
 from rlightning_aio.envs.results import (
+    explained,
     has_preprocess_fn,
     input_of,
     is_awaitable,
@@ -57,6 +57,7 @@ from rlightning_aio.protocol.net.wire import (
     HANDSHAKE_SECONDS,
     HARDWARE_HEARTBEAT,
     MAX_FRAME_BYTES,
+    MAX_HEARTBEAT,
     MAX_NAME_LENGTH,
     WireError,
     ping_ms,
@@ -105,7 +106,7 @@ class RemoteEnvClient:
             other env, whose method ``stop`` is then called, if it has one.
         compression: ``zstd`` compresses images of observations, without loss; None sends them as
             they are. Both ends need the extra ``zstd``.
-        heartbeat: seconds of silence after which the server counts as gone, at least 0.1. None: as
+        heartbeat: seconds of silence after which the server counts as gone, 0.1 to 86400. None: as
             the server says; until then 1 for hardware, else 5.
 
     Attributes:
@@ -146,18 +147,17 @@ class RemoteEnvClient:
         self._is_hardware = hardware
         self._own_heartbeat = _checked_heartbeat(heartbeat)
         self._heartbeat = heartbeat or (HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT)
+        compression = _checked_compression(compression)
         self._env = env = _own_env(env, self.name)
-        try:
+        with _closed_on_error(env):
             self._session = ClientSession(
                 initialised(env),
                 self.name,
                 free_actions=env.transforms_actions or has_preprocess_fn(env),
                 reads_extras=reads_extras(env),
                 hardware=hardware,
-                compression=_checked_compression(compression),
+                compression=compression,
             )
-        except (UnsupportedSpace, WireError) as error:
-            raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         self._bare_step = fast_path_of(env).bare_step()
         self._env_step = step_of(env)
         self._input = checked_input_of(env) if hardware else input_of(env)
@@ -417,7 +417,7 @@ class RemoteEnvClient:
             if self._is_hardware:
                 stop(self._env)
             LOG.exception("%s: the env raised", self.name)
-            self._session.fail(request.number, ErrorText.of(error))
+            self._session.fail(request.number, ErrorText.of(explained(error)))
         self._flush()
         late, self._late_events = self._late_events, []
         for event in late:
@@ -457,12 +457,12 @@ class RemoteEnvClient:
         began_ns = time.perf_counter_ns()
         if self._bare_step is not None:
             with self._at_work():
-                *outcome, info = self._bare_step(self._input(request.action, request.extras))
+                returned = self._bare_step(self._input(request.action, request.extras))
+            observation, reward, terminated, truncated, info = returned
+            outcome = ResultFields(observation, reward, terminated, truncated)
             busy_ns = time.perf_counter_ns() - began_ns
             self.num_steps += 1
-            self._session.answer(
-                request.number, ResultFields(*outcome), info, {}, busy_ns, time.time_ns()
-            )
+            self._session.answer(request.number, outcome, info, {}, busy_ns, time.time_ns())
             return
         with self._at_work():
             ret = self._env_step(self._input(request.action, request.extras))
@@ -520,13 +520,30 @@ def _own_env(env: Any, name: str) -> BaseEnv:
     """
     if not isinstance(env, BaseEnv):
         make: Any = env if not isinstance(env, gym.Env) else lambda: env
-        env = env_of_callable(EnvConfig(name=name, backend="callable", task=make))
+        config = EnvConfig(name=name, backend="callable", task=make, placement="inline")
+        env = env_of_callable(config)
     if is_awaitable(env):
         raise ConfigError(
             f"env {env.env_id!r} is awaitable (its step is `async def`), and a client steps its "
             "env in a plain loop; give it plain methods, or run it in a worker of the trainer"
         )
     return env
+
+
+@contextlib.contextmanager
+def _closed_on_error(env: BaseEnv) -> Generator[None]:
+    """Close `env` if the client that owns it can't be made.
+
+    Raises:
+        ConfigError: its spaces can't be announced.
+    """
+    try:
+        yield
+    except BaseException as error:
+        env.close()
+        if isinstance(error, UnsupportedSpace | WireError):
+            raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
+        raise
 
 
 def _checked_compression(given: Any) -> Literal["zstd"] | None:
@@ -536,8 +553,8 @@ def _checked_compression(given: Any) -> Literal["zstd"] | None:
 
 
 def _checked_heartbeat(heartbeat: float | None) -> float | None:
-    if heartbeat is not None and not 0.1 <= heartbeat < math.inf:
-        raise ConfigError(f"heartbeat: should be at least 0.1 seconds, not {heartbeat}")
+    if heartbeat is not None and not 0.1 <= heartbeat <= MAX_HEARTBEAT:
+        raise ConfigError(f"heartbeat: should be 0.1 to {MAX_HEARTBEAT} seconds, not {heartbeat}")
     return heartbeat
 
 

@@ -90,8 +90,11 @@ class _GivenEnv(GymnasiumEnv):
         super().__init__(config, worker_index, preprocess_fn)
 
     def stop(self) -> None:
-        """Call the method of that name which the env has, if it has one."""
-        stop: Any = getattr(self._made.unwrapped, "stop", None)
+        """Call the method of that name of the outermost wrapper or env that has one."""
+        made, bare = self._made, self._made.unwrapped
+        while made is not bare and not callable(getattr(made, "stop", None)):
+            made = made.env
+        stop: Any = getattr(made, "stop", None)
         if callable(stop):
             stop()
 

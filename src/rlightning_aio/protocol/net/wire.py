@@ -33,6 +33,10 @@ MAX_PARTS: Final = 1024
 MAX_NAME_LENGTH: Final = 128
 DEFAULT_HEARTBEAT: Final = 5.0
 HARDWARE_HEARTBEAT: Final = 1.0
+MIN_HEARTBEAT: Final = 0.4
+MAX_HEARTBEAT: Final = 86400
+_MAX_TTL_MS: Final = 6553599
+"""The longest that ZMQ accepts."""
 """Seconds within which an end that is gone is found."""
 HANDSHAKE_SECONDS: Final = 2.0
 """Time for the handshake of a connection."""
@@ -70,7 +74,7 @@ def ping_ms(heartbeat: float) -> tuple[int, int, int]:
     """Return how often ZMQ pings a peer that may be silent for `heartbeat` seconds, how long it
     waits for a sign of life then, and after which silence the peer is to give up, in milliseconds.
     """
-    return int(250 * heartbeat), int(500 * heartbeat), int(750 * heartbeat)
+    return int(250 * heartbeat), int(500 * heartbeat), min(int(750 * heartbeat), _MAX_TTL_MS)
 
 
 class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
@@ -99,7 +103,7 @@ class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
     """Server: you are in. The first request will be a reset; until then, nothing moves."""
 
     env_id: str
-    heartbeat: float
+    heartbeat: Annotated[float, Meta(ge=MIN_HEARTBEAT, le=MAX_HEARTBEAT)]
     """Seconds within which either end finds that the other is gone."""
 
 

@@ -115,7 +115,7 @@ class Listener:
     def _listen(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         settings = self._settings
         router = self._router = context.socket(zmq.ROUTER)
-        interval, patience, _ = ping_ms(settings.heartbeat or DEFAULT_HEARTBEAT)
+        interval, patience, given_to_peer = ping_ms(settings.heartbeat or DEFAULT_HEARTBEAT)
         # Messages to a closed connection must fail, not vanish.
         router.set(zmq.ROUTER_MANDATORY, 1)
         router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
@@ -126,6 +126,7 @@ class Listener:
         router.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
         router.set(zmq.HEARTBEAT_IVL, interval)
         router.set(zmq.HEARTBEAT_TIMEOUT, patience)
+        router.set(zmq.HEARTBEAT_TTL, given_to_peer)
         self._authenticator.open(context, router)
         host = "127.0.0.1" if settings.host == "localhost" else settings.host
         if ":" in host:

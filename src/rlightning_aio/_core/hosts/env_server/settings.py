@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.net.wire import MAX_HEARTBEAT, MIN_HEARTBEAT
 from rlightning_aio.registry import did_you_mean
 from rlightning_aio.remote.keys import read_server_keys
 
@@ -35,7 +36,7 @@ class ServerSettings(BaseModel):
     """Number of places for clients, or the names of the clients that have one."""
     connect_timeout: float = Field(default=60.0, gt=0)
     """Seconds that a call waits for clients alone; ``.inf``: without end."""
-    heartbeat: float | None = Field(default=None, ge=0.4, le=86400)
+    heartbeat: float | None = Field(default=None, ge=MIN_HEARTBEAT, le=MAX_HEARTBEAT)
     """Seconds within which a client that is gone is found; None: 5, of hardware 1."""
     keys: Path | None = None
     """Its directory, made by ``rlightning-aio keygen``; only clients listed there are let in."""
