@@ -1,9 +1,10 @@
-"""A run that is killed goes on from its file: each attempt is there once, as if nothing was."""
+"""An interrupted or killed run goes on from its file: each attempt is there once, as without."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -17,8 +18,9 @@ from attempts.room import Room
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, play
 
-KILLS = int(os.environ.get("RLIGHTNING_AIO_KILLS", "2"))
+KILLS = int(os.environ.get("RLIGHTNING_AIO_KILLS", "3"))
 TASKS, SIZE = 4 * KILLS, 3
+SIGNALS = [signal.SIGKILL, signal.SIGTERM, signal.SIGINT]
 
 
 async def agent(episode: Any) -> int:
@@ -50,19 +52,19 @@ def lines_in(path: Path) -> int:
 
 
 def test_a_run_that_is_killed_goes_on(tmp_path: Path) -> None:
-    """Several times by SIGKILL, at any moment after some more attempts have ended."""
+    """Several times by each of the signals, at any moment after some more attempts have ended."""
     path, whole = tmp_path / "killed.jsonl", tmp_path / "whole.jsonl"
     command = [sys.executable, "-m", "attempts.test_killed", str(path)]
     surroundings = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    for _ in range(KILLS):
+    for number in itertools.islice(itertools.cycle(SIGNALS), KILLS):
         before = lines_in(path)
         process = subprocess.Popen(command, env=surroundings)
         while lines_in(path) < before + 5 and process.poll() is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        assert process.returncode == -signal.SIGKILL
+        process.send_signal(number)
+        assert process.wait() != 0
+        assert (process.returncode == -signal.SIGKILL) == (number == signal.SIGKILL)
     subprocess.run(command, check=True, env=surroundings)
     rl.run(run(str(whole)))
     assert rows(path) == rows(whole)
