@@ -9,8 +9,6 @@ import asyncio
 import time
 from typing import Final
 
-__all__ = ["Clock"]
-
 _TICK: Final = 0.05
 
 

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-__all__ = ["is_connections"]
-
 _PACKAGES: Final = ("openai", "anthropic", "httpx", "httpcore", "aiohttp", "requests", "urllib3")
 _NAMES: Final = frozenset(
     (

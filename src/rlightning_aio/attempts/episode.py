@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.spec import EpisodeSpec
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
-__all__ = ["AttemptEpisode", "AttemptInPlay"]
-
 
 class AttemptEpisode:
     """One attempt at one task, as its agent sees it.

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
 
-__all__ = ["ResultsFile", "new_writer"]
-
 _HANDED_OUT: Final = "handed_out"
 
 

@@ -16,8 +16,6 @@ from rlightning_aio.attempts.rules import is_final, is_of_env
 if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Health"]
-
 _BORNE: Final = 2
 """Failures in a row that an env may have before it rests."""
 _REST, _LONGEST_REST = 1.0, 60.0

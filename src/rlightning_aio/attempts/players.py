@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["Players"]
-
 
 class _Player(NamedTuple):
     entry: str

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.queue import Job, TaskInPlay
     from rlightning_aio.attempts.tries import Agent
 
-__all__ = ["play"]
-
 _BURST: Final = 16
 """Most attempts that begin in one turn of the event loop, so that it is free for others."""
 _LOOK_SECONDS: Final = 0.2

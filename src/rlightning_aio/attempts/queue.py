@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import WorkerDied
     from rlightning_aio.outcomes import Outcome
 
-__all__ = ["AttemptQueue", "Job", "TaskInPlay"]
-
 
 @dataclass(eq=False, slots=True)
 class TaskInPlay:

@@ -20,8 +20,6 @@ from rlightning_aio.outcomes import Outcome
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-__all__ = ["Attempt", "AttemptGroup", "attempt_of", "success_of"]
-
 _KEYS: Final = ("success", "is_success")
 """In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
 

@@ -13,8 +13,6 @@ from typing import Any
 
 from rlightning_aio._core.group.episodes.episodes import checked_seed
 
-__all__ = ["EpisodeKey", "EpisodeSpec", "plain", "spec_of", "written"]
-
 EpisodeKey = tuple[str, str, int | None, str, str]
 """Entry, task, seed, options as JSON, and env of an episode."""
 

@@ -11,8 +11,6 @@ from rlightning_aio.attempts.spec import EpisodeSpec
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-__all__ = ["TaskSource"]
-
 
 class TaskSource:
     """See the module.

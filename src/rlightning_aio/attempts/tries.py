@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.episode import AttemptEpisode, AttemptInPlay
     from rlightning_aio.attempts.rules import Rules
 
-__all__ = ["Agent", "Try", "surely"]
-
 Agent: TypeAlias = "Callable[[AttemptEpisode], Awaitable[Any]]"
 """Plays one attempt."""
 

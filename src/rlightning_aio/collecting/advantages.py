@@ -15,8 +15,6 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Segments", "gae", "vtrace"]
-
 
 class Segments:
     """The division of ``[n]`` transitions into segments of consecutive ones.

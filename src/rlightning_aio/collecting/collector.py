@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Collector"]
-
 G = TypeVar("G", AsyncEnvGroup, SyncEnvGroup)
 H = TypeVar("H", AsyncEnvGroup, SyncEnvGroup)
 R = TypeVar("R", Rollout, dict[str, Rollout])

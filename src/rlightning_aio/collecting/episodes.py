@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.collecting.rollout import Rollout
 
-__all__ = ["WholeEpisode", "whole_episodes"]
-
 
 @dataclass(frozen=True, slots=True)
 class WholeEpisode:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio.trees import Tree
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["OWN_NAMES", "EnvKind", "Part"]
-
 
 @dataclass(slots=True, eq=False)
 class Part:

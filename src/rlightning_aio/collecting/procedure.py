@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 
-__all__ = ["Procedure", "run"]
-
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["Ended", "ResultRows", "columns_of_episodes", "result_rows"]
-
 Ended: TypeAlias = "tuple[int, float, int, dict[str, Any]]"
 """An episode that has ended: a row of `Rollout.episodes`."""
 

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Ends", "Rollout"]
-
 _Pair: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
 
 

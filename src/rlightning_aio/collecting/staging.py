@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.columns import Rows
     from rlightning_aio.trees import Tree
 
-__all__ = ["Full", "Staging"]
-
 _NO_PLACE: Final = -1
 _NO_ROWS: Final = np.zeros(0, np.intp)
 

@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = [
-    "allocated",
-    "as_column",
-    "check_alike",
-    "gathered",
-    "grown",
-    "rows_of",
-    "scattered",
-    "with_lists",
-]
-
 
 def as_column(name: str, value: Any, *, keeps_values: bool = False) -> NDArray[Any]:
     """Convert a value for column `name` to an array; arrays and CPU tensors are not copied.

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Estimate", "mean_estimate", "wilson_estimate"]
-
 _Z: Final = NormalDist().inv_cdf(0.975)
 _T: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228)
 """The 97.5 % quantiles of Student's t with 1 to 10 degrees of freedom."""

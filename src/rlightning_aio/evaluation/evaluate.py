@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["evaluate"]
-
 Function: TypeAlias = "Callable[[BatchedData], Any]"
 Policy: TypeAlias = "Callable[[BatchedData], Any] | Model | None"
 

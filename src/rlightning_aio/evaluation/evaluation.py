@@ -11,8 +11,6 @@ from rlightning_aio.attempts.records import Attempt
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 from rlightning_aio.outcomes import is_bystanders
 
-__all__ = ["Evaluation", "parts_of"]
-
 
 @dataclass(slots=True)
 class Evaluation:

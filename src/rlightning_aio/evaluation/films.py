@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.collecting.procedure import Procedure
 
-__all__ = ["Films"]
-
 _DEFAULT_FPS: Final = 30.0
 _PLAYABLE: Final = (
     # Most players need halved chroma, so sizes must be even; envs need the other cores.

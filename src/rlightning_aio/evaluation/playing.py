@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from rlightning_aio.evaluation.films import Films
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Options", "PolicyPlay"]
-
 _PATIENCE_SECONDS: Final = 1.0
 """For results of an evaluation that ends in an error; what takes longer is aborted."""
 _log = logging.getLogger("rlightning_aio")
