@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from patience import HANG
+from run_python import output_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -89,6 +90,15 @@ def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
         assert printed[example]
         # On a busy machine, another placement may be the faster one.
         assert re.sub(r"entry .*`rlightning-aio bench` measures\n", "", complained[example]) == ""
+
+
+def test_wrong_calls_raise_their_errors(tmp_path: Path) -> None:
+    """Each call of the example is refused, and the group goes on."""
+    printed = output_of("-W", "error", ROOT / "examples" / "errors.py", folder=tmp_path)
+    assert [line.partition(":")[0] for line in printed.splitlines() if line[:1].isupper()] == [
+        *("ConfigError", "StartFailed", "NothingPending", "UnknownEnv", "SnapshotError"),
+        *("BadAction", "EnvBusy", "KeyboardInterrupt", "ResetNeeded", "GroupClosed"),
+    ]
 
 
 def test_omitted_pages_are_run_by_other_tests() -> None:
