@@ -24,7 +24,6 @@ from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.plugins.openenv.session import (
     OpenEnvSession,
     ServerGone,
-    check_headers,
     pauses,
 )
 
@@ -63,7 +62,11 @@ class OpenEnvOptions(BaseModel):
     @field_validator("headers")
     @classmethod
     def _check_headers(cls, headers: dict[str, str]) -> dict[str, str]:
-        check_headers(headers)
+        for name, value in headers.items():
+            if not (name.isascii() and name.replace("-", "_").isidentifier()):
+                raise ValueError(f"{name!r} is no name of a header")
+            if not (value.isascii() and value.isprintable()):
+                raise ValueError(f"the value of {name} has characters that are none of a header")
         return headers
 
     @model_validator(mode="after")

@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import re
 import socket as sockets
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -29,7 +28,6 @@ __all__ = [
     "OpenEnvSession",
     "ServerGone",
     "ServerRefused",
-    "check_headers",
     "pauses",
 ]
 
@@ -45,8 +43,6 @@ _REPLIES: Final = {"reset": "observation", "step": "observation", "state": "stat
 """The type of a request's reply."""
 _AT_CONNECT: Final = ("CAPACITY_REACHED", "FACTORY_ERROR", "SESSION_ERROR")
 """Errors that a server sends unasked, after which it closes the socket."""
-_NAME: Final = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
-_VALUE: Final = re.compile(r"[\t\x20-\x7e]*")
 _LOG: Final = logging.getLogger("rlightning_aio.openenv")
 # At a lower level, websockets logs headers.
 _LOG.setLevel(logging.INFO)
@@ -207,19 +203,6 @@ def _keep_alive_by_system(transport: asyncio.Transport) -> None:
     for name, value in (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 6)):
         if hasattr(sockets, name):
             socket.setsockopt(sockets.IPPROTO_TCP, getattr(sockets, name), value)
-
-
-def check_headers(headers: Mapping[str, str]) -> None:
-    """Check that headers can be sent.
-
-    Raises:
-        ValueError: a name or a value can't.
-    """
-    for name, value in headers.items():
-        if not _NAME.fullmatch(name):
-            raise ValueError(f"{name!r} is no name of a header")
-        if not _VALUE.fullmatch(value):
-            raise ValueError(f"the value of {name} has characters that are none of a header")
 
 
 def _address(url: str) -> str:
