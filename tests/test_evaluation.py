@@ -104,19 +104,6 @@ def test_a_fixed_number_of_each_is_unbiased_where_first_come_is_not() -> None:
     assert found.length.mean == (SHORT + LONG) / 2
 
 
-def test_the_first_episodes_are_unbiased_where_first_come_is_not() -> None:
-    """In all envs, three in ten episodes succeed; the first three to end all succeed."""
-    envs = [scripted(lambda seed: seed % 10 < 3)] * 10
-    with (group := group_of(*envs)), group.auto_reset(1000):
-        batch, _ = group.reset(seed=0)
-        while not batch.done.any():
-            batch, _ = group.step(batch.respond(action=nothing(batch)))
-        assert batch.info("success")[batch.done].tolist() == [True] * 3
-    found = evaluated(group_of(*envs), 4, seed=0)
-    assert found.success is not None
-    assert (found.success.mean, found.success.count) == (0.3, 40)
-
-
 def by_number(found: Evaluation) -> list[tuple[Any, ...]]:
     """What came of each episode, by env, sub-environment and number."""
     return sorted(
@@ -325,31 +312,6 @@ def test_entries_of_different_spaces_have_a_policy_each() -> None:
         with pytest.raises(ValueError, match=r"no policy was given for .* 'car'.* cart, bar"):
             evaluate(group, policies, 2)
         assert group.pending == []
-
-
-def test_the_policy_waits_for_half_of_the_envs_by_default() -> None:
-    """So it is not called for one env after the other."""
-    sizes: list[int] = []
-
-    def noting(batch: rl.BatchedData) -> Any:
-        sizes.append(len(batch))
-        return nothing(batch)
-
-    evaluated(group_of(*[scripted(lambda _: True)] * 6), 1, policy=noting)
-    assert set(sizes) == {3}
-
-
-async def test_it_is_awaited_over_an_asynchronous_group() -> None:
-    """The policy may be awaitable, too."""
-
-    async def policy(batch: rl.BatchedData) -> Any:
-        return nothing(batch)
-
-    entry = {"name": "env", "task": scripted(lambda _: True), "placement": "inline"}
-    async with rl.build_env_group(entry) as group:
-        with group.auto_reset(1000):
-            found = await evaluate(group, policy, np.int64(2))
-    assert len(found.attempts) == 2
 
 
 def test_an_episode_may_be_for_one_env() -> None:

@@ -127,18 +127,6 @@ def test_options_reach_the_reset() -> None:
     assert sorted(one.length for one in found.attempts) == [1, 2, 3]
 
 
-async def test_it_is_awaited_over_an_asynchronous_group() -> None:
-    """So may its policy be."""
-
-    async def policy(batch: rl.BatchedData) -> Any:
-        return nothing(batch)
-
-    entry = {"name": "env", "task": Tasks, "placement": "inline", "num_workers": 2}
-    async with rl.build_env_group(entry) as group:
-        with group.auto_reset(100):
-            assert rows(await evaluate(group, policy, QUEUE)) == ROWS
-
-
 def test_an_entry_is_found_by_its_task() -> None:
     """An env that doesn't switch plays its own task; the entry that has the task is preferred."""
     one, two = (

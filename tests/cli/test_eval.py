@@ -7,7 +7,6 @@ import os
 import signal
 from typing import TYPE_CHECKING, Any
 
-import pytest
 from cli import stub_policies
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
@@ -54,16 +53,6 @@ def test_the_name_of_an_entry_may_have_a_slash(tmp_path: Path) -> None:
     played = invoke_json("eval", config, "--episodes", 1)["attempts"]
     assert {one["env_id"] for one in played} == {f"my/cart-{k}" for k in range(3)}
     assert invoke_json("rollout", config, "--steps", 9)
-
-
-def test_success_is_read_from_the_last_info(tmp_path: Path) -> None:
-    """Without it there is no success rate."""
-    config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
-    judged, stub = invoke_json("eval", config, "--episodes", 5, "--seed", 0)["parts"]
-    assert judged["success"]["mean"] == 0.5
-    assert judged["success"]["low"] == pytest.approx(0.2366, abs=5e-5)
-    assert stub["success"] is None
-    assert (stub["episodes"], stub["length"]["mean"]) == (5, 10)
 
 
 def test_a_policy_is_given_by_module_and_name(tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerRefused
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -103,29 +102,6 @@ async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_ag
         assert batch.restarted.all()
         batch, _ = await group.step(steps_of("o-0"))
         assert not batch.restarted.any()
-
-
-@on_asyncio
-async def test_a_call_of_a_lost_session_is_an_error() -> None:
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
-        assert (await group["o-0"].call("state"))["step_count"] == 0
-        server.fates.append("lost before")
-        with pytest.raises(rl.EnvRaised, match=f"{server.url} was lost"):
-            await group["o-0"].call("state")
-
-
-@on_asyncio
-async def test_a_refusal_is_read_even_if_the_socket_is_closed() -> None:
-    async with Misbehaving(capacity=0) as server:
-        session = OpenEnvSession(server.url)
-        session._socket = await session._connected()
-        await session._socket.wait_closed()
-        with pytest.raises(ServerRefused, match="CAPACITY_REACHED"):
-            await session.ask({"type": "state"})
 
 
 @on_asyncio

@@ -33,36 +33,6 @@ def pendulum() -> gym.Env[Any, Any]:
     return gym.make("Pendulum-v1", max_episode_steps=30)
 
 
-def test_it_does_the_same_as_subproc_vec_env() -> None:
-    """Over episode ends: observations, rewards, dones, infos, and infos of resets."""
-    from stable_baselines3.common.vec_env import DummyVecEnv
-
-    from rlightning_aio.sb3 import VecEnv
-
-    ours, theirs = VecEnv([pendulum] * 3), DummyVecEnv([pendulum] * 3)
-    for env in (ours, theirs):
-        env.seed(5)
-    assert_alike(ours.reset(), theirs.reset())
-    for _ in range(100):
-        actions = np.random.default_rng(0).uniform(-2, 2, (3, 1)).astype(np.float32)
-        found, expected = ours.step(actions), theirs.step(actions)
-        assert_alike(found[0], expected[0])
-        np.testing.assert_allclose(
-            found[1], expected[1], rtol=1e-6
-        )  # Stable-Baselines3's are float32.
-        assert_alike(found[2], expected[2])
-        assert_alike(list(found[3]), expected[3])
-        assert_alike(ours.reset_infos, theirs.reset_infos)
-    assert ours.get_attr("g") == theirs.get_attr("g")
-    ours.set_attr("note", 7, indices=[0, -1])
-    assert ours.get_attr("note", indices=-1) == [7]
-    assert not ours.has_attr("nothing")
-    assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
-    assert ours.env_method("get_wrapper_attr", "g", indices=[1]) == [10.0]
-    ours.close()
-    ours.close()
-
-
 def test_infos_are_made_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """A step that ends no episode decodes none; a program that reads one finds all."""
     from rlightning_aio import sb3
@@ -452,22 +422,6 @@ def test_ppo_learns_the_same_on_envs_that_are_stepped_together(n_envs: int) -> N
 
 def hopper() -> gym.Env[Any, Any]:
     return gym.make("Hopper-v5", disable_env_checker=True)
-
-
-def test_a_step_limit_of_the_entry_ends_episodes() -> None:
-    """In the step that reaches it, and again the same number of steps later."""
-    from rlightning_aio.sb3 import VecEnv
-
-    env = VecEnv([lambda: gym.make("Pendulum-v1")] * 2, max_episode_steps=3)
-    env.reset()
-    for step in range(1, 8):
-        first, _, done, infos = env.step(np.zeros((2, 1), np.float32))
-        assert done.tolist() == [step % 3 == 0] * 2
-        for info, observation in zip(infos, first, strict=True):
-            assert info["TimeLimit.truncated"] == (step % 3 == 0)
-            assert ("terminal_observation" in info) == (step % 3 == 0)
-            assert not np.array_equal(info.get("terminal_observation"), observation)
-    env.close()
 
 
 class Locked(Choosy):
