@@ -542,7 +542,6 @@ def test_what_nothing_is_known_of() -> None:
         (Estimate(0.0123, 0.0119, 0.0127, 9), "0.01230 [0.01190, 0.01270] (n=9)"),
         (Estimate(500.0, 500.0, 500.0, 3), "500.00 [500.00, 500.00] (n=3)"),
         (Estimate(7.0, None, None, 1), "7 (n=1)"),
-        (Estimate(float("nan"), None, None, 4), "nan (n=4)"),
     ],
 )
 def test_an_estimate_prints_what_is_known(estimate: Estimate, printed: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import TYPE_CHECKING, Any
 
 from cli.command import invoke, invoke_json, run, write_config
@@ -85,7 +84,7 @@ def test_large_returns_are_averaged_and_short_in_the_table(tmp_path: Path) -> No
         assert "1.5e+301" in invoke(*words).stdout
 
 
-def test_estimates_of_any_values() -> None:
+def test_estimates_of_any_finite_values() -> None:
     assert mean_estimate([]) is None
     for values in ([1e308, 1.5e308, 1.7e308], [-1e308, 1.2e308], [5e-324, 0.0], [0.0, 0.0]):
         found = mean_estimate(values)
@@ -94,8 +93,3 @@ def test_estimates_of_any_values() -> None:
         assert found.low is not None
         assert found.high is not None
         assert found.low <= found.mean <= found.high
-    for values in ([math.nan, 1.0], [math.inf, 1.0], [math.inf, -math.inf], [math.nan]):
-        found = mean_estimate(values)
-        assert found is not None
-        assert not math.isfinite(found.mean)
-        assert (found.low, found.high, found.count) == (None, None, len(values))

@@ -44,15 +44,10 @@ class Estimate:
 
 
 def mean_estimate(values: Sequence[float]) -> Estimate | None:
-    """Mean of `values` with Student's t interval; None without values.
-
-    If a value is NaN or infinite, so is the mean, and there is no interval.
-    """
+    """Mean of `values`, which are finite, with Student's t interval; None without values."""
     if not values:
         return None
     count = len(values)
-    if not all(map(math.isfinite, values)):
-        return Estimate(sum(values), None, None, count)
     # Scaling by a power of two is exact, and keeps the sum of large values finite.
     _, exponent = math.frexp(max(map(abs, values)))
     scaled = [math.ldexp(value, -exponent) for value in values]
