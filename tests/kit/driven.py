@@ -77,6 +77,12 @@ def kinds_on_both_drivers(name: str, values: Iterable[str]) -> pytest.MarkDecora
     return pytest.mark.parametrize(("driver", name), cases)
 
 
+FOR_BOTH = {
+    "abort", "call", "call_with", "get_attr", "offload", "reload", "render", "set_attr",
+}  # fmt: skip
+"""Methods that wait, and are written once for both kinds of group."""
+
+
 class Awaited:
     """A synchronous group or handle with the awaitable methods of the asynchronous one."""
 
@@ -90,7 +96,7 @@ class Awaited:
             return Awaited(attribute, AioDriver)
         if name == "_core":
             return attribute
-        if not inspect.iscoroutinefunction(getattr(self._like, name)):
+        if not inspect.iscoroutinefunction(getattr(self._like, name)) and name not in FOR_BOTH:
             return attribute
 
         async def awaited(*args: Any, **kwargs: Any) -> Any:

@@ -98,26 +98,8 @@ class EnvGroup(GroupInterface):
         procedure = self._collect(timeout, wait_all, min_results, max_results, deadline)
         return await self._driver.run(procedure)
 
-    async def abort(self, env_ids: Sequence[str] | None = None) -> None:
-        await self._driver.run(self._core.abort(time.monotonic(), env_ids))
-
     async def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
         return await self._driver.run(self._drain(deadline))
-
-    async def call(
-        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
-    ) -> list[Any]:
-        return await self.call_with(name, args, kwargs, env_ids)
-
-    async def call_with(
-        self,
-        name: str,
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-        env_ids: Sequence[str] | None = None,
-    ) -> list[Any]:
-        asked = name, tuple(args), dict(kwargs or {})
-        return await self._driver.run(self._core.calls.call(time.monotonic(), env_ids, asked))
 
     async def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
@@ -155,12 +137,6 @@ class EnvGroup(GroupInterface):
         """
         return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
-    async def offload(self) -> None:
-        await self.call("offload", env_ids=self._local_ids)
-
-    async def reload(self) -> None:
-        await self.call("reload", env_ids=self._local_ids)
-
     async def close(self) -> None:
         try:
             await self._driver.run_last(self._core.close(time.monotonic()))
@@ -187,21 +163,6 @@ class EnvHandle(EnvHandleInterface):
 
     async def _asked(self, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
         return await self._group._agents.asked(self._env_id, what)  # noqa: SLF001
-
-    async def get_attr(self, name: str) -> Any:
-        return await super().get_attr(name)
-
-    async def set_attr(self, name: str, value: Any) -> None:
-        await super().set_attr(name, value)
-
-    async def render(self) -> Any:
-        return await super().render()
-
-    async def offload(self) -> None:
-        await super().offload()
-
-    async def reload(self) -> None:
-        await super().reload()
 
 
 def build_env_group(

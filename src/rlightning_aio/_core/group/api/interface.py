@@ -1,11 +1,13 @@
 """The waiting methods of groups and handles, documented once for both kinds.
 
-`aio` defines them as coroutines and `sync` as plain methods. A method returns when the replies are
+`aio` defines them as coroutines and `sync` as plain methods; those whose result has no type of its
+own are written here, for both, as only their drivers wait. A method returns when the replies are
 there; "cancelled" below means a cancelled task, or Ctrl-C in a synchronous program.
 """
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.api.facade import Facade
@@ -23,6 +25,9 @@ E = TypeVar("E", bound="EnvHandleInterface")
 
 class GroupInterface(Facade):
     """The waiting methods of a group."""
+
+    # Runs a procedure: returns its result in a synchronous group, else an awaitable.
+    _driver: Any
 
     def init(self) -> Any:
         """Start all worker processes in parallel, and build their envs.
@@ -159,7 +164,7 @@ class GroupInterface(Facade):
             UnknownEnv: no env of this group has that id.
             GroupClosed: the group was not initialised, or is closed.
         """
-        raise NotImplementedError
+        return self._driver.run(self._core.abort(time.monotonic(), env_ids))
 
     def drain(self, deadline: float | None = None) -> Any:
         """Wait for all that is in flight, and return it as one batch.
@@ -210,7 +215,7 @@ class GroupInterface(Facade):
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        raise NotImplementedError
+        return self.call_with(name, args, kwargs, env_ids)
 
     def call_with(
         self,
@@ -220,7 +225,8 @@ class GroupInterface(Facade):
         env_ids: Sequence[str] | None = None,
     ) -> Any:
         """Call method `name` of envs as `call` does, also one with an argument ``env_ids``."""
-        raise NotImplementedError
+        asked = name, tuple(args), dict(kwargs or {})
+        return self._driver.run(self._core.calls.call(time.monotonic(), env_ids, asked))
 
     def snapshot(self, env_ids: Sequence[str] | None = None) -> Any:
         """Return the complete state of envs as bytes that can be stored.
@@ -306,11 +312,11 @@ class GroupInterface(Facade):
             WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
             GroupClosed: the group was not initialised, or is closed.
         """
-        raise NotImplementedError
+        return self.call("offload", env_ids=self._local_ids)
 
     def reload(self) -> Any:
         """Allocate the device memory of every local env again; errors are those of `offload`."""
-        raise NotImplementedError
+        return self.call("reload", env_ids=self._local_ids)
 
     def close(self) -> Any:
         """Close all envs and end their workers, by force after the ``close_timeout`` of

@@ -97,26 +97,8 @@ class EnvGroup(GroupInterface):
         procedure = self._collect(timeout, wait_all, min_results, max_results, deadline)
         return self._driver.run(procedure)
 
-    def abort(self, env_ids: Sequence[str] | None = None) -> None:
-        self._driver.run(self._core.abort(time.monotonic(), env_ids))
-
     def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
         return self._driver.run(self._drain(deadline))
-
-    def call(
-        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
-    ) -> list[Any]:
-        return self.call_with(name, args, kwargs, env_ids)
-
-    def call_with(
-        self,
-        name: str,
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-        env_ids: Sequence[str] | None = None,
-    ) -> list[Any]:
-        asked = name, tuple(args), dict(kwargs or {})
-        return self._driver.run(self._core.calls.call(time.monotonic(), env_ids, asked))
 
     def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
         return self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
@@ -128,12 +110,6 @@ class EnvGroup(GroupInterface):
 
     def __getitem__(self, env_id: str) -> Any:
         return self._handle(env_id, EnvHandle)
-
-    def offload(self) -> None:
-        self.call("offload", env_ids=self._local_ids)
-
-    def reload(self) -> None:
-        self.call("reload", env_ids=self._local_ids)
 
     def close(self) -> None:
         try:
