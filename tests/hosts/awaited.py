@@ -12,7 +12,7 @@ from gymnasium import spaces
 from rlightning_aio import ENVS, BaseEnv, EnvRet, PolicyResponse
 
 OWN = {"backend": "scripted", "task": "-", "imports": ["hosts.awaited"]}
-STEP, END, HANG, IGNORE, CANCELLED, BLOCK, LEAK, GATE, RAISE, EXIT, INTERRUPT, BIG = range(12)
+STEP, END, HANG, IGNORE, CANCELLED, BLOCK, GATE, RAISE, EXIT, INTERRUPT, BIG = range(11)
 BIG_BYTES = 1 << 22
 """More than a socket holds."""
 
@@ -58,7 +58,7 @@ class Scripted(BaseEnv):
         return spaces.Box(-np.inf, np.inf, (4,), np.float64)
 
     def get_action_space(self) -> Any:
-        return spaces.Discrete(12)
+        return spaces.Discrete(11)
 
     def _result(self, **fields: Any) -> EnvRet:
         shown = [self.built[self.env_id], self.episodes, self.steps, self.seed]
@@ -83,8 +83,6 @@ class Scripted(BaseEnv):
             raise asyncio.CancelledError("its own")
         elif action == BLOCK:
             time.sleep(0.12)  # noqa: ASYNC251  # As it should not.
-        elif action == LEAK:
-            self.left = asyncio.create_task(asyncio.Event().wait(), name="left behind")
         elif action == GATE:
             self.at_gate.add(self.env_id)
             await self.gates[self.env_id].wait()

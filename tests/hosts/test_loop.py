@@ -25,7 +25,6 @@ from hosts.awaited import (
     HANG,
     IGNORE,
     INTERRUPT,
-    LEAK,
     OWN,
     RAISE,
     STEP,
@@ -730,18 +729,6 @@ async def test_the_garbage_collectors_time_is_nobodys(caplog: pytest.LogCaptureF
     assert "blocked the event loop" not in caplog.text
 
 
-async def test_tasks_that_an_env_leaves_behind_are_cancelled(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    others = asyncio.create_task(asyncio.Event().wait())
-    async with rl.build_env_group(entry(num_workers=2)) as group:
-        await group.reset()
-        await group.step(steps(e_0=STEP, e_1=LEAK))
-    assert "env 'e-1' left 1 tasks running when it was closed (left behind)" in caplog.text
-    assert not others.done()
-    others.cancel()
-
-
 async def test_an_interrupt_that_an_env_raises_in_a_worker_is_its_own() -> None:
     """Another env that shares the event loop stays in its step."""
     config = entry("m", "process", num_workers=2, envs_per_process=2, step_timeout=SOON)
@@ -778,22 +765,6 @@ async def test_a_group_can_be_closed_during_a_step() -> None:
     await until_at_gate(*group.env_ids)
     await group.close()
     assert sorted(Scripted.closed) == ["e-0", "e-1", "e-2"]
-
-
-async def test_a_close_that_is_cancelled_cancels_what_envs_have_left() -> None:
-    """Nobody waits for their tasks then, but none of them goes on."""
-    group = rl.build_env_group(entry())
-    await group.init()
-    await group.reset()
-    await group.step(steps(e_0=LEAK))
-    (left,) = (task for task in asyncio.all_tasks() if task.get_name() == "left behind")
-    closing = asyncio.ensure_future(group.close())
-    await asyncio.sleep(0)
-    closing.cancel()
-    await asyncio.wait({closing})
-    await group.close()
-    assert left.done() or left.cancelling()
-    await asyncio.wait({left})
 
 
 @pytest.mark.parametrize("wrong", [{"close": "hangs"}, {}], ids=["close hangs", "step goes on"])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from rlightning_aio._core.hosts.awaiting.event_loop import OWNER, new_task, wait_fairly
+from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.messages import ErrorText
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ class AwaitedEnv:
         self._idle: asyncio.Future[None] | None = None
         self._is_cancelled = False
         self._context = context.copy()
-        self._context.run(OWNER.set, self)
         self._closing: asyncio.Task[None] | None = None
         self.task = new_task(self._live(make), loop, self._context)
         self.task.add_done_callback(self._on_end)
@@ -215,8 +214,7 @@ async def end_all(envs: Collection[AwaitedEnv], seconds: float) -> None:
 
     Args:
         envs: of one event loop.
-        seconds: how long they may take to close, after `CANCEL_SECONDS` at most. The time for which
-            the event loop was blocked meanwhile, perhaps by so many of them, comes on top.
+        seconds: how long they may take to close, after `CANCEL_SECONDS` at most.
     """
     for env in envs:
         env.leave()
@@ -224,7 +222,9 @@ async def end_all(envs: Collection[AwaitedEnv], seconds: float) -> None:
     if stopping:
         await asyncio.wait(stopping, timeout=CANCEL_SECONDS)
     by_task = {env.closing(): env for env in envs}
-    late = await wait_fairly(by_task, seconds)
+    late = {task for task in by_task if not task.done()}
+    if late:
+        late = (await asyncio.wait(late, timeout=seconds))[1]
     for task in late:
         by_task[task].cut_short(seconds)
     if late:

@@ -11,8 +11,10 @@ Left out: how requests and completions travel.
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections import deque
-from contextvars import Context, copy_context
+from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,14 +25,11 @@ from rlightning_aio._core.hosts.awaiting.awaited_env import (
     reraise,
 )
 from rlightning_aio._core.hosts.awaiting.event_loop import (
-    TimeLimit,
     awaited_calls,
     cancel,
-    cancel_leftovers,
     leave_behind,
     log,
     new_task,
-    tasks_of,
     time_collector,
     watched,
 )
@@ -47,14 +46,17 @@ from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, MutableSequence
+    from contextvars import Context
 
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
 _LINES, _EVERY = 3, 100
 """Turns that hold the event loop for long: the first ones are logged, then each of this number."""
-_LEFTOVERS_SECONDS: Final = 0.1
-"""How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
+_LOOKS: Final = 4
+"""Looks at the time of requests within the shortest limit, as of a worker's."""
+_PAUSE_SECONDS: Final = 0.02
+"""The shortest time between two looks."""
 
 
 class _EnvRecord:
@@ -67,6 +69,7 @@ class _EnvRecord:
         runner: of that env, or of the one before.
         entry: of the request that is being executed; 0 while there is none.
         arguments: of that request.
+        due: when its time is up.
         answered: entry of the last request that was answered.
         is_ending: the env before has left by itself, and has not closed yet.
         lost: why the env before is gone, and the same as a message; None if there was none.
@@ -81,6 +84,7 @@ class _EnvRecord:
         self.runner: Any = None
         self.entry = 0
         self.arguments: Any = None
+        self.due = math.inf
         self.answered = 0
         self.is_ending = False
         self.lost: tuple[Loss, str] | None = None
@@ -142,15 +146,12 @@ class AwaitedEnvs:
         config = order.config
         self._close_seconds = config.close_timeout or AWAITED_CLOSE_SECONDS
         self._renews = config.on_env_error == "restart"
-        self._limits = {
-            op: TimeLimit(seconds, self._expire) for op, seconds in limits_of(config).items()
-        }
+        self._limits = limits_of(config)
+        self._pause = max(_PAUSE_SECONDS, min(self._limits.values(), default=0.0) / _LOOKS)
+        self._look: asyncio.TimerHandle | None = None
         # All envs whose tasks run, and the tasks that replace envs or put them away.
         self._envs: set[AwaitedEnv] = set()
         self._tasks: set[asyncio.Task[None]] = set()
-        # Names of envs that have closed, until a timer looks for what they have left.
-        self._closed: dict[object, str] = {}
-        self._look: asyncio.TimerHandle | None = None
 
     # -- life ---------------------------------------------------------------------
 
@@ -230,10 +231,9 @@ class AwaitedEnvs:
                 log.error("interrupted; these envs were not closed: %s", ", ".join(left))
             raise
         errors = [(env.index, error) for env in envs if (error := env.close_error) is not None]
-        closed = {**self._closed, **{env: env.name for env in envs}}
-        await cancel(self._leftovers(closed), CANCEL_SECONDS / 4)
-        for task in tasks_of({*closed, *self._envs}, self._loop):
-            leave_behind(task)
+        for env in self._envs:
+            for task in env.tasks():
+                leave_behind(task)
         return errors
 
     def disconnect(self) -> None:
@@ -241,10 +241,10 @@ class AwaitedEnvs:
         disconnect_all([record.runner for record in self._records if record.env is not None])
 
     def release(self) -> None:
-        """Cancel everything without waiting, also tasks that envs have started. Idempotent."""
+        """Cancel everything without waiting. Idempotent."""
         self._end()
         if self._envs and not self._loop.is_closed():
-            for task in self._tasks | tasks_of(self._envs, self._loop).keys():
+            for task in self._tasks.union(*(env.tasks() for env in self._envs)):
                 task.cancel()
         for env in self._envs if self._envs and not self._loop.is_running() else ():
             leave_behind(env.task)  # The warning about the group says enough.
@@ -255,8 +255,6 @@ class AwaitedEnvs:
         """Begin nothing more, and post nothing more."""
         self._ending = True
         self._queue.clear()
-        for limit in self._limits.values():
-            limit.end()
         if self._look is not None:
             self._look.cancel()
 
@@ -297,8 +295,10 @@ class AwaitedEnvs:
         """Have an env execute the request in its record."""
         op = op_of(record.entry)
         env.give(op, record.entry, record.arguments, self._on_outcome)
-        if op in self._limits:
-            self._limits[op].begin(record, self._loop)
+        if (seconds := self._limits.get(op)) is not None:
+            record.due = time.monotonic() + seconds
+            if self._look is None:
+                self._plan_look()
 
     def _on_outcome(
         self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
@@ -311,6 +311,13 @@ class AwaitedEnvs:
             return
         completion = completion_of(self._host_id, env.runner, entry, outcome, error)
         self._finish(record, completion, by=env)
+
+    @staticmethod
+    def _take_request(record: _EnvRecord) -> int:
+        """Return the entry of the request of an env, which executes none from now on."""
+        entry, record.entry, record.arguments = record.entry, 0, None
+        record.due = math.inf
+        return entry
 
     def _finish(
         self, record: _EnvRecord, completion: Completion | None, *, by: AwaitedEnv | None = None
@@ -325,8 +332,7 @@ class AwaitedEnvs:
             self._put_away(record, by)
         if self._ending:
             return
-        entry, record.entry, record.arguments = record.entry, 0, None
-        record.answered = entry
+        entry = record.answered = self._take_request(record)
         self.num_busy -= 1
         if completion is None:
             self._done(entry)
@@ -369,13 +375,32 @@ class AwaitedEnvs:
 
     # -- envs that are lost -------------------------------------------------------
 
-    def _expire(self, record: _EnvRecord, seconds: float) -> None:
+    def _plan_look(self) -> None:
+        planned = time.monotonic() + self._pause
+        self._look = self._loop.call_later(self._pause, self._look_for_late, planned)
+
+    def _look_for_late(self, planned: float) -> None:
+        """Find the requests that take too long.
+
+        While something else blocked the event loop, no env could go on, so that isn't counted.
+        """
+        self._look = None
+        now = time.monotonic()
+        for record in self._records:
+            record.due += max(0.0, now - planned)
+            if now >= record.due:
+                self._expire(record)
+        if any(record.due < math.inf for record in self._records):
+            self._plan_look()
+
+    def _expire(self, record: _EnvRecord) -> None:
         """Put an env away whose request takes too long."""
         env = record.env
-        if self._ending or env is None:
+        if env is None:
             return
         op = op_of(record.entry)
         doing = Operation(op).name.lower()
+        seconds = self._limits[op]
         message = (
             f"env {record.name!r} took longer than {seconds} s for a {doing} and was cancelled"
         )
@@ -388,7 +413,7 @@ class AwaitedEnvs:
     def _report_loss(self, record: _EnvRecord, why: Loss, message: str) -> None:
         """Report that an env is gone, and the request with it that it was executing."""
         record.lost = why, message
-        entry, record.entry, record.arguments = record.entry, 0, None
+        entry = self._take_request(record)
         if self._ending:
             return
         self.num_busy -= entry != 0
@@ -436,26 +461,12 @@ class AwaitedEnvs:
         self._note_closed(env)
 
     def _note_closed(self, env: AwaitedEnv) -> None:
-        """Report what was wrong with an env that was put away, and look for what it has left."""
+        """Report what was wrong with an env that was put away."""
         if (error := env.close_error) is not None and not self._ending:
             log.warning("env %r, as it was put away to be rebuilt: %s", env.name, error.summary)
-        if self._look is None and not self._ending:
-            look = self._look_for_leftovers
-            self._look = self._loop.call_later(_LEFTOVERS_SECONDS, look, context=Context())
-        self._closed[env] = env.name
-
-    def _look_for_leftovers(self) -> None:
-        closed, self._closed, self._look = self._closed, {}, None
-        self._leftovers(closed)
-
-    def _leftovers(self, names: dict[Any, str]) -> list[asyncio.Task[Any]]:
-        known = [task for env in self._envs for task in env.tasks()]
-        return cancel_leftovers(names, but=known)
 
     def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        # In no env's context, or the end of that env would cancel it: the caller may be the task of
-        # another env, or a timer that was set there.
-        task = new_task(coroutine, self._loop, Context())
+        task = new_task(coroutine, self._loop)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task

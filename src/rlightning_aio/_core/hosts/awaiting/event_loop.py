@@ -1,10 +1,4 @@
-"""What envs do to the event loop that they share: how long they hold it, and what they leave.
-
-`watched` awaits a coroutine and measures each of its turns, without the time of the garbage
-collector, which no env has chosen. `TimeLimit` finds requests that take
-too long with one timer for all envs. Tasks that an env starts belong to it, because they inherit
-its context; `cancel_leftovers` finds them.
-"""
+"""The event loops that awaitable envs share, and what an env does to one: how long it holds it."""
 
 from __future__ import annotations
 
@@ -13,25 +7,21 @@ import gc
 import logging
 import os
 import time
-from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from contextvars import Context, ContextVar
 from types import coroutine
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
+    from collections.abc import Callable, Collection, Coroutine, Generator
+    from contextvars import Context
 
 LONG_TURN_SECONDS: Final = 0.1
 """An env that holds the event loop for longer is reported."""
 MOST_THREADS: Final = 256
 """Of the loops of `run_loop`; asyncio's own have the number of cores and four more."""
-OWNER: Final[ContextVar[object]] = ContextVar("rlightning_aio_env", default=None)
-"""The env on whose behalf code runs, also in tasks that the env has started."""
 log = logging.getLogger("rlightning_aio")
 
 T = TypeVar("T")
-F = TypeVar("F", bound=asyncio.Future[Any])
 
 
 def run_loop(main: Coroutine[Any, Any, T]) -> T:
@@ -98,7 +88,7 @@ def watched(
         answering: a coroutine that has not begun.
         entry: of the request.
         report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`; after
-            `time_collector` without those of the garbage collector.
+            `time_collector` without those of the garbage collector, which no env has chosen.
         enter: gets `entry` before each turn, and 0 after it.
     """
     send, throw, clock = answering.send, answering.throw, time.monotonic
@@ -149,120 +139,11 @@ def awaited_calls(answering: Any) -> str:
     )
 
 
-class _Watched(Protocol):
-    entry: int
-
-
-class TimeLimit:
-    """Calls `expire` with each env whose request takes longer than `seconds`.
-
-    All requests have the same limit, so that the first to begin is the first whose time is up. One
-    timer serves all of them. Requests whose time is up get a tenth of it in addition, and as long
-    as the timer was late: while something else blocked the event loop, no env could go on.
-
-    Args:
-        seconds: the limit.
-        expire: gets the env and the limit.
-    """
-
-    def __init__(self, seconds: float, expire: Callable[[Any, float], None]) -> None:
-        self.seconds = seconds
-        self._expire = expire
-        self._running: deque[tuple[float, _Watched, int]] = deque()
-        self._timer: asyncio.TimerHandle
-        self._is_set = False
-        self._late: dict[int, asyncio.TimerHandle] = {}
-        self._num_late = 0
-
-    def begin(self, env: _Watched, loop: asyncio.AbstractEventLoop) -> None:
-        """`env` begins to execute `env.entry`, which is another one as soon as that has ended."""
-        running = self._running
-        while running and running[0][1].entry != running[0][2]:
-            running.popleft()  # It has ended; kept until its time is up, thousands would pile up.
-        running.append((time.monotonic() + self.seconds, env, env.entry))
-        if not self._is_set:
-            self._is_set = True
-            self._timer = loop.call_later(self.seconds, self._look, loop)
-
-    def end(self) -> None:
-        """Let nothing expire any more."""
-        self._running.clear()
-        for timer in (*self._late.values(), *((self._timer,) if self._is_set else ())):
-            timer.cancel()
-
-    def _look(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Find the requests whose time is up, and when to look for the next ones."""
-        self._is_set = False
-        now, lateness = time.monotonic(), 0.0
-        late: list[tuple[_Watched, int]] = []
-        while self._running:
-            expiry, env, entry = self._running[0]
-            if env.entry == entry and expiry > now:
-                self._is_set = True
-                self._timer = loop.call_later(expiry - now, self._look, loop)
-                break
-            self._running.popleft()
-            if env.entry == entry:
-                late.append((env, entry))
-                lateness = max(lateness, now - expiry)
-        if late:
-            self._num_late = number = self._num_late + 1
-            more = self.seconds / 10 + lateness
-            self._late[number] = loop.call_later(more, self._judge, number, late)
-
-    def _judge(self, number: int, late: list[tuple[_Watched, int]]) -> None:
-        del self._late[number]
-        for env, entry in late:
-            if env.entry == entry:
-                self._expire(env, self.seconds)
-
-
-async def wait_fairly(futures: Collection[F], seconds: float) -> set[F]:
-    """Wait for `futures`; return those that are not done after some seconds.
-
-    If these end late, because the event loop was blocked, it waits as long as that again.
-    """
-    late, more = {one for one in futures if not one.done()}, seconds
-    for _ in range(2):
-        if late:
-            began = time.monotonic()
-            late = (await asyncio.wait(late, timeout=more))[1]
-            more = time.monotonic() - began - more
-    return late
-
-
 async def cancel(tasks: Collection[asyncio.Task[Any]], seconds: float) -> set[asyncio.Task[Any]]:
     """Cancel `tasks` and wait for them for some seconds; returns those that go on."""
     for task in tasks:
         task.cancel()
     return (await asyncio.wait(tasks, timeout=seconds))[1] if tasks else set()
-
-
-def cancel_leftovers(
-    names: Mapping[object, str], but: Collection[object]
-) -> list[asyncio.Task[Any]]:
-    """Report and cancel the tasks that closed envs have left running; return them.
-
-    Args:
-        names: the envs' names, by what `OWNER` is in their contexts.
-        but: tasks that are known already.
-    """
-    left: dict[str, list[asyncio.Task[Any]]] = {}
-    for task, owner in tasks_of(names, asyncio.get_running_loop()).items():
-        if task not in but:
-            left.setdefault(names[owner], []).append(task)
-    for name, tasks in left.items():
-        log.warning(
-            "env %r left %d tasks running when it was closed (%s); they are cancelled: end them in "
-            "its close()",
-            name,
-            len(tasks),
-            ", ".join(task.get_name() for task in tasks),
-        )
-    found = [task for tasks in left.values() for task in tasks]
-    for task in found:
-        task.cancel()
-    return found
 
 
 def leave_behind(task: asyncio.Task[Any]) -> None:
@@ -272,21 +153,3 @@ def leave_behind(task: asyncio.Task[Any]) -> None:
     """
     asyncio._unregister_task(task)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
     setattr(task, "_log_destroy_pending", False)  # noqa: B010  # As `asyncio.gather` does.
-
-
-def tasks_of(
-    envs: Collection[object], loop: asyncio.AbstractEventLoop
-) -> dict[asyncio.Task[Any], object]:
-    """Tasks that belong to one of `envs`, with that env, except the one that runs now."""
-    tasks = asyncio.all_tasks(loop) - {asyncio.current_task(loop)}
-    owners = {task: _owner_of(task) for task in tasks}
-    return {task: owner for task, owner in owners.items() if owner in envs}
-
-
-def _owner_of(task: asyncio.Task[Any]) -> object:
-    get_context: Any = getattr(task, "get_context", None)
-    if get_context is not None:
-        context = get_context()
-    else:  # Before Python 3.12; but each task refers to its context.
-        context = next((one for one in gc.get_referents(task) if type(one) is Context), None)
-    return None if context is None else context.get(OWNER)
