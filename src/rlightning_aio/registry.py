@@ -215,7 +215,7 @@ PLACEMENTS: dict[str, Placement] = {
         check="rlightning_aio._core.hosts.process.system:check_system",
     ),
     "loop": Placement(
-        "rlightning_aio._core.hosts.here.loop:LoopHost",
+        "rlightning_aio._core.hosts.loop:LoopHost",
         spreads=False,
         refuses={
             "envs_per_process": "all of the entry's envs live in this process",
@@ -226,7 +226,7 @@ PLACEMENTS: dict[str, Placement] = {
         awaits="only",
     ),
     "inline": Placement(
-        "rlightning_aio._core.hosts.here.inline:InlineHost",
+        "rlightning_aio._core.hosts.inline:InlineHost",
         spreads=False,
         refuses={
             "step_timeout": _NO_LIMIT,

@@ -19,9 +19,9 @@ from kit.checked import CheckedRequests
 
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
-from rlightning_aio._core.group.episodes.episodes import Episodes
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.episodes import Episodes
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.state.sums import Sums
 from rlightning_aio._core.group.supervision.supervisor import Supervisor

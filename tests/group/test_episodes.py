@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from rlightning_aio._core.group.episodes.episodes import (
+from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.episodes import (
     LEGAL,
     Episodes,
     LossEvent,
@@ -17,7 +18,6 @@ from rlightning_aio._core.group.episodes.episodes import (
     Position,
     Report,
 )
-from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.slab import IS_RESET, OVER

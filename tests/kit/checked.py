@@ -89,7 +89,7 @@ _OF_REQUESTS: Final[Rules] = {
 }
 """The changes that each method makes, by its arguments."""
 _OF_QUEUE: Final[Rules] = {
-    "free": lambda it, args: [(Event.FREED, it.with_errors(args[0]))],
+    "free": lambda it, args: [(Event.FREED, np.array([k for k in args[0] if k in it.errors], int))],
 }
 
 

@@ -14,7 +14,7 @@ from kit.checked import CheckedRequests
 from simulator.program import OPS
 
 from rlightning_aio import errors
-from rlightning_aio._core.group.episodes import episodes
+from rlightning_aio._core.group.state import episodes
 from rlightning_aio._core.group.state.request_states import LEGAL, Owner, State
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from simulator.coverage import ROWS, row_key, rows
 from simulator.program import draw
 from simulator.runs import run, run_twice, shown, shrunk
 
-from rlightning_aio._core.group.episodes.episodes import Episodes
+from rlightning_aio._core.group.state.episodes import Episodes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rlightning_aio._core.group.episodes.episodes import checked_seed
+from rlightning_aio._core.group.state.episodes import checked_seed
 
 EpisodeKey = tuple[str, str, int | None, str, str]
 """Entry, task, seed, options as JSON, and env of an episode."""

@@ -25,7 +25,7 @@ def main() -> None:
     from rlightning_aio.errors import ConfigError  # noqa: PLC0415
 
     try:
-        from rlightning_aio._core.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
+        from rlightning_aio._core.hosts.descriptors import stdout_set_aside  # noqa: PLC0415
         from rlightning_aio.cli.app import app  # noqa: PLC0415
 
         sys.stdout = stdout_set_aside()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 import typer
 
 import rlightning_aio
-from rlightning_aio._core.group.episodes.episodes import checked_seed
+from rlightning_aio._core.group.state.episodes import checked_seed
 from rlightning_aio.attempts import ResultsFile
 from rlightning_aio.cli.options import (
     AsJson,

@@ -16,7 +16,7 @@ from gymnasium.error import ResetNeeded as GymnasiumResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio._core.group.api.sync import due_for_reset
-from rlightning_aio._core.group.episodes.episodes import as_int
+from rlightning_aio._core.group.state.episodes import as_int
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import lost_rows, reported_infos
 from rlightning_aio.envs.adapted.makers import adapted

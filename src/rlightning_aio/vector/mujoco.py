@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.error import ResetNeeded
 
-from rlightning_aio._core.group.episodes.snapshot_format import (
+from rlightning_aio._core.group.state.snapshot_format import (
     EnvSnapshot,
     check_same,
     pack,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from rlightning_aio._core.group.episodes.episodes import checked_seed
+from rlightning_aio._core.group.state.episodes import checked_seed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

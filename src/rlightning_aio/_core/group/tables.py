@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from rlightning_aio._core.group.episodes.episodes import Episodes
     from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
     from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.episodes import Episodes
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.group.state.slab_layout import SlabLayout

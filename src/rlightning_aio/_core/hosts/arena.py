@@ -13,7 +13,7 @@ import os
 import tempfile
 from typing import Final
 
-from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
+from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
 
 _MAP_FIXED: Final = 0x10
 

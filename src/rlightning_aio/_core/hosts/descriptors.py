@@ -2,16 +2,21 @@
 
 Rule: the set is an epoll, or where the system has none (macOS) a selector with the same methods.
 Both are level-triggered, and have a descriptor of their own.
+
+And descriptors 0, 1 and 2: they stay open in a program that was started without its streams.
+Otherwise the next file would get one of them, and output to stderr would be written into it.
 """
 
 from __future__ import annotations
 
+import os
 import select
 import selectors
 import socket
+import sys
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, TextIO, cast
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,6 +24,8 @@ if TYPE_CHECKING:
 # The numbers that epoll has; those of selectors are different.
 READABLE: Final = select.POLLIN if hasattr(select, "epoll") else selectors.EVENT_READ
 WRITABLE: Final = select.POLLOUT if hasattr(select, "epoll") else selectors.EVENT_WRITE
+_STDOUT: Final = 1
+_STDERR: Final = 2
 
 
 class _Selector(selectors.DefaultSelector):
@@ -98,3 +105,33 @@ class Inbox:
                 self._is_open = False
                 self._tasks.clear()
                 self._wake_up.close()
+
+
+def occupy_standard_streams() -> None:
+    """Open /dev/null in place of closed streams, here and in child processes.
+
+    Call it before opening a file that must not get one of these descriptors.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+
+
+def stdout_set_aside() -> TextIO:
+    """Redirect descriptor 1 to stderr, here and in child processes.
+
+    Then an env, a C library or a child process that prints can't corrupt output to stdout. Returns
+    a stream to the original stdout.
+    """
+    occupy_standard_streams()
+    before = sys.stdout
+    if before is not None:  # pyright: ignore[reportUnnecessaryComparison]  # Closed by the caller.
+        before.flush()
+    kept = os.dup(_STDOUT)
+    os.dup2(_STDERR, _STDOUT)
+    return os.fdopen(
+        kept,
+        "w",
+        encoding=getattr(before, "encoding", None),
+        errors=getattr(before, "errors", None),
+    )

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.steps import Flags
     from rlightning_aio._core.group.engine.waiting import Poller
-    from rlightning_aio._core.group.episodes.episodes import Seeds
+    from rlightning_aio._core.group.state.episodes import Seeds
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.types import EnvMeta

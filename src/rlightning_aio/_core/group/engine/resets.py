@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Procedure, Wait
-from rlightning_aio._core.group.episodes.episodes import seeds_for
+from rlightning_aio._core.group.state.episodes import seeds_for
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_BEFORE
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
-    from rlightning_aio._core.group.episodes.episodes import Seeds
+    from rlightning_aio._core.group.state.episodes import Seeds
     from rlightning_aio._core.group.state.requests import Ticket
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables

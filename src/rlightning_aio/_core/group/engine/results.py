@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.episodes.episodes import Report
+    from rlightning_aio._core.group.state.episodes import Report
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio.batch.sent import Sources

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from rlightning_aio._core.group.engine.calls import values_of
-from rlightning_aio._core.group.episodes.episodes import Position
-from rlightning_aio._core.group.episodes.snapshot_format import (
+from rlightning_aio._core.group.state.episodes import Position
+from rlightning_aio._core.group.state.snapshot_format import (
     EnvSnapshot,
     check_same,
     identity_of,

@@ -9,11 +9,11 @@ import numpy as np
 
 from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio._core.group.engine.waiting import Poller
-from rlightning_aio._core.group.episodes.episodes import Episodes
 from rlightning_aio._core.group.setup.plan import host_class, placement_for
 from rlightning_aio._core.group.setup.start_orders import start_orders
 from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
 from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.episodes import Episodes
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.state.sums import Sums

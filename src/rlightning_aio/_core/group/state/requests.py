@@ -17,10 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rlightning_aio._core.group.state.conditions import Conditions
+from rlightning_aio._core.group.state.conditions import FAULT, Conditions
 from rlightning_aio._core.group.state.numbering import Numbering
 from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
-from rlightning_aio._core.group.state.uncollected import UncollectedErrors
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.protocol import exchange, kernel
 from rlightning_aio.protocol.entries import (
@@ -121,19 +120,30 @@ class Tickets:
         ticket.slots = ticket.slots[~np.isin(ticket.slots, slots)]
 
 
-class CollectorQueue(UncollectedErrors):
+class CollectorQueue:
     """The results and errors that wait for the collector, in the order of their arrival.
+
+    An env is busy until its error has been raised, whatever the trainer has read.
+
+    Args:
+        conditions: of the group.
+        state: `State`, by slot.
 
     Attributes:
         num_ready: results; num_awaited: requests whose results it will get.
         ready: slots of those results.
+        faults: errors, in the order of their arrival.
+        errors: by slot, the error that its request ended in.
     """
 
     def __init__(self, conditions: Conditions, state: NDArray[np.int8]) -> None:
-        super().__init__(conditions, state)
+        self._conditions = conditions
+        self._state = state
         self.num_ready = 0
         self.num_awaited = 0
         self.ready: deque[NDArray[np.intp]] = deque()
+        self.faults: deque[EnvFault] = deque()
+        self.errors: dict[int, EnvFault] = {}
 
     def append(self, slots: NDArray[np.intp]) -> None:
         """Add awaited results that are ready."""
@@ -161,6 +171,27 @@ class CollectorQueue(UncollectedErrors):
         """Remove results that the collector does not get."""
         self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
         self.num_ready -= len(slots)
+
+    def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
+        """Keep an error; the envs of `slots` are busy until it is raised."""
+        self._state[slots] = _SPENT_CODE
+        self.errors |= dict.fromkeys(slots.tolist(), fault)
+        self.faults.append(fault)
+        self._conditions.note(FAULT, True)
+
+    def take_fault(self, fault: EnvFault) -> NDArray[np.intp]:
+        """Remove an error that is raised; return the slots that it frees."""
+        self.faults.remove(fault)
+        self._conditions.note(FAULT, bool(self.faults))
+        return self.free([slot for slot, own in self.errors.items() if own is fault])
+
+    def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
+        """Free those of `slots` whose errors wait, and return them; the errors stay."""
+        free = np.array([slot for slot in slots if slot in self.errors], np.intp)
+        self._state[free] = _IDLE_CODE
+        for slot in free.tolist():
+            del self.errors[slot]
+        return free
 
 
 class Requests:

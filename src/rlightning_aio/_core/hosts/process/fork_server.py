@@ -10,6 +10,7 @@ Rule: it has one thread when it forks. It builds no env.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import faulthandler
@@ -25,10 +26,11 @@ import termios
 import threading
 import time
 import traceback
+import weakref
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from rlightning_aio._core.hosts.process import finalisers
+from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
 from rlightning_aio._core.hosts.process.descendants import adopt_orphans, children, kill_below
 from rlightning_aio._core.hosts.process.fork_messages import (
     CloseLimit,
@@ -41,7 +43,6 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Preload,
     Ready,
 )
-from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -90,6 +91,11 @@ _DUMP_SECONDS: Final = 0.3
 _ERROR_CHARACTERS: Final = 60_000
 _STDOUT: Final = 1
 _STDERR: Final = 2
+
+
+# What `multiprocessing` uses of them at the end of a process has no public name.
+_atexit: Any = atexit
+_threading: Any = threading
 
 
 @dataclass
@@ -390,7 +396,7 @@ def _run_worker(
         leave()
         die_with_parent()
         adopt_orphans()
-        finalisers.drop_inherited()
+        _drop_inherited()
         if os.getppid() != parent:
             os._exit(1)
         faulthandler.enable(all_threads=True)
@@ -400,7 +406,7 @@ def _run_worker(
 
         trainer = socket.socket(fileno=channel)
         worker.main(trainer, arena, order.place)
-        finalisers.run_all()
+        _run_finalisers()
         code = 0
     except BaseException:
         traceback.print_exc()
@@ -409,6 +415,42 @@ def _run_worker(
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(code)
+
+
+# -- how a worker ends: as Python does, without what the fork server has left to be done at its end.
+# Python's own end would also run the exit functions of the fork server's modules, and some of those
+# delete what other workers use. `multiprocessing` ends its processes likewise.
+
+
+def _drop_inherited() -> None:
+    """Forget, in a process that was forked just now, what its parent does at its end."""
+    _atexit._clear()  # noqa: SLF001
+    finalize: Any = weakref.finalize
+    for finaliser in list(finalize._registry):  # noqa: SLF001
+        finaliser.atexit = False
+    finalize._registered_with_atexit = False  # noqa: SLF001
+    if util := _multiprocessing():
+        util._finalizer_registry.clear()  # noqa: SLF001
+
+
+def _run_finalisers() -> None:
+    """Wait for threads, run finalisers and exit functions, and collect garbage.
+
+    This closes files that have no references, removes temporary folders, and ends daemons of
+    `multiprocessing`.
+    """
+    gc.collect()
+    _threading._shutdown()  # noqa: SLF001
+    if util := _multiprocessing():
+        util._exit_function()  # noqa: SLF001
+    _atexit._run_exitfuncs()  # noqa: SLF001
+
+
+def _multiprocessing() -> Any:
+    return sys.modules.get("multiprocessing.util")
+
+
+# -- the start ------------------------------------------------------------------
 
 
 def _watch_trainer(trainer: MessageSocket, process: int, finished: socket.socket) -> None:

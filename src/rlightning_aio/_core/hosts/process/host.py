@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
+from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -35,7 +36,6 @@ from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
 from rlightning_aio._core.hosts.process.spares import RunningForkServer
 from rlightning_aio._core.hosts.process.system import processor_ns
-from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
