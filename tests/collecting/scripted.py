@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rlightning_aio import sync
 from rlightning_aio.batch import BatchedData, joined
 from rlightning_aio.batch.data import parts_of
-from rlightning_aio.envs.adapted.same_step import SameStep
+from rlightning_aio.envs.adapted.makers import SameStep
 from rlightning_aio.errors import NothingPending
 from rlightning_aio.protocol.slab import TRUNCATED
 
