@@ -49,7 +49,7 @@ def by_program(written: str) -> dict[str, str]:
 # Those of migrating.md are run by vector/test_pages.py, that on Ray by on_ray/test_pages.py.
 NEEDS_MORE = (
     r"^(import torch$|from stable_baselines3|net = "
-    r"|from (lerobot|ray|rl_zoo3|skrl|skyrl_gym|tianshou|tinker_cookbook|torchrl|trl)\b"
+    r"|from (lerobot|ray|rl_zoo3|skrl|torchrl|trl)\b"
     r"| +import gym_pusht|    \"placement\": \"ray\")"
 )
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)

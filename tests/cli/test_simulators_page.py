@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.simulators
 
 PAGE = (TESTS.parent / "docs" / "simulators.md").read_text()
+EXAMPLES = TESTS.parent / "examples"
 
 
 def blocks(language: str, section: str) -> list[str]:
@@ -37,11 +39,9 @@ def test_the_programs_run(section: str, modules: list[str], tmp_path: Path) -> N
 
 
 def test_metaworld_ends_in_a_table_of_success(tmp_path: Path) -> None:
-    """With the page's env, policies and command, on fewer seeds, and without the plot."""
+    """With the example's env and the page's command, on fewer seeds, and without the plot."""
     pytest.importorskip("metaworld")
-    env, policies = blocks("python", "MetaWorld")
-    (tmp_path / "my_metaworld.py").write_text(env)
-    (tmp_path / "my_policies.py").write_text(policies)
+    shutil.copy(EXAMPLES / "metaworld_env.py", tmp_path)
     (tmp_path / "arm.yaml").write_text(*blocks("yaml", "MetaWorld"))
     (command,) = blocks("console", "MetaWorld")
     line = command.replace("\\\n", "").strip().replace(" --plot success.png", "")
@@ -54,14 +54,11 @@ def test_metaworld_ends_in_a_table_of_success(tmp_path: Path) -> None:
     assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 1 + 6
 
 
-def test_a_seed_of_metaworld_decides_an_episode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_seed_of_metaworld_decides_an_episode(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the env has played before."""
     pytest.importorskip("metaworld")
-    (tmp_path / "my_metaworld.py").write_text(blocks("python", "MetaWorld")[0])
-    monkeypatch.syspath_prepend(tmp_path)
-    from my_metaworld import MetaWorld  # type: ignore[import-not-found]
+    monkeypatch.syspath_prepend(EXAMPLES)
+    from metaworld_env import MetaWorld  # type: ignore[import-not-found]
 
     one, other = MetaWorld(), MetaWorld()
     other.reset(seed=9, options={"task": "push-v3"})
@@ -76,5 +73,4 @@ def test_a_seed_of_metaworld_decides_an_episode(
 
 def test_the_env_of_libero_is_a_program() -> None:
     """It is not run: LIBERO's packages go with no others."""
-    (program,) = blocks("python", "LIBERO")
-    compile(program, "my_libero.py", "exec")
+    compile((EXAMPLES / "libero_env.py").read_text(), "libero_env.py", "exec")

@@ -22,8 +22,6 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("migrating#RLlib", ["ray", "tree", "torch"]),
         ("migrating#RL Zoo", ["rl_zoo3"]),
         ("migrating#skrl", ["skrl"]),
-        ("migrating#Tianshou", ["tianshou"]),
-        ("migrating#SkyRL", ["skyrl_gym"]),
         ("metrics", ["wandb", "prometheus_client"]),
     ],
 )
@@ -47,6 +45,14 @@ def test_programs_run(
         program.write_text(block)
         outputs.append(output_of(program, folder=tmp_path))
     assert "".join(outputs).strip()
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize("name", ["tianshou", "skyrl"])
+def test_examples_for_other_libraries_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each runs to its end, and prints something."""
+    pytest.importorskip({"skyrl": "skyrl_gym"}.get(name, name))
+    assert output_of(DOCS.parent / "examples" / f"{name}_env.py").strip()
 
 
 DYING = """
