@@ -394,11 +394,23 @@ def test_an_aborted_reset_stops_the_arm(arm: Any, log: Path) -> None:
         assert "stop" in lines(log)
 
 
+class InHalves(Arm):
+    """Its step is in two halves."""
+
+    def step_async(self, policy_resp: PolicyResponse) -> None:
+        self.result = self.step(policy_resp)
+
+    def collect_async(self, timeout: Any = None) -> EnvRet:  # type: ignore[override]
+        return self.result
+
+
+@pytest.mark.parametrize("kind", [Arm, InHalves])
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_program_that_sends_no_action_in_time_stops_the_arm(
-    arm: Any, log: Path, placement: str
+    arm: Any, log: Path, placement: str, kind: type[Arm]
 ) -> None:
     """With action_timeout, for robots that go on moving without one."""
+    ENVS.register("test arm", hardware=True)(kind)
     with sync.build_env_group(arm(placement, action_timeout=0.2)) as group:
         batch, _ = group.reset()
         wait_for(log, "stop")
@@ -406,7 +418,11 @@ def test_a_program_that_sends_no_action_in_time_stops_the_arm(
             group.step(batch.respond(action=np.zeros((1, 2))))
         batch, _ = group.reset()
         group.step(batch.respond(action=np.zeros((1, 2))))
-    assert lines(log)[:4] == ["reset", "stop", "reset", "step [0.0, 0.0]"]
+        wait_for(log, "step [0.0, 0.0]")
+        before = len(lines(log))
+        while len(lines(log)) == before:
+            time.sleep(0.01)
+    assert lines(log)[:5] == ["reset", "stop", "reset", "step [0.0, 0.0]", "stop"]
 
 
 class Slow:

@@ -14,7 +14,7 @@ from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.envs.fast_path import FastPath
-from rlightning_aio.envs.results import has_preprocess_fn, input_of, is_awaitable, step_of
+from rlightning_aio.envs.results import has_preprocess_fn, input_of, is_async_first, is_awaitable
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.protocol.bounds import out_of_bounds
 from rlightning_aio.protocol.columns import Misfit, fitted_tree, leaves
@@ -178,7 +178,8 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
         raise ConfigError(f"{where}: should be a number of seconds above 0, not {seconds!r}")
     if is_awaitable(env):
         raise ConfigError(f"{where}: an awaitable env can't have it")
-    reset, step, close = env.reset, step_of(env), env.close
+    step_name = "step_async" if is_async_first(env) else "step"
+    reset, step, close = env.reset, getattr(env, step_name), env.close
     due, expired = math.inf, False
 
     def timed_reset(**arguments: Any) -> Any:
@@ -212,7 +213,8 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
         return close()
 
     changed: Any = env
-    changed.reset, changed.step, changed.close = timed_reset, timed_step, timed_close
+    changed.reset, changed.close = timed_reset, timed_close
+    setattr(env, step_name, timed_step)
     if isinstance(env, FastPath):
         changed.bare_step = changed.bare_reset = lambda: None
     end = watched(late)

@@ -29,9 +29,10 @@ def limits_of(config: EnvConfig) -> dict[int, float]:
 
 def close_seconds(config: EnvConfig, *, awaits: bool) -> float:
     """Return how long a host may take to close its envs, which are awaitable or not, and to end."""
-    if config.close_timeout is not None:
-        return config.close_timeout + _CANCEL_SECONDS
-    return AWAITED_CLOSE_SECONDS + _CANCEL_SECONDS if awaits else _CLOSE_SECONDS
+    seconds = config.close_timeout
+    if awaits:
+        return (AWAITED_CLOSE_SECONDS if seconds is None else seconds) + _CANCEL_SECONDS
+    return _CLOSE_SECONDS if seconds is None else seconds
 
 
 def restart_pause(losses: int) -> float:

@@ -155,7 +155,7 @@ class EnvGroup:
             if self._local:
                 options = {ARGUMENTS: (args, kwargs)} if args or kwargs else None
                 rows += self._rows(self._group.reset(options=options, env_ids=self._local)[0])
-            rows += self._first_results(kwargs.get("seed"), kwargs.get("options"))
+            self._add_first_results(rows, kwargs.get("seed"), kwargs.get("options"))
         return _batch_and_flags(rows)
 
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:
@@ -245,17 +245,18 @@ class EnvGroup:
 
     # -- results
 
-    def _first_results(self, seed: Any, options: Any) -> list[_Row]:
+    def _add_first_results(self, rows: list[_Row], seed: Any, options: Any) -> None:
         """Reset clients, and wait for the first of those that are there, or that come."""
         if not self._places:
-            return []
+            return
         pending = set(self._group.pending)
         if idle := [place for place in self._places if place not in pending]:
             self._group.reset_async(seed=seed, options=options, env_ids=idle)
-        rows, self._kept = self._kept, []
-        while not rows or _owing(self._group).intersection(idle):
+        num_local = len(rows)
+        rows += self._kept
+        self._kept = []
+        while len(rows) == num_local or _owing(self._group).intersection(idle):
             rows += self._rows(self._group.collect_async()[0])
-        return rows
 
     def _local_pending(self) -> set[str]:
         return set(self._group.pending).intersection(self._local)

@@ -15,7 +15,6 @@ from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.envs.hardware import stop
 from rlightning_aio.protocol.entries import answers_with_value
-from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
@@ -88,5 +87,5 @@ class AwaitedRunner(EnvRunner):
             arguments = self.reset_with
         seed, options = chosen = super()._seed_and_options(arguments)
         if not (options and "reset_mask" in options):  # It begins no episode of the whole env.
-            self.reset_with = seed, copied(options)
+            self.reset_with = seed, arguments[1] if arguments else None
         return chosen
