@@ -27,6 +27,7 @@ import multiprocessing
 import random
 import time
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from harness import machine_facts
@@ -108,18 +109,14 @@ async def asked(port: int, *words: str) -> Any:
 
 
 class Sandbox:
-    """One of the server, of which one is broken; its observation is the number of its session."""
+    """One of the server, ``whole`` or ``broken``; its observation is the number of its session."""
 
-    broken: Sandbox | None = None
-
-    def __init__(self, port: int) -> None:
-        self.port, self.session = port, ""
-        Sandbox.broken = Sandbox.broken or self
+    def __init__(self, port: int, kind: str) -> None:
+        self.port, self.kind, self.session = port, kind, ""
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
-        await self.delete()
-        kind = "broken" if Sandbox.broken is self else "whole"
-        self.steps, self.session = 0, await asked(self.port, "create", kind)
+        await self.close()
+        self.steps, self.session = 0, await asked(self.port, "create", self.kind)
         return self.session, {}
 
     async def step(self, action: Any) -> Any:  # noqa: ARG002
@@ -127,18 +124,13 @@ class Sandbox:
         reward = await asked(self.port, "step", self.session)
         return self.session, reward, self.steps == STEPS, False, {}
 
-    async def delete(self) -> None:
+    async def close(self) -> None:
         while self.session:  # Whatever it takes: a sandbox costs money.
             try:
                 await asked(self.port, "delete", self.session)
                 self.session = ""
             except EnvError:
                 await asyncio.sleep(0.2)
-
-    async def close(self) -> None:
-        if Sandbox.broken is self:  # The one that takes its place is.
-            Sandbox.broken = None
-        await self.delete()
 
 
 async def agent(episode: Any) -> str:
@@ -150,9 +142,10 @@ async def agent(episode: Any) -> str:
 async def in_sandboxes(port: int, number: int, blocked: float) -> dict[str, Any]:
     """Play all attempts, and compare them with the ledger."""
     groups, began = list[Any](), time.monotonic()
-    limits = {"step_timeout": 2.0, "reset_timeout": 10.0, "max_restarts": 100}
-    fields: dict[str, Any] = {"placement": "loop", "env_kwargs": {"port": port}, **limits}
-    async with rl.build_env_group(Sandbox, num_workers=SANDBOXES, **fields) as group:
+    limits: dict[str, Any] = {"step_timeout": 2.0, "reset_timeout": 10.0, "max_restarts": 100}
+    kinds = ["broken", *["whole"] * (SANDBOXES - 1)]
+    boxes = [partial(Sandbox, port, kind) for kind in kinds]
+    async with rl.build_env_group(boxes, placement="loop", **limits) as group:
         specs = (EpisodeSpec("", seed) for seed in range(number))
         async for attempts in play(group, specs, agent, SIZE, Rules(attempt_timeout=20)):
             time.sleep(blocked)  # noqa: ASYNC251  # The update of the weights.

@@ -318,6 +318,42 @@ def test_all_that_waited_are_charged_an_attempt_where_no_env_is_at_fault(
     assert played == [task for task in "123" if task not in charged]
 
 
+class Poisoned:
+    """The second step of seed 1 ends its worker, while all envs in that wait."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.seed, self.steps = seed, 0
+        return 0, {}
+
+    async def step(self, action: Any) -> Any:
+        self.steps += 1
+        if (self.seed, self.steps) == (1, 2):
+            asyncio.get_running_loop().call_later(0.02, os._exit, 3)
+            await asyncio.Event().wait()
+        await asyncio.sleep(0.01)
+        return 0, 1.0, self.steps == 4, False, {}
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+def test_what_was_executed_in_a_worker_that_died_is_played_again_alone(pinned: bool) -> None:
+    """So the second death names the task."""
+    with sync.build_env_group(Poisoned, num_workers=4, envs_per_process=2) as group:
+        ids = group.env_ids if pinned else [""]
+        queue = [EpisodeSpec("", k, env_id=ids[k % len(ids)]) for k in range(12)]
+        found = evaluate(group, None, queue, min_results=1)
+    (failed,) = found.failed
+    assert [one.blame for one in (*failed.failures, failed.outcome)][:2] == [
+        "infrastructure",
+        "env",
+    ]
+    assert failed.spec.seed == 1
+    assert {one.spec.seed for one in found.played} == {*range(12)} - {1}
+    assert all(len(one.failures) <= 1 for one in found.played)
+
+
 @pytest.mark.parametrize("together", [1, 2])
 def test_an_env_whose_worker_is_not_replaced_leaves(together: int) -> None:
     """The others play its episodes; with no env left the evaluation ends in the error."""

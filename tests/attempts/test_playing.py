@@ -378,8 +378,9 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
         await episode.step("die")
 
     async with rooms(PLACES["workers"], num_workers=2, on_worker_death="raise") as group:
-        with pytest.raises(rl.WorkerDied):
+        with pytest.raises(rl.WorkerDied) as caught:
             await played(group, tasks(9), agent, 2, Rules(retries=retries))
+    assert any("it played attempt" in note and "seed=" in note for note in caught.value.__notes__)
 
 
 async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:

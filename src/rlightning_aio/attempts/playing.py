@@ -296,6 +296,7 @@ class _Engine:
         attempt = ended.result()
         if isinstance(one.error, WorkerDied):
             queue.fault = one.error
+            one.error.add_note(f"it played attempt {job.index} at {job.spec}")
         queue.players.note(attempt.outcome)
         if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
             queue.free[one.env_id] = None
