@@ -5,12 +5,14 @@ more than 10,000 actions are sent, and `pytest -s` prints how many. No request h
 time of one is up when a rule says so, or when the server will never answer it.
 """
 
+# pyright: reportPrivateUsage=false
+
 from __future__ import annotations
 
 import asyncio
 import math
 import os
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from envs.misbehaving_openenv import CONNECT_ERRORS, FATES, Misbehaving, numbers
@@ -26,12 +28,12 @@ from hypothesis.stateful import (
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio._core.hosts.awaiting import awaited_envs
+from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.plugins.openenv import session as openenv_session
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
 ENVS = 4
 CAUSES = (".ServerGone", ".ServerRefused")
@@ -43,28 +45,15 @@ def chosen(env_ids: list[str], which: set[int]) -> list[str]:
     return [env_ids[k] for k in sorted({k % len(env_ids) for k in which})] if env_ids else []
 
 
-class Patience:
-    """In place of `TimeLimit`: the time of a request is up when the test says so."""
+made: list[AwaitedEnvs] = []
+"""The envs of groups, as they are made."""
 
-    made: ClassVar[list[Patience]] = []
 
-    def __init__(self, seconds: float, expire: Callable[[Any, float], None]) -> None:
-        self.seconds = seconds
-        self._expire = expire
-        self._running: dict[str, tuple[Any, int]] = {}
-        self.made.append(self)
-
-    def begin(self, env: Any, loop: asyncio.AbstractEventLoop) -> None:
-        del loop
-        self._running[env.name] = env, env.entry
-
-    def end(self) -> None:
-        self._running.clear()
-
-    def give_up_on(self, env_id: str) -> None:
-        env, entry = self._running.pop(env_id, (None, 0))
-        if env is not None and env.entry == entry:
-            self._expire(env, self.seconds)
+def give_up_on(envs: AwaitedEnvs, env_id: str) -> None:
+    """Let the time be up of the request that an env executes, if it does."""
+    for record in envs._records:  # noqa: SLF001
+        if record.name == env_id and record.due < math.inf:
+            envs._expire(record)  # noqa: SLF001
 
 
 class Machine(RuleBasedStateMachine):
@@ -101,7 +90,7 @@ class Machine(RuleBasedStateMachine):
         entry |= {"placement": "loop", "step_timeout": HANG, "max_restarts": 10**6}
         self.group = rl.build_env_group(entry)
         await self.group.init()
-        self.patience = Patience.made.pop()
+        self.envs = made.pop()
         self.resetting = self.group.auto_reset(math.inf)
         self.resetting.__enter__()
         await self.group.reset()
@@ -149,12 +138,12 @@ class Machine(RuleBasedStateMachine):
 
     async def _give_up_on_steps(self, ids: list[str]) -> None:
         for env_id in ids:
-            self.patience.give_up_on(env_id)
+            give_up_on(self.envs, env_id)
 
     def _give_up_on(self, number: int) -> None:
         """Let the time be up of a step that is never answered."""
         for env_id in [i for i, asked in self.asked.items() if asked == number]:
-            self.patience.give_up_on(env_id)
+            give_up_on(self.envs, env_id)
 
     @rule(count=st.integers(1, ENVS))
     def collect(self, count: int) -> None:
@@ -247,7 +236,13 @@ class Machine(RuleBasedStateMachine):
 @pytest.mark.filterwarnings("ignore:close.. of env .* took longer")
 def test_whatever_a_server_does_each_request_ends_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No reply answers another request, no action runs twice, no slot leaks, all envs recover."""
-    monkeypatch.setattr(awaited_envs, "TimeLimit", Patience)
+    make = AwaitedEnvs.__init__
+
+    def noted(envs: AwaitedEnvs, *args: Any, **kwargs: Any) -> None:
+        made.append(envs)
+        make(envs, *args, **kwargs)
+
+    monkeypatch.setattr(AwaitedEnvs, "__init__", noted)
     monkeypatch.setattr(openenv_session, "_KEEPALIVE_SECONDS", 0.002)
     monkeypatch.setattr(openenv_session, "_PAUSE_SECONDS", (0.001, 0.01))
     steps = int(os.environ.get("RLIGHTNING_AIO_STEPS", "20"))
