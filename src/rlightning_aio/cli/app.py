@@ -18,8 +18,6 @@ from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.protocol import kernel
 
-__all__ = ["app"]
-
 app = typer.Typer(
     rich_markup_mode="markdown",
     name="rlightning-aio",

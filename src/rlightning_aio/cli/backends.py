@@ -11,8 +11,6 @@ from rlightning_aio.cli.options import AsJson
 from rlightning_aio.cli.terminal import named_columns, print_json, print_table
 from rlightning_aio.registry import BACKENDS, Backend, plugins
 
-__all__ = ["backends"]
-
 
 @dataclass(frozen=True, slots=True)
 class _Row:

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio.cli.measuring import Stand
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Baseline", "baselines_of", "opened_baseline"]
-
 _PLAIN: Final = ("gymnasium", "mujoco")
 """Backends whose envs are those of `gymnasium.make`, unchanged."""
 _MANY: Final = 128

@@ -59,8 +59,6 @@ if TYPE_CHECKING:
     from rlightning_aio.cli.measuring import Place, Stand
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["bench"]
-
 _NOTE: Final = 1024
 """Bytes of the text that says what the child does."""
 

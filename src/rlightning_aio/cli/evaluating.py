@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.evaluation import Estimate
 
-__all__ = ["evaluation"]
-
 _RANDOM: Final = "random"
 _NAMED: Final = 5
 """Number of failed episodes that a message names."""

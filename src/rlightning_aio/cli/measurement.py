@@ -22,14 +22,6 @@ from rlightning_aio.sharing import num_cores
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-__all__ = [
-    "Figures",
-    "family",
-    "in_turns",
-    "machine_facts",
-    "memory_bytes",
-]
-
 C = TypeVar("C")
 _ALWAYS_USED: Final = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
 

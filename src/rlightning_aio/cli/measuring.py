@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Contender", "Place", "Round", "Rule", "Stand", "as_round", "opened_group"]
-
 
 @dataclass(frozen=True)
 class Rule:

@@ -9,8 +9,6 @@ import typer
 
 from rlightning_aio.errors import ConfigError
 
-__all__ = ["AsJson", "Config", "Overrides", "PlotFile", "PolicyName", "Seed", "check_seed"]
-
 _LAST_SEED: Final = 2**61
 """Further seeds count up from a given one, and all must be below 2**62."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from rlightning_aio.cli.measuring import Contender
     from rlightning_aio.evaluation import Estimate, Evaluation
 
-__all__ = ["check_plot", "draw_contenders", "draw_evaluation"]
-
 _KINDS: Final = (".png", ".svg", ".pdf")
 
 

@@ -34,15 +34,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.cli.terminal import Progress
 
-__all__ = [
-    "PolicyRaised",
-    "Responder",
-    "load_policy",
-    "respond_to_all",
-    "servers_announced",
-    "steps_in",
-]
-
 Policy: TypeAlias = Callable[[BatchedData], Any]
 
 _PACKAGE: Final = str(Path(__file__).parents[1])

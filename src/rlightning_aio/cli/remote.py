@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["client", "keygen"]
-
 
 def client(
     config: Annotated[Path, typer.Argument(help="YAML file with one entry", show_default=False)],

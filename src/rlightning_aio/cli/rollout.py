@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["rollout"]
-
 _ENDLESS: Final = 2**62
 _STEPS: Final = 10_000
 """Default number of steps."""

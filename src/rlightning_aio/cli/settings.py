@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["Setting", "possible_settings", "swept_settings"]
-
 _MANY_WORKERS: Final = 32
 """Largest number of workers to try; starting more takes too long."""
 

@@ -25,30 +25,10 @@ from rich.table import Table
 import rlightning_aio
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
 from rlightning_aio.json_text import json_of
-from rlightning_aio.protocol.net.texts import LOG
+from rlightning_aio.protocol.error_text import LOG
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
-
-__all__ = [
-    "INTERRUPTED",
-    "Progress",
-    "connections_logged",
-    "count",
-    "counted",
-    "duration",
-    "exit_code_of",
-    "guarded",
-    "handling",
-    "in_words",
-    "interruptible",
-    "named_columns",
-    "number",
-    "print_json",
-    "print_lines",
-    "print_table",
-    "run_interruptible",
-]
 
 INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as in shells."""

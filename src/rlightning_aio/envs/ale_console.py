@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from typing import Any, Final
 
-__all__ = ["StickyConsole", "is_sticky"]
-
 _CERTAIN: Final = 1e-15
 """Accepted probability that the console never executes an action given to it repeatedly."""
 _FRAMES_BETWEEN_STATES: Final = 128

@@ -30,16 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.fast_path import BareResult
 
-__all__ = [
-    "Answer",
-    "BaseEnv",
-    "PreprocessFn",
-    "Result",
-    "initialised",
-    "result_of",
-    "sub_env_seeds",
-]
-
 PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
 Answer = Result | Awaitable[Result]

@@ -9,14 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-__all__ = [
-    "BareReset",
-    "BareResult",
-    "BareStep",
-    "FastPath",
-    "fast_path_of",
-]
-
 BareReset = Callable[..., tuple[Any, dict[str, Any]]]
 BareResult = tuple[Any, Any, Any, Any, dict[str, Any]]
 BareStep = Callable[[Any], BareResult]

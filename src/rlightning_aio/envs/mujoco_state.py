@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["load_data", "load_model", "save_data", "save_model"]
-
 _COMPILED: Final = (
     "tex_", "mesh_", "hfield_", "skin_", "flex", "name_", "names", "text", "tuple_", "paths",
     "oct_", "plugin", "vis", "stat", "B_", "D_", "M_", "map",

@@ -15,8 +15,6 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = ["load_named", "read_options"]
-
 Options = TypeVar("Options", bound=BaseModel)
 
 

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Pace"]
-
 
 class Pace:
     """Deadlines at a fixed rate, on the monotonic clock.

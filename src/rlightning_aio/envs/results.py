@@ -27,16 +27,6 @@ from rlightning_aio.types import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = [
-    "has_preprocess_fn",
-    "input_of",
-    "is_async_first",
-    "is_awaitable",
-    "one_result",
-    "reads_extras",
-    "step_of",
-]
-
 
 def has_preprocess_fn(env: BaseEnv) -> bool:
     """Return True if actions of `env` pass through a function of the user."""

@@ -1,4 +1,4 @@
-"""The wrappers of a Gymnasium environment."""
+"""The wrappers of a Gymnasium environment, found and put on."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from rlightning_aio.registry import is_of_simulator
 
-__all__ = ["ClassName", "autoreset_mode_of", "has_wrapper", "metadata_of", "name_of", "wrappers_of"]
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from gymnasium.envs.registration import EnvSpec
 
 ClassName: TypeAlias = tuple[str, str]
 """A class's module and qualified name. To send the class would import its module in the worker."""
@@ -77,3 +79,30 @@ def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:
     while isinstance(env, gym.Wrapper):
         yield cast("gym.Wrapper[Any, Any, Any, Any]", env)
         env = cast("Any", env).env
+
+
+class OneOf:
+    """Makes one env, in wrappers, also in a worker that does not have the task registered.
+
+    In messages it has the name of the task.
+
+    Args:
+        spec: of the task.
+        kwargs: of `gymnasium.make`.
+        wrappers: the first innermost.
+    """
+
+    def __init__(
+        self,
+        spec: EnvSpec,
+        kwargs: dict[str, Any],
+        wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
+    ) -> None:
+        self._spec, self._kwargs, self._wrappers = spec, kwargs, wrappers
+        self.__qualname__, self.computes = spec.id, is_of_simulator(spec)
+
+    def __call__(self) -> gym.Env[Any, Any]:
+        env: gym.Env[Any, Any] = gym.make(self._spec, **self._kwargs)
+        for wrap in self._wrappers:
+            env = wrap(env)
+        return env

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["answers_of", "check_policies", "parts_by_policy"]
-
 
 def check_policies(entries: Iterable[str], policies: Mapping[str, object]) -> None:
     """Check that each of some entries has a policy.

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["ActionChunks"]
-
 
 @dataclass(slots=True)
 class _Left:

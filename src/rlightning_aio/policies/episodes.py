@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["begins", "begins_of_envs"]
-
 
 def begins(batch: BatchedData) -> NDArray[np.bool_]:
     """Return True where an episode begins; shaped like `BatchedData.is_reset`.

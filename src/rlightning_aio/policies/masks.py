@@ -18,8 +18,6 @@ from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["allowed_action", "can_be_masked", "has_masks"]
-
 
 def can_be_masked(space: gym.Space[Any]) -> bool:
     """Return True if actions of `space`, or of an agent in it, are discrete."""

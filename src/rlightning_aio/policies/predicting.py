@@ -12,8 +12,6 @@ from rlightning_aio.trees import mapped
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["Model", "PredictPolicy"]
-
 
 class Model(Protocol):
     """A model that predicts actions, as `PredictPolicy` asks it to."""

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["RandomPolicy", "sampler_of"]
-
 Sampler: TypeAlias = "Callable[[int], Any]"
 
 _UNBOUNDED = 0.2

@@ -1,13 +1,23 @@
-"""`ErrorText`: an exception as it travels to another process."""
+"""`ErrorText`: an exception as it travels to another process; and texts of peers, safe to show.
+
+Rule: no text of a peer reaches a terminal unchanged. Characters that can't be printed (escapes, and
+those that reorder a line) become Python's escapes, and a text that is too long loses its middle.
+"""
 
 from __future__ import annotations
 
+import logging
 import traceback
 from dataclasses import dataclass
 from typing import Any, Final
 
 from rlightning_aio.outcomes import BLAMES
 from rlightning_aio.protocol.entries import answers_with_value
+
+LOG: Final = logging.getLogger("rlightning_aio.remote")
+"""Of both ends of env_server."""
+_ONE_LINE: Final = 1000
+_LINES: Final = 100_000
 
 
 @dataclass(frozen=True)
@@ -88,3 +98,28 @@ _TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
 def _plain(text: str) -> str:
     """Return `text` as a plain `str`: other processes may lack its subclass."""
     return str.__str__(text)
+
+
+def in_one_line(text: str) -> str:
+    """Return `text` without control characters and line ends, at most about 1,000 characters."""
+    return _printable(text, "", _ONE_LINE, " … ")
+
+
+def in_lines(text: str) -> str:
+    """Return a traceback without control characters, with its lines, at most 100,000 characters."""
+    return _printable(text, "\n\t", _LINES, "\n…\n")
+
+
+def _cut(text: str, most: int, gap: str) -> str:
+    return text if len(text) <= most else text[: most // 2] + gap + text[-(most // 2) :]
+
+
+def _printable(text: str, kept: str, most: int, gap: str) -> str:
+    text = _cut(text, most, gap)
+    if text.isprintable():
+        return text
+    printable = (
+        char if char.isprintable() or char in kept else char.encode("unicode_escape").decode()
+        for char in text
+    )
+    return _cut("".join(printable), most, gap)

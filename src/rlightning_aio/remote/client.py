@@ -40,7 +40,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.simulators.callable import env_of_callable
 from rlightning_aio.errors import ClientRefused, ConfigError
-from rlightning_aio.protocol.error_text import ErrorText
+from rlightning_aio.protocol.error_text import LOG, ErrorText
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Phase,
@@ -51,7 +51,6 @@ from rlightning_aio.protocol.net.client_session import (
 )
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
-from rlightning_aio.protocol.net.texts import LOG
 from rlightning_aio.protocol.net.wire import (
     DEFAULT_HEARTBEAT,
     HANDSHAKE_SECONDS,

@@ -27,7 +27,7 @@ from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import write_file
-from rlightning_aio.protocol.net.texts import in_one_line
+from rlightning_aio.protocol.error_text import in_one_line
 
 if TYPE_CHECKING:
     import os

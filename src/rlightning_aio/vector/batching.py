@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = ["batched", "merged", "replaced", "spread"]
-
 
 def batched(space: gym.Space[Any], observations: Any) -> Any:
     """Convert lists of observations that can't be stacked to tuples, as Gymnasium does."""

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["Stepped", "with_deaths"]
-
 _CAUSE: Final = ("worker_restarted", "env_at_fault", "outcome")
 """Keys of an info that say why its env was restarted, and who was at fault."""
 

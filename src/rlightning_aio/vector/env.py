@@ -49,8 +49,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["VectorEnv", "per_worker"]
-
 T = TypeVar("T")
 
 

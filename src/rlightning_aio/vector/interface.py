@@ -9,8 +9,6 @@ from typing import Any, Final
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-__all__ = ["CalledEnvs", "check_free", "check_name", "check_running", "check_sent"]
-
 _NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
 
 

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["LazyColumns", "LazyInfos"]
-
 _OF_BOTH: Final = (
     "__contains__", "__delitem__", "__eq__", "__ge__", "__getitem__", "__gt__", "__iter__",
     "__le__", "__len__", "__lt__", "__ne__", "__repr__", "__reversed__", "__setitem__", "clear",

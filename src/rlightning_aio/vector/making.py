@@ -15,9 +15,9 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.mujoco.of_spec import OneOf
 from rlightning_aio.envs.mujoco.tasks import is_batched
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted, spec_of
+from rlightning_aio.envs.wrappers import OneOf
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import is_mujocos, name_of
 from rlightning_aio.sharing import check_threads
@@ -30,15 +30,6 @@ if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
 
     from rlightning_aio.vector.mujoco import MujocoVectorEnv
-
-__all__ = [
-    "batch_of",
-    "imports_of",
-    "is_brief",
-    "make_vec",
-    "steps_together",
-    "vector_entry_point",
-]
 
 Made = TypeVar("Made", bound="gym.vector.VectorEnv[Any, Any, Any]")
 _OF_EVERY_VECTOR_ENV: Final = {"autoreset_mode", "shared_memory", "copy", "context", "daemon"}

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from gymnasium.vector import AutoresetMode
     from numpy.typing import NDArray
 
-__all__ = ["MujocoVectorEnv"]
-
 
 # skrl looks for Gymnasium among the bases themselves.
 class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_random`.

@@ -13,14 +13,6 @@ from rlightning_aio._core.group.state.episodes import checked_seed
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "checked_mask",
-    "checked_mode",
-    "mask_and_options",
-    "options_of_envs",
-    "seeds_of_envs",
-]
-
 
 def checked_mode(mode: Any) -> AutoresetMode:
     """Return an autoreset mode that was given as one of Gymnasium's members, or as its value.

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["adopted_spaces"]
-
 Space = Any
 
 

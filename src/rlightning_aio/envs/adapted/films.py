@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["RECORD_VIDEO", "record"]
-
 RECORD_VIDEO: Final = "record_video"
 
 

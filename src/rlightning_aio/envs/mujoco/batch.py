@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.mujoco.outputs import StepArrays
     from rlightning_aio.envs.mujoco.task import Task
 
-__all__ = ["FAILED", "MujocoBatch"]
-
 # Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
 

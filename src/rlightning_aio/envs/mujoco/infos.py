@@ -11,8 +11,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.envs.mujoco.task import Columns
 
-__all__ = ["Begun", "Finished", "of_step"]
-
 Infos = dict[str, Any]
 
 

@@ -27,20 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = [
-    "AdvancePlan",
-    "FieldPart",
-    "Noise",
-    "Outputs",
-    "StepArrays",
-    "Terms",
-    "address_of",
-    "compiled",
-    "inline_offset_of",
-    "live_timestep",
-    "offset_of",
-]
-
 _MOST_PARTS: Final = 32
 _MOST_KNOWN: Final = 6
 # Without the GIL, another thread may be about to take a reference.

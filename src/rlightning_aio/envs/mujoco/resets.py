@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["can_draw", "drawn", "generator_of", "noise_of"]
-
 
 def can_draw(scale: Any) -> bool:
     """Return True if `drawn` takes this scale; Gymnasium refuses some others."""

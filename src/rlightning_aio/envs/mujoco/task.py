@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.mujoco.outputs import FieldPart, StepArrays
     from rlightning_aio.envs.mujoco.threads import Simulations
 
-__all__ = ["Columns", "Task", "lengths"]
-
 Columns = Callable[[], dict[str, Any]]
 """Makes infos of several simulations, from values that don't change later."""
 

@@ -34,8 +34,6 @@ from rlightning_aio.envs.mujoco.outputs import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["Simulations"]
-
 # Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
 

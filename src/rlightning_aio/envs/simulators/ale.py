@@ -25,8 +25,6 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from rlightning_aio.types import EnvRet
 
-__all__ = ["ALEEnv"]
-
 # Optional and untyped, so imported by name; importing it registers the games.
 ale_py: Any = import_module("ale_py")
 # Otherwise each game that starts prints a banner.

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import EnvRet, PolicyResponse
 
-__all__ = ["env_of_callable"]
-
 
 def env_of_callable(
     config: EnvConfig, worker_index: int = 0, preprocess_fn: PreprocessFn | None = None

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.wrappers import ClassName
 
-__all__ = ["GymnasiumEnv", "MujocoEnv", "outdated_assets_accepted", "spec_of"]
-
 
 class GymnasiumEnv(FastPath, BaseEnv):
     """A Gymnasium environment, or ``num_envs`` of them; ``env_kwargs`` go to `gymnasium.make`.

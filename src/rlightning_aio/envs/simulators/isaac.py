@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["IsaacManagerBasedEnv", "IsaacMarlEnv"]
-
 
 class _IsaacEnv(BaseEnv):
     """The shared part of both backends: construction, seeds, conversion of actions and results.

@@ -25,8 +25,6 @@ from rlightning_aio.registry import BACKENDS, did_you_mean
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["IsaacOptions", "make_simulator"]
-
 ANY_SEED = -1
 """Isaac Lab draws a seed where it finds this one."""
 

@@ -23,8 +23,6 @@ from rlightning_aio.types import EnvRet, PolicyResponse
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["ManiskillEnv"]
-
 if not render_device_is_usable():
     do_without_materials()
 # Optional and untyped, so imported by name; importing mani_skill.envs registers the tasks.

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["PettingZooEnv"]
-
 DEFAULT_FACTORY = "parallel_env"
 
 # Partly typed, so imported by name.

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["do_without_materials", "render_device_is_usable"]
-
 PROBE = "import sapien.render; sapien.render.RenderMaterial()"
 PROBE_TIMEOUT = 60.0
 

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rlightning_aio.protocol.error_text import ErrorText
+from rlightning_aio.protocol.error_text import LOG, ErrorText, in_one_line
 from rlightning_aio.protocol.net.payload import Packed, ResultFields, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe
-from rlightning_aio.protocol.net.texts import LOG, in_one_line
 from rlightning_aio.protocol.net.wire import (
     VERSION,
     Bye,

@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 from rlightning_aio.errors import BadAction
 from rlightning_aio.outcomes import BLAMES
 from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.error_text import ErrorText
+from rlightning_aio.protocol.error_text import LOG, ErrorText, in_lines, in_one_line
 from rlightning_aio.protocol.net.announcements import Rejection, announced
 from rlightning_aio.protocol.net.payload import Packed
-from rlightning_aio.protocol.net.texts import LOG, in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
     DEFAULT_HEARTBEAT,
     HARDWARE_HEARTBEAT,

@@ -15,7 +15,7 @@ import zmq
 from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descriptor_set
 from rlightning_aio._core.hosts.env_server.authenticator import Authenticator
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.protocol.net.texts import LOG
+from rlightning_aio.protocol.error_text import LOG
 from rlightning_aio.protocol.net.wire import (
     DEFAULT_HEARTBEAT,
     HANDSHAKE_SECONDS,
