@@ -209,7 +209,10 @@ class BaseEnv(abc.ABC):
             torch.cuda.empty_cache()
 
     def is_finish(self) -> bool:
-        """Return True to end `RemoteEnvClient.run`; called after every reset and step."""
+        """Return True to end `RemoteEnvClient.run`.
+
+        Called after every reset, step and `on_disconnect`, and not before.
+        """
         return False
 
     def on_disconnect(self) -> None:
@@ -219,7 +222,8 @@ class BaseEnv(abc.ABC):
         """Stop what this env moves, at once. Default: `on_disconnect`.
 
         Called of hardware only (see `Registry.register`): after a `reset` or `step` has raised or
-        its result was refused, when an action is refused, and when the trainer is gone or ends.
+        its result was refused, when an action is refused, when the trainer is gone or ends, and
+        before it is closed.
         It may be called from another thread while `reset` or `step` is at work, and again and
         again until that returns; what is at work should raise then.
         """

@@ -28,7 +28,7 @@ class Cameras:
         self._read, self._timeout = read, timeout
         self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[dict[str, Any] | BaseException] = queue.SimpleQueue()
-        self._num_missed = 0
+        self._num_owed = 0
         Thread(target=self._serve, name="cameras", daemon=True).start()
 
     def _serve(self) -> None:
@@ -47,7 +47,7 @@ class Cameras:
         """
         due = time.monotonic() + self._timeout
         self._asked.put(True)
-        self._num_missed += 1
+        self._num_owed += 1
         while True:
             try:
                 answer = self._answers.get(timeout=max(0.0, due - time.monotonic()))
@@ -55,8 +55,8 @@ class Cameras:
                 raise TimeoutError(
                     f"cameras.read returned no images within {self._timeout:g} s (camera_timeout)"
                 ) from None
-            self._num_missed -= 1
-            if not self._num_missed:  # Others are of calls that have given up.
+            self._num_owed -= 1
+            if not self._num_owed:  # Others are of calls that have given up.
                 break
         if isinstance(answer, BaseException):
             raise answer

@@ -241,12 +241,12 @@ class EnvServerHost(Host):
             return
         self._entry, self._since_ns = int(entries[0]), time.monotonic_ns()
         sessions = self.server.sessions
-        if op_of(self._entry) == Operation.STEP:
-            action, extras = given or STEP_IN_ROW
-            sessions.step(self._place, self._action(action), extras)
-        else:
+        if is_reset:
             self._reset, self._lost_reset = given or self._lost_reset, (None, None)
             sessions.reset(self._place, *self._reset)
+        else:
+            action, extras = given or STEP_IN_ROW
+            sessions.step(self._place, self._action(action), extras)
         self.server.flush()
 
     def _action(self, given: Any) -> Any:

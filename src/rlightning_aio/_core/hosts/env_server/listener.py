@@ -145,7 +145,7 @@ class Listener:
         context, self._context = self._context, None
         if self._address is not None:
             self._sessions.close("the trainer closed its group")
-            self._send()
+            self.flush()
         self._descriptors.close()
         self._wake_up.close()
         self._router.disable_monitor()
@@ -189,7 +189,7 @@ class Listener:
             gone, self._gone = self._gone, []
             for route in gone:
                 self._sessions.disconnected(route)
-        self._send()
+        self.flush()
 
     def _read_events(self) -> None:
         """Note which connections have come and gone."""
@@ -238,10 +238,7 @@ class Listener:
         return descriptor in self._open and self._open[descriptor] in {None, frame.bytes}
 
     def flush(self) -> None:
-        """Send new requests."""
-        self._send()
-
-    def _send(self) -> None:
+        """Send all that waits."""
         outbox = self._sessions.outbox
         if not outbox:
             return

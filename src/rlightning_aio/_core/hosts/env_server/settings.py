@@ -23,7 +23,7 @@ _Name = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^/\x00-\x
 class ServerSettings(BaseModel):
     """``env_kwargs`` of an env_server entry."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     host: str = "127.0.0.1"
     """Address to listen on; a public one needs ``keys``, or ``insecure: true``."""
