@@ -44,8 +44,8 @@ def test_values_go_through_rows_unchanged(
     sent = [sampled(actions, seed + row) for row in range(rows)]
     seen = [sampled(observations, seed + row) for row in range(rows)]
     for row in range(rows):
-        row_writer(actions, ours.action, row, "action")(sent[row])
-        row_writer(observations, theirs.observation, row, "observation")(seen[row])
+        row_writer(ours.action, row, "action")(sent[row])
+        row_writer(theirs.observation, row, "observation")(seen[row])
         theirs.reward[row] = row
         theirs.terminated[row] = row % 2
         theirs.over[row] = row % 3 > 0
@@ -75,12 +75,12 @@ def test_gathered_rows_are_a_copy_in_the_requested_order(
     slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
     values = [sampled(space, row) for row in range(rows)]
     for row, value in enumerate(values):
-        row_writer(space, slab.observation, row, "observation")(value)
+        row_writer(slab.observation, row, "observation")(value)
     chosen = data.draw(st.lists(st.integers(0, rows - 1), min_size=1))
     picked = gather(slab.observation, np.array(chosen, np.intp))
     ranged = gather(slab.observation, slice(0, rows))
     for row in range(rows):
-        row_writer(space, slab.observation, row, "observation")(sampled(space, 77))
+        row_writer(slab.observation, row, "observation")(sampled(space, 77))
     for k, row in enumerate(chosen):
         assert same(index(picked, k), values[row])
     for row in range(rows):
@@ -94,7 +94,7 @@ def test_a_value_read_for_an_env_is_a_copy(space: Any) -> None:
     layout = RowLayout(spaces.Discrete(2), space, (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
     one, other = sampled(space, 1), sampled(space, 2)
-    write = row_writer(space, slab.action, 0, "action")
+    write = row_writer(slab.action, 0, "action")
     write(one)
     read = row_reader(slab.action, 0)()
     write(other)
@@ -133,7 +133,7 @@ def test_a_misfit_names_position_and_difference(space: Any, value: Any, said: st
     layout = RowLayout(space, spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
     with pytest.raises(Misfit, match=said):
-        row_writer(space, slab.observation, 0, "observation")(value)
+        row_writer(slab.observation, 0, "observation")(value)
 
 
 def test_doubles_are_narrowed_as_gymnasium_does() -> None:
@@ -141,7 +141,7 @@ def test_doubles_are_narrowed_as_gymnasium_does() -> None:
     space = spaces.Dict(x=spaces.Box(-1, 1, (2,)), n=spaces.Discrete(5))
     layout = RowLayout(space, spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
-    row_writer(space, slab.observation, 0, "observation")({"n": 3, "x": [0.1, 0.2]})
+    row_writer(slab.observation, 0, "observation")({"n": 3, "x": [0.1, 0.2]})
     found = index(slab.observation, 0)
     assert found["x"].tolist() == np.array([0.1, 0.2], np.float32).tolist()
     assert found["n"] == 3

@@ -16,10 +16,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.trees import as_array, is_dict, is_tuple, key_of, mapped, tree_of, walked
+from rlightning_aio.trees import as_array, key_of, mapped, tree_of, walked
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -146,43 +146,49 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
     return array
 
 
-def fitted_tree(
-    space: gym.Space[Any],
-    value: Any,
-    what: str,
-    path: Path = (),
-) -> Tree:
+def fitted_tree(space: gym.Space[Any], value: Any, what: str) -> Tree:
     """Convert `value` to arrays with the shapes and dtypes of `space`, without needless copies.
 
     Raises:
         Misfit: see `row_writer`.
     """
-    if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
-        return value
-    if is_dict(space):
-        check_keys(value, space.spaces.keys(), what, path)
-        parts = space.spaces.items()
-        return {k: fitted_tree(inner, value[k], what, (*path, k)) for k, inner in parts}
-    if is_tuple(space):
-        check_length(value, len(space.spaces), what, path)
-        return tuple(
-            fitted_tree(inner, part, what, (*path, position))
-            for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
-        )
-    assert is_array(space)
-    return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
+
+    def of_array(part: spaces.Box[Any], given: Any, path: Path) -> NDArray[Any]:
+        if type(given) is np.ndarray and given.shape == part.shape and given.dtype == part.dtype:
+            return given
+        return fitted(given, Leaf(path, part.shape, part.dtype), what).astype(part.dtype)
+
+    return placed(of_array, tree_of(space), value, what)
 
 
-def check_keys(value: Any, keys: Collection[str], what: str, path: Path = ()) -> None:
-    """Raise `Misfit` if `value` is no dict with these keys."""
-    if not hasattr(value, "keys") or value.keys() != keys:
-        raise _misplaced(what, path, f"a dict with keys {sorted(map(str, keys))}", value)
+def placed(
+    function: Callable[[Any, Any, Path], Any], tree: Tree, value: Any, what: str, path: Path = ()
+) -> Tree:
+    """Apply `function` to each leaf of `tree`, to what `value` has in its place, and to its path.
 
+    Args:
+        function: see above; its results are arranged as `tree` is.
+        tree: of a space, in the structure of its values.
+        value: should have that structure; lists may be in the place of tuples.
+        what: name of the value in messages.
+        path: of `tree`.
 
-def check_length(value: Any, length: int, what: str, path: Path) -> None:
-    """Raise `Misfit` if `value` is no tuple or list of this length."""
-    if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != length:
-        raise _misplaced(what, path, f"a tuple of {length}", value)
+    Raises:
+        Misfit: `value` has another structure.
+    """
+    if isinstance(tree, dict):
+        parts = cast("dict[str, Tree]", tree)
+        if not hasattr(value, "keys") or value.keys() != parts.keys():
+            expected = f"a dict with keys {sorted(map(str, parts))}"
+            raise _misplaced(what, path, expected, value)
+        return {k: placed(function, part, value[k], what, (*path, k)) for k, part in parts.items()}
+    if isinstance(tree, tuple):
+        several = cast("tuple[Tree, ...]", tree)
+        if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != len(several):
+            raise _misplaced(what, path, f"a tuple of {len(several)}", value)
+        both = enumerate(zip(several, cast("list[Any]", value), strict=True))
+        return tuple(placed(function, part, own, what, (*path, k)) for k, (part, own) in both)
+    return function(tree, value, path)
 
 
 def _misplaced(what: str, path: Path, expected: str, value: Any) -> Misfit:
@@ -193,14 +199,8 @@ def _misplaced(what: str, path: Path, expected: str, value: Any) -> Misfit:
     return Misfit(f"{place} doesn't fit its space: expected {expected}, found {found}")
 
 
-def row_writer(
-    space: gym.Space[Any],
-    tree: Tree,
-    row: int,
-    what: str,
-    path: Path = (),
-) -> Callable[[Any], None]:
-    """Make a function that copies a value of `space` into `row` of `tree`.
+def row_writer(tree: Tree, row: int, what: str) -> Callable[[Any], None]:
+    """Make a function that copies a value of a space into `row` of `tree`, its columns.
 
     Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments.
 
@@ -208,66 +208,25 @@ def row_writer(
         Misfit: the value has another shape, structure or kind of dtype, or numbers out of range;
             a part of it may have been written.
     """
-    if is_dict(space):
-        return _dict_writer(space, tree, row, what, path)
-    if is_tuple(space):
-        return _tuple_writer(space, tree, row, what, path)
-    leaf = Leaf(path, tree.shape[1:], tree.dtype)
-    if not leaf.shape:
-        return _number_writer(tree, row, leaf, what)
-    view, shape, dtype = tree[row], leaf.shape, leaf.dtype
+    each = iter([_array_writer(array, row, path, what) for path, array in walked(tree)])
+    writers: Any = mapped(lambda _: next(each), tree)
+    if not isinstance(writers, dict | tuple):
+        return writers
+
+    def write(value: Any) -> None:
+        placed(lambda writer, part, _: writer(part), writers, value, what)
+
+    return write
+
+
+def _array_writer(column: NDArray[Any], row: int, path: Path, what: str) -> Callable[[Any], None]:
+    leaf = Leaf(path, column.shape[1:], column.dtype)
+    view, shape, dtype = column[row, ...], leaf.shape, leaf.dtype
 
     def write(value: Any) -> None:
         if type(value) is not np.ndarray or value.shape != shape or value.dtype is not dtype:
             value = fitted(value, leaf, what)
         view[...] = value
-
-    return write
-
-
-def _number_writer(column: NDArray[Any], row: int, leaf: Leaf, what: str) -> Callable[[Any], None]:
-    def write(value: Any) -> None:
-        column[row] = fitted(value, leaf, what)
-
-    return write
-
-
-def _dict_writer(
-    space: spaces.Dict[Any],
-    tree: Tree,
-    row: int,
-    what: str,
-    path: Path,
-) -> Callable[[Any], None]:
-    writers = {
-        key: row_writer(inner, tree[key], row, what, (*path, key))
-        for key, inner in space.spaces.items()
-    }
-
-    def write(value: Any) -> None:
-        check_keys(value, writers.keys(), what, path)
-        for key, writer in writers.items():
-            writer(value[key])
-
-    return write
-
-
-def _tuple_writer(
-    space: spaces.Tuple[Any],
-    tree: Tree,
-    row: int,
-    what: str,
-    path: Path,
-) -> Callable[[Any], None]:
-    writers = [
-        row_writer(inner, part, row, what, (*path, position))
-        for position, (inner, part) in enumerate(zip(space.spaces, tree, strict=True))
-    ]
-
-    def write(value: tuple[Any, ...] | list[Any] | NDArray[Any]) -> None:
-        check_length(value, len(writers), what, path)
-        for writer, part in zip(writers, value, strict=True):
-            writer(part)
 
     return write
 

@@ -20,10 +20,9 @@ from rlightning_aio.protocol.columns import (
     Leaf,
     Misfit,
     assemble,
-    check_keys,
-    check_length,
     fitted,
     in_brackets,
+    placed,
 )
 from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
 from rlightning_aio.trees import as_array, mapped, tree_of, walked
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.protocol.net.wire import Compression
-    from rlightning_aio.trees import Path, Tree
 
 MAX_HEAD = 1 << 20
 """Rewards of one result."""
@@ -85,21 +83,7 @@ class SpaceLayout:
         Raises:
             Misfit: it doesn't fit the space; the message says what was expected and found.
         """
-        self._pack(self._tree, value, packed, ())
-
-    def _pack(self, tree: Tree, value: Any, packed: Packed, path: Path) -> None:
-        if isinstance(tree, dict):
-            parts = cast("dict[str, Any]", tree)
-            check_keys(value, parts.keys(), self._what, path)
-            for key, part in parts.items():
-                self._pack(part, value[key], packed, (*path, key))
-        elif isinstance(tree, tuple):
-            parts = cast("tuple[Any, ...]", tree)
-            check_length(value, len(parts), self._what, path)
-            for position, (part, own) in enumerate(zip(parts, value, strict=True)):
-                self._pack(part, own, packed, (*path, position))
-        else:
-            tree.pack(value, packed)
+        placed(lambda codec, part, _: codec.pack(part, packed), self._tree, value, self._what)
 
     def unpack(self, frames: Sequence[Part], texts: Sequence[str]) -> Any:
         """Return the value at the start of `frames`; its arrays are read-only views of them.

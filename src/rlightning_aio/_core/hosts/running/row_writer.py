@@ -96,9 +96,7 @@ class RowWriter:
         self._hands_over = layout.observations_out_of_band
         self._write_observation: Callable[[Any], None] | None = None
         if slab.observation is not None:
-            self._write_observation = row_writer(
-                layout.observation_space, slab.observation, row, "observation"
-            )
+            self._write_observation = row_writer(slab.observation, row, "observation")
         self._infos = InfoWriter(memoryview(slab.info[row]), announce)
         self._last_out_of_band: OutOfBand = {}
         self.holds_tensor = False
