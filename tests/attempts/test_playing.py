@@ -919,6 +919,20 @@ async def test_free_envs_prepare_while_others_play() -> None:
     assert all(attempts.is_complete for attempts in found)
 
 
+@pytest.mark.usefixtures("moving")
+async def test_what_moves_something_real_is_not_reset_ahead() -> None:
+    counts: list[int] = []
+
+    async def agent(episode: AttemptEpisode) -> None:
+        counts.append(Slow.began)
+        await once(episode)
+
+    Slow.began = 0
+    async with rl.build_env_group(Slow, name="box", num_workers=4, placement="loop") as group:
+        await played(group, tasks(6), agent, 1, Rules(max_concurrency=1))
+    assert counts == [1, 2, 3, 4, 5, 6]
+
+
 async def test_an_attempt_whose_turn_never_came_is_cancelled() -> None:
     async def agent(episode: AttemptEpisode) -> None:
         while Slow.began < 2 or not episode.spec.seed:  # noqa: ASYNC110  # The others wait.

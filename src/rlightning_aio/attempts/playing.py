@@ -16,6 +16,7 @@ from collections import Counter, deque
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakSet
 
+from rlightning_aio._core.group.api.facade import is_resettable
 from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
@@ -154,6 +155,9 @@ class _Engine:
         self._results = results
         self._queue = AttemptQueue(group, rules, results)
         self._has_clients = len(group) > group.size()
+        # What moves something real, as a client may, doesn't move before its agent's turn.
+        is_plain = all(is_resettable(group, env_id) for env_id in group.env_ids)
+        self._ahead = 2 if is_plain and not self._has_clients else 1
         self._playing: dict[asyncio.Task[Attempt], tuple[Job, Try]] = {}
         self._ended = deque[asyncio.Task[Attempt]]()
         self._look_at = 0.0
@@ -235,7 +239,7 @@ class _Engine:
     def _most(self) -> int:
         """Number of attempts that may play at once, and of envs that prepare for the next ones."""
         envs = len(self._queue.free) + len(self._playing)
-        return min(envs, 2 * (self._rules.max_concurrency or envs))
+        return min(envs, self._ahead * (self._rules.max_concurrency or envs))
 
     def _begin(self) -> bool:
         """Begin attempts on idle envs, and read more tasks while envs are idle.
