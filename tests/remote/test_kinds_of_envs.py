@@ -218,7 +218,9 @@ class FourValues(gym.Env[Any, Any]):
         return 0, 0.0, False, {}
 
 
-def test_a_robot_whose_wrapper_stops_it_says_what_a_step_returns() -> None:
+def test_a_robot_whose_wrapper_stops_it_says_what_a_step_returns(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     """Its step is refused, so that it stops; the words are those of a local env."""
     entry = {"name": "s", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
     robot = Braked(FourValues())
@@ -229,5 +231,6 @@ def test_a_robot_whose_wrapper_stops_it_says_what_a_step_returns() -> None:
         with pytest.raises(EnvRaised, match="GymV21CompatibilityV0"):
             group.step(batch.respond(action=[0]))
         assert robot.num_stops
+        assert "one: the env raised" in caplog.text  # On the robot's computer, too.
         client.client._env.is_finish = lambda: True  # noqa: SLF001
     client.join()
