@@ -222,7 +222,9 @@ class Play(Session):
             self.refuse_busy(requests)
             return False
         except asyncio.CancelledError:
-            if self.clients or self.nested & requests.keys():  # Perhaps nothing was sent yet.
+            # Perhaps nothing was sent yet: a reset waits first for what is in flight.
+            is_reset = next(iter(requests.values())).kind == "reset"
+            if self.clients or self.nested & requests.keys() or is_reset:
                 self.interrupted(requests, owner)
             self.model.orphan(owner)
             raise
