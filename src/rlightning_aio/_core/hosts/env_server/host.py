@@ -307,9 +307,9 @@ class EnvServerHost(Host):
     def on_lost(self, cause: str, *, in_order: bool) -> None:
         entry, self._entry = self._entry, 0
         requests = (entry,) if entry else ()
-        self._lost_reset = (None, None)
-        if entry and op_of(entry) == Operation.RESET:
-            self._lost_reset = self._reset
+        if entry:  # Without, a reset that was lost before waits for the next client, still.
+            is_reset = op_of(entry) == Operation.RESET
+            self._lost_reset = self._reset if is_reset else (None, None)
         self._post(Died(self.host_id, Death(cause, requests=requests, in_order=in_order)))
 
     def waits_since(self) -> float | None:
