@@ -50,7 +50,7 @@ class Line(NamedTuple):
 WAITING = "waiting:benchmarks/Sleeping-v0"
 LINES = (
     Line("CartPole", "CartPole-v1"),
-    Line("HalfCheetah, one batch", "HalfCheetah-v5"),
+    Line("HalfCheetah, batched", "HalfCheetah-v5"),
     Line("own env of 200 µs", "own_envs:benchmarks/Own200-v0"),
     Line("own env that waits", WAITING, OursAsync("", Work(WAITING, NUM_ENVS, None))),
 )
@@ -70,7 +70,9 @@ def table_of(rates: list[list[list[float]]]) -> Table:
         # All have played the rounds of ours.
         ratios = [ours.over(Figures(one.values[: len(ours.values)])).median for one in theirs]
         medians = [number_text(one.median) for one in (*theirs, ours)]
-        table.add_row(line.title, *medians, " and ".join(f"{ratio:.1f}" for ratio in ratios))
+        digits = [0 if ratio >= 10 else 1 for ratio in ratios]  # A terminal has 80 columns.
+        times = [f"{ratio:.{n}f}" for ratio, n in zip(ratios, digits, strict=True)]
+        table.add_row(line.title, *medians, " and ".join(times))
     return table
 
 

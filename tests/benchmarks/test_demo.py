@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 DEMO = ROOT / "benchmarks" / "demo.py"
 
 
-LINES = ("CartPole", "HalfCheetah, one batch", "own env of 200 µs", "own env that waits")
+LINES = ("CartPole", "HalfCheetah, batched", "own env of 200 µs", "own env that waits")
 
 
 def test_it_shows_four_lines_and_the_next_steps(tmp_path: Path) -> None:
@@ -28,8 +28,8 @@ def test_it_shows_four_lines_and_the_next_steps(tmp_path: Path) -> None:
         assert found, (line, shown)
         *theirs, ours, once, twice = (float(one.replace(",", "")) for one in found.groups())
         for rate, ratio in zip(theirs, (once, twice), strict=True):
-            # Rates are shown with three digits.
-            assert abs(ratio - ours / rate) <= 0.05 + 0.01 * ours / rate
+            # Rates are shown with three digits, and so are ratios from 10 on.
+            assert abs(ratio - ours / rate) <= (0.5 if ratio >= 10 else 0.05) + 0.01 * ours / rate
     assert "CartPole is no faster" in shown
     for page in re.findall(r"(?:docs|examples)/\w+\.\w+", shown):
         assert (ROOT / page).exists(), page
