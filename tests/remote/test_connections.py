@@ -17,7 +17,7 @@ from patience import HANG
 from rlightning_aio import sync
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.space_description import describe
-from rlightning_aio.protocol.net.wire import VERSION, Bye, ClientHello, Writer
+from rlightning_aio.protocol.net.wire import VERSION, Bye, ClientHello, Reset, Welcome, Writer
 from rlightning_aio.remote import RemoteEnvClient
 
 if TYPE_CHECKING:
@@ -90,6 +90,56 @@ def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
         batch, _ = group.collect_async(deadline=HANG)
     assert batch.observation.tolist() == [[0, -1, 1]]
     assert "client_lost" not in batch.values()[0].info
+
+
+@pytest.mark.parametrize("hardware", [True, False])
+def test_a_goodbye_during_a_step_is_read(hardware: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """The connection has ended before the client looks at it again, or its hardware is stopped."""
+    begun, gate, stopped = threading.Event(), threading.Event(), threading.Event()
+
+    def on_step() -> None:
+        begun.set()
+        if hardware:
+            assert stopped.wait(HANG)
+        else:
+            assert gate.wait(HANG)
+            assert friend.client._monitor.poll(1000 * HANG)
+
+    env: Any = CountingEnv(on_step=on_step)
+    env.stop = stopped.set
+    with sync.build_env_group(ENTRY) as group:
+        friend = ClientThread(group["robots-0"].address, "arm", env, hardware=hardware)
+        batch, _ = group.reset(env_ids=["robots-0/arm"])
+        group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+        assert begun.wait(HANG)
+        group.close()
+        gate.set()
+        friend.join()
+    cause = "the server ended the session: the trainer closed its group"
+    assert [m for m in caplog.messages if "session" in m] == [f"arm: session over: {cause}"]
+    assert env.disconnects == 1
+
+
+def test_all_that_came_before_the_end_of_a_connection_is_read(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A client that was suspended finds its welcome, a request, a goodbye and the end at once."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+        env: Any = CountingEnv()
+        with RemoteEnvClient(env, "127.0.0.1", port, name="arm", hardware=False) as client:
+            while not server.poll(0):
+                client._wait(0.0)
+            route = server.recv_multipart()[0]
+            welcome = Welcome(env_id="robots-0/arm", heartbeat=HANG)
+            for message in (welcome, Reset(number=1), Bye(reason="enough")):
+                server.send_multipart([route, *Writer().write(message)])
+            server.close(linger=int(1000 * HANG))
+            assert client._monitor.poll(1000 * HANG)
+            client._wait(None)
+            assert caplog.messages[-1] == "arm: session over: the server ended the session: enough"
+            assert client._dealer is None
+            assert (env.disconnects, env.resets, client.num_sessions) == (1, 0, 1)
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,8 @@ _SECONDS_BETWEEN_ATTEMPTS: Final = (0.1, 5.0)
 _ATTEMPT_SECONDS: Final = 3 * HANDSHAKE_SECONDS
 """Time after which an attempt that ZMQ says nothing about is over."""
 _LINGER_MS: Final = 500
+_NEVER_MS: Final = 24 * 3600 * 1000
+"""Time after which ZMQ itself would dial again. The socket is closed long before."""
 
 _ADDRESS: Final = re.compile(r"tcp://(?:\[[0-9A-Fa-f:.]+\]|[\w.-]+):([0-9]{1,5})")
 _MAX_PORT: Final = 65535
@@ -269,7 +271,8 @@ class RemoteEnvClient:
             self._dealer = dealer
 
     def _set_options(self, dealer: _Socket) -> None:
-        dealer.set(zmq.RECONNECT_IVL, -1)
+        # -1 would have ZMQ drop what nobody has read when the connection ends, as a goodbye.
+        dealer.set(zmq.RECONNECT_IVL, _NEVER_MS)
         dealer.set(zmq.LINGER, 0)
         dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         dealer.set(zmq.CONNECT_TIMEOUT, int(1000 * HANDSHAKE_SECONDS))
@@ -285,14 +288,14 @@ class RemoteEnvClient:
         if "[" in self._address:
             dealer.set(zmq.IPV6, 1)
 
-    def _hang_up(self) -> None:
+    def _hang_up(self, linger_ms: int = _LINGER_MS) -> None:
         """End the attempt or the connection, and set the time of the next attempt."""
         if self._dealer is not None:
             with _signals_held_back():
                 self._poller = zmq.Poller()
                 self._dealer.disable_monitor()
                 self._monitor.close(linger=0)
-                self._dealer.close(linger=_LINGER_MS)
+                self._dealer.close(linger_ms)
                 self._dealer = None
             self._due = time.monotonic() + self._pause
             self._pause = min(2 * self._pause, _SECONDS_BETWEEN_ATTEMPTS[1])
@@ -318,13 +321,19 @@ class RemoteEnvClient:
     def _read(self, wait_ms: int | None) -> None:
         """Wait for messages and events, at most so long, and apply them."""
         for source, _ in self._poller.poll(wait_ms):
-            dealer = self._dealer
-            if dealer is None:
+            if self._dealer is None:
                 break  # An event before this one has ended the connection.
             if source is self._monitor:
                 self._read_event()
-            elif (first := next_frame(dealer)) is not None:
-                self._apply(self._session.receive(receive_parts(dealer, first)))
+            else:
+                self._receive()
+
+    def _receive(self) -> bool:
+        """Read and apply one message. Return False if there is none."""
+        if self._dealer is None or (first := next_frame(self._dealer)) is None:
+            return False
+        self._apply(self._session.receive(receive_parts(self._dealer, first)))
+        return True
 
     def _log_state(self) -> None:
         """Log the state of the connection, once for each trouble."""
@@ -343,6 +352,9 @@ class RemoteEnvClient:
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._session.connected()
         elif event == zmq.EVENT_DISCONNECTED:
+            # The server's last words say why.
+            while self._session.phase is not Phase.AWAY and self._receive():
+                pass
             is_new = self._session.phase is Phase.AWAY
             self._lose(self._trouble if is_new else "the connection to the server broke")
         elif event == zmq.EVENT_CLOSED:
@@ -355,7 +367,7 @@ class RemoteEnvClient:
         """Process the end of an attempt or a connection."""
         self._trouble = cause
         event = self._session.disconnected(cause)
-        self._hang_up()
+        self._hang_up(linger_ms=0)
         self._apply(event)
 
     def _flush(self) -> None:
