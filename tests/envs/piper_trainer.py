@@ -1,7 +1,8 @@
-"""A trainer that is killed while its arm moves: ``python piper_trainer.py CHANNEL``."""
+"""A trainer that is killed while its arm moves: ``python piper_trainer.py CHANNEL PLACEMENT``."""
 
 from __future__ import annotations
 
+import os
 import sys
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
@@ -9,12 +10,13 @@ from rlightning_aio import BatchedData, PolicyResponse, sync
 FAR = [1.5, 2.0, -2.0, 1.0, 1.0, 1.0, 0.0]
 
 
-def main(channel: str) -> None:
+def main(channel: str, placement: str) -> None:
+    os.environ["CAN_CONFIG"] = '{"sleep_after_open": 0.0}'
     entry = {
         "name": "arm",
         "backend": "piper",
         "task": "test",
-        "env_vars": {"CAN_CONFIG": '{"sleep_after_open": 0.0}'},
+        "placement": placement,
         "env_kwargs": {
             "can_interface": "slcan",
             "channel": channel,
@@ -34,4 +36,4 @@ def main(channel: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -144,17 +144,28 @@ def test_an_invalid_action_stops_a_moving_arm(monkeypatch: pytest.MonkeyPatch, p
                 step([*READY[:5], 0.1, 0.0])
 
 
-@pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGTERM])
-def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
-    """By any signal; the worker makes the safe stop."""
+@pytest.mark.parametrize(
+    ("death", "placement", "said"),
+    [
+        (signal.SIGKILL, "process", b""),
+        (signal.SIGTERM, "process", b""),
+        (signal.SIGKILL, "inline", b"has stopped it: the program that drove it has ended\n"),
+    ],
+)
+def test_the_arm_stops_when_its_trainer_dies(
+    death: signal.Signals, placement: str, said: bytes
+) -> None:
+    """By any signal; the worker makes the safe stop, or without one the watchdog, which says so."""
     arm = WatchedArm()
     script = Path(__file__).with_name("piper_trainer.py")
+    command, pipe = [sys.executable, script], subprocess.PIPE
     with (
         contextlib.closing(SlcanPort()) as port,
         running(arm, port),
-        subprocess.Popen([sys.executable, script, port.path], stdout=subprocess.PIPE) as trainer,
+        subprocess.Popen([*command, port.path, placement], stdout=pipe, stderr=pipe) as trainer,
     ):
         assert trainer.stdout
+        assert trainer.stderr
         assert trainer.stdout.readline() == b"moving\n"
         assert not arm.emergency_stopped
         trainer.send_signal(death)
@@ -164,6 +175,7 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
         # the lost port can't take is said again to whatever arm has its path then.
         while trainer.stdout.readline():
             pass
+        assert said in trainer.stderr.read()
         assert np.abs(arm.joints - arm.targets).max() == 0
 
 
