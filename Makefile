@@ -228,7 +228,7 @@ $(RLLIB)/installed: pyproject.toml constraints.txt requirements/test.txt | $(RLL
 
 $(PEERS_VENV)/installed: pyproject.toml constraints.txt requirements/test.txt | $(PEERS_VENV)/bin/python
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.[ale,sb3]' \
-	    --requirement requirements/test.txt --requirement requirements/examples.txt box2d hydra-core moviepy pandas
+	    --requirement requirements/test.txt --requirement requirements/examples.txt array-api-compat box2d hydra-core moviepy pandas
 	@touch $@
 
 $(ISAAC)/installed: pyproject.toml requirements/test.txt tests/simulators/isaac.txt | $(ISAAC)/bin/python

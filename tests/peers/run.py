@@ -239,8 +239,8 @@ class Watch:
         config.hook.pytest_deselected(items=out)
 
     def pytest_collectreport(self, report: Any) -> None:
-        if report.failed:
-            self.outcomes[report.nodeid] = "failed"
+        if report.outcome != "passed":
+            self.outcomes[report.nodeid] = report.outcome
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if report.when == "call" or report.outcome != "passed":
