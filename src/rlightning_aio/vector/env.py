@@ -74,8 +74,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             batched and the single observation space.
         autoreset_mode: when an env is reset after the end of its episode.
         max_concurrency: maximum number of workers, each executing one env at a time. None: one for
-            each env, up to eight for each core that this process may use; of tasks that are known
-            to compute (`make_vec`), one for each core.
+            each env; of tasks that are known to compute (`make_vec`), one for each core that this
+            process may use.
         entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
 
     Attributes:
