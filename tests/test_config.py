@@ -425,6 +425,7 @@ VALUES: dict[str, Any] = {
     "close_timeout": 2.0,
     "on_worker_death": "restart",
     "max_restarts": 0,
+    "recycle": {"episodes": 9},
     "interpreter": sys.executable,
     "env_vars": {"A": "1"},
     "max_concurrency": 3,

@@ -222,6 +222,7 @@ PLACEMENTS: dict[str, Placement] = {
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
             "ray_options": _NOT_RAYS,
+            "recycle": _NO_WORKER,
         },
         awaits="only",
     ),
@@ -235,6 +236,7 @@ PLACEMENTS: dict[str, Placement] = {
             "close_timeout": _NO_LIMIT,
             "on_worker_death": _NO_WORKER,
             "max_restarts": _NO_WORKER,
+            "recycle": _NO_WORKER,
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
@@ -273,6 +275,7 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "start_timeout": "clients connect at any time; env_kwargs.connect_timeout limits how "
             "long a call waits for them",
             "close_timeout": _CLIENTS_OWN,
+            "recycle": _CLIENTS_OWN,
         },
     ),
 }

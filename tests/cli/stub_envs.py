@@ -280,6 +280,21 @@ class Masked(Plays):
 gym.register("cli/Masked-v0", Masked)
 
 
+class Leaky(Plays):
+    """Keeps 4 MB of each episode."""
+
+    observation_space = gym.spaces.Box(0, 1, (2,))
+    kept: ClassVar[list[Any]] = []
+
+    def does(self, action: Any) -> float:
+        return 1.0
+
+    def observed(self) -> Any:
+        if not self.steps:
+            self.kept.append(np.ones(4_000_000, np.uint8))
+        return self.np_random.random(2, np.float32)
+
+
 class Careless(Plays):
     """Draws from a generator that nobody seeds, forgets files, and divides by zero."""
 

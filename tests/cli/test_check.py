@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, write_config
-from cli.stub_envs import Careless, Stub
+from cli.stub_envs import Careless, Leaky, Stub
 from group.sample_envs import Crowd
 
 if TYPE_CHECKING:
@@ -72,6 +73,21 @@ def test_check_plays_episodes_and_names_what_is_wrong(tmp_path: Path) -> None:
     assert any("more open descriptors after" in leak for leak in leaks)
     assert "problem: none found" in text
     assert "placement" not in text
+
+
+@pytest.mark.parametrize("placement", ["process", "inline"])
+def test_what_leaks_memory_gets_a_limit(tmp_path: Path, placement: str) -> None:
+    """Where there is a worker that can be renewed, and its generators go over."""
+    entry = {"name": "leaky", "backend": "callable", "task": "cli.stub_envs:Leaky"}
+    entry |= {"placement": placement, "imports": ["cli.stub_envs"]}
+    try:
+        (found,) = failed(write_config(tmp_path, entry), "--steps", "60")
+    finally:
+        Leaky.kept.clear()
+    (problem,) = found["problems"]
+    assert re.match(r"\d+ more MB of memory after \d+ episodes", problem)
+    limit = re.search(r"recycle: {memory_mb: (\d+)00}", problem)
+    assert (limit is not None) == (placement == "process")
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])

@@ -167,7 +167,9 @@ def test_few_results_are_no_reason() -> None:
 def test_one_look_is_no_reason(caplog: pytest.LogCaptureFixture) -> None:
     """The next one must find the same: a machine may be busy for a moment."""
     records, sums = workers(1, 1), SimpleNamespace(num_batches=0)
-    tables: Any = SimpleNamespace(records=records, num_cores=2, sums=sums)
+    tables: Any = SimpleNamespace(
+        records=records, num_cores=2, sums=sums, slots_of=lambda record: record.slots
+    )
     so_far = dict.fromkeys(spent(records, US), 0.0)
     sums.of = lambda _: dict(so_far)
     hint = Hint(tables)

@@ -89,11 +89,18 @@ class Host:
 
     Attributes:
         struck: it was killed from outside; aborted: perhaps by an abort, for which it is replaced.
+        renewed: some of its envs may be in the next process already, and live on.
     """
 
     def __init__(
-        self, *, mortal: bool, count: Callable[[], int] | None = None, knows: bool = True
+        self,
+        *,
+        mortal: bool,
+        count: Callable[[], int] | None = None,
+        knows: bool = True,
+        renewed: bool = False,
     ) -> None:
+        self.renewed = renewed
         self.mortal = mortal
         self.knows = knows
         self._count = count
@@ -180,6 +187,7 @@ class State:
         for sub in self.scripts.subs:
             twin = object.__new__(type(sub))
             vars(twin).update(vars(sub))
+            twin.draws = copy.copy(sub.draws)
             found.scripts.subs.append(twin)
         for name in ("returns", "lengths", "counted"):
             setattr(found, name, list(getattr(self, name)))
@@ -526,6 +534,9 @@ class Model:
         require(not env.put_away or request.kind != "step", "a step of an env that has raised")
         is_reset = request.kind == "reset"
         states = env.possible() if is_reset else [env.state, *env.loose]
+        marks = {state.scripts.subs[0].mark for state in states}
+        if is_reset and env.host.renewed and UNLOADABLE in marks:
+            states.append(env.fresh())  # Its next worker can't take its generators over.
         limit = self.limit_of(env)
         now = [state.copy() for state in states]
         played = [state.play(request, limit) for state in now]
@@ -805,7 +816,7 @@ class Model:
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
             require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
             for other in self.envs.values():
-                if other.host is host:
+                if other is env or (other.host is host and not host.renewed):
                     other.gone = True
 
 

@@ -279,6 +279,8 @@ class Play(Session):
         envs, named = self.model.envs, fault.env_ids
         hosts = [envs[env_id].host for env_id in named[:1]]
         own = [env_id for env_id in requests if envs[env_id].host in hosts]
+        if hosts and hosts[0].renewed:
+            own = [env_id for env_id in own if env_id in named]
         require(named and sorted(named) == sorted(own), "a refusal of others", repr(fault))
         for env_id in named:
             self.model.gone(envs[env_id], fault)
@@ -599,7 +601,8 @@ class Play(Session):
         options = None
         if rng.random() < 0.3:
             options = {"token": rng.randrange(TOKENS)}
-            if "raise" in self.features and rng.random() < 0.3:
+            raises = "raise" in self.features and rng.random() < 0.3
+            if raises and all(map(self.may_raise_in_reset, envs)):
                 options["effect"] = rng.choice(["raise", "raise oddly"])
         seed: Any = None
         kind = rng.choice(["none", "int", "list", "mapping"])
@@ -726,7 +729,9 @@ class Play(Session):
 
     def marks(self, env: Env) -> list[int]:
         """Those that matter when its state is loaded."""
-        return [SLOW, UNLOADABLE] + [DEADLY] * ("die" in self.features and self.is_killable(env))
+        may_die = "die" in self.features and self.is_killable(env)
+        # A next worker that loads such a state would die of what nobody asked for.
+        return [SLOW, UNLOADABLE] + [DEADLY] * (may_die and not env.host.renewed)
 
     async def mark(self, env: Env, mark: int) -> None:
         """Set the `mark` of an env, and get it."""

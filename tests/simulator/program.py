@@ -17,6 +17,8 @@ from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, TIMEOUT, broken
 from simulator.world import Faults
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from simulator.world import World
 
 FEATURES = (
@@ -86,6 +88,7 @@ class Plan:
     timeout: float | None = None
     start: str = ""
     heartbeat: float = 5.0
+    recycle: int = 0
 
     def config(self, number: int) -> dict[str, Any]:
         """The fields of the entry, the `number`-th."""
@@ -102,6 +105,8 @@ class Plan:
                     del found["max_restarts"]
         else:
             found["envs_per_process"] = self.share
+            if self.recycle:
+                found["recycle"] = {"episodes": self.recycle}
         if self.timeout is None:
             del found["step_timeout"], found["reset_timeout"]
         if self.limit is not None and self.form != "stacked":  # Those have their own.
@@ -176,13 +181,19 @@ class Program:
     def envs(self, workers: list[dict[str, Any]], world: World | None) -> list[Env]:
         """The model's envs, on the hosts that `get_workers` names."""
         host_of: dict[str, Host] = {}
+        num_recycled = 0
         for number, worker in enumerate(workers):
             plan = next(plan for plan in self.plans if plan.name == worker["entry"])
             here = plan.placement == "inline"
-            process = "an actor" if plan.placement == "ray" else f"worker {number}"
-            count = None if world is None else partial(world.deaths.__getitem__, process)
             on_ray = plan.placement == "ray"
-            host = Host(mortal=on_ray or not here, count=count, knows=not on_ray)
+            process = "an actor" if on_ray else f"worker {number}"
+            names = [process]
+            if plan.recycle:  # Its other host has the next worker.
+                names += [] if on_ray else [f"worker {len(workers) + num_recycled}"]
+                num_recycled += 1
+            count = None if world is None else partial(_deaths_of, world, names)
+            renewed = plan.recycle > 0
+            host = Host(mortal=on_ray or not here, count=count, knows=not on_ray, renewed=renewed)
             host_of |= dict.fromkeys(worker["env_ids"], host)
         envs: list[Env] = []
         first = 0
@@ -252,12 +263,24 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
 """Kinds of programs: the weight of each, and its operations; see `draw` for that of attempts."""
 _ATTEMPTS: Final = 0.06
 """The share of programs that are of attempts, in place of what else they would be."""
+RECYCLE: Final = "recycle"
+_RECYCLED: Final = 0.4
+"""The share of programs whose workers may be renewed."""
 _CLIENTS: Final = 0.2
 """The share of programs that have clients, of those that may have them."""
 
 
 def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60) -> Program:
     """The program of a seed, without some features; a third of them have few."""
+    program = _drawn(seed, without, num_ops)
+    apart = Random(seed ^ 0x2EC7C1E)
+    if apart.random() > _RECYCLED or RECYCLE in without:
+        return program
+    plans = tuple(_recycled(apart, plan) for plan in program.plans)
+    return replace(program, plans=plans, features=program.features | {RECYCLE})
+
+
+def _drawn(seed: int, without: frozenset[str], num_ops: int) -> Program:
     rng = Random(seed)
     share = rng.choice((0.25, 0.5, 0.5))
     kind = rng.choices([*KINDS], [weight for weight, _ in KINDS.values()])[0]
@@ -333,6 +356,17 @@ def _restarted(rng: Random, plan: Plan) -> Plan:
     if rng.random() < 0.3:
         return plan
     return replace(plan, on_error="restart", max_restarts=rng.choice([3, 1, 0]))
+
+
+def _recycled(rng: Random, plan: Plan) -> Plan:
+    """The same plan, perhaps with workers that are replaced after so many episodes."""
+    if plan.placement not in ("process", "ray"):
+        return plan
+    return replace(plan, recycle=rng.choice([0, 1, 1, 2, 3, 5, 8]))
+
+
+def _deaths_of(world: World, names: Sequence[str]) -> int:
+    return sum(world.deaths[name] for name in names)
 
 
 def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:

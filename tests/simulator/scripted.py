@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import random
 import signal
 import string
 import time
@@ -169,23 +170,51 @@ def mixed(*numbers: int) -> int:
     return found
 
 
+class Draws(random.Random):
+    """What goes over to the next worker, as a random generator does.
+
+    Attributes:
+        last: seed of a reset; code, episode, mark, grudge: of `Script`. The code may have come
+            from another env, with a state that was restored.
+    """
+
+    def __init__(self, code: int = 0) -> None:
+        super().__init__(0)
+        self.code, self.last, self.episode, self.mark, self.grudge = code, -1, 0, 0, ""
+
+    def getstate(self) -> Any:
+        return vars(self).copy()
+
+    def setstate(self, state: Any) -> None:
+        vars(self).update(state)
+
+
+def _of_draws(name: str) -> Any:
+    return property(
+        lambda self: getattr(self.draws, name),
+        lambda self, value: setattr(self.draws, name, value),
+    )
+
+
 class Script:
     """One env, or sub-environment, which does nothing to its process.
 
     Attributes:
         mark: can be set from outside, and goes into the next `mix`.
         grudge: what the next reset does.
-        refuses: the next snapshot is refused.
+        refuses: the next snapshot is refused, until a reset.
         over: its episode has ended.
         limit: a wrapper truncates its episodes once as many steps have elapsed since the last
             reset, which may have failed.
     """
 
+    code, seed, episode = _of_draws("code"), _of_draws("last"), _of_draws("episode")
+    mark, grudge = _of_draws("mark"), _of_draws("grudge")
+
     def __init__(self, code: int, limit: float = math.inf) -> None:
-        self.code, self.limit = code, limit
-        self.seed = -1
-        self.episode = self.steps = self.elapsed = self.mix = self.mark = 0
-        self.grudge = ""
+        self.limit = limit
+        self.draws = Draws(code)
+        self.steps = self.elapsed = self.mix = 0
         self.refuses = self.over = False
 
     def __getstate__(self) -> dict[str, Any]:
@@ -195,11 +224,12 @@ class Script:
         return vars(self).copy()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        if state["mark"] == UNLOADABLE:
+        mark = state["draws"].mark
+        if mark == UNLOADABLE:
             raise RuntimeError("it does not load")
-        if state["mark"] == DEADLY:
+        if mark == DEADLY:
             machine.die("soon")
-        elif state["mark"] == SLOW:
+        elif mark == SLOW:
             machine.spend(0.1)
         vars(self).update(state)
 
@@ -216,7 +246,7 @@ class Script:
         if seed is not None:
             self.seed = int(seed)
         self.episode, self.steps, self.over = (self.episode + 1) % 128, 0, False
-        self.elapsed = 0
+        self.elapsed, self.refuses = 0, False
         token = (options or {}).get("token", 0)
         # With a seed, what follows depends on nothing that was before.
         self.mix = mixed(

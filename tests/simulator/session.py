@@ -274,6 +274,10 @@ class Session:
         """The env is in another process."""
         return env.host.mortal and self.plan(env).placement not in ("loop", "client")
 
+    def may_raise_in_reset(self, env: Env) -> bool:
+        """An env that goes on after that is as it was, unless the next worker has it then."""
+        return not self.plan(env).recycle or env.entry.on_error == "restart"
+
     def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
         """What the sub-environments of an env are to do, now and then all the same."""
         if rng.random() < 0.3:
@@ -305,9 +309,11 @@ class Session:
             faults += ["rubbish"] * ("rubbish" in features and entry.layout in (*FIXED, "number"))
             faults += [*DYING, "raise oddly"] * ("die" in features)
             return faults + ["hang"] * (self.plan(env).timeout is not None)
-        faults = ["keep state"] * ("snapshots" in features)
+        # Such an env begins with a fresh generator in the next worker.
+        keeps = "snapshots" in features and not self.plan(env).recycle
+        faults = ["keep state"] * keeps
         if "raise" in features:
-            faults += ["raise", "raise oddly", "raise next"]
+            faults += ["raise", "raise oddly"] + ["raise next"] * self.may_raise_in_reset(env)
             if not self.is_async and self.plan(env).placement == "inline":
                 faults.append("ctrl-c")
         if "rubbish" in features and entry.layout in (*FIXED, "number"):

@@ -55,10 +55,11 @@ from rlightning_aio._core.group.drivers import sync_driver
 from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import hint, overdue
 from rlightning_aio._core.hosts import descriptors
+from rlightning_aio._core.hosts.awaiting import awaited_envs
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
-from rlightning_aio._core.hosts.running import build_env
+from rlightning_aio._core.hosts.running import build_env, renewal
 from rlightning_aio.envs.adapted import makers
 from rlightning_aio.protocol import error_text, exchange, kernel, rings
 
@@ -216,6 +217,8 @@ class World:
             (process_hosts, "processor_ns", nothing_known),
             (spares, "kill_below", nothing_known),
             (build_env, "register_tasks", nothing_known),  # The registry is this process's.
+            (process_hosts, "resident_mb", lambda _: 100.0),
+            (renewal, "resident_mb", lambda _: 100.0),
             # Some steps are timed by the kernel, which has a clock of its own.
             (hint, "_ENOUGH_RESULTS", math.inf),
             # Each process has a heap of its own, so these would act on one that is small.
@@ -234,6 +237,7 @@ class World:
             (secrets, "randbits", self.rng.getrandbits),
             # The sizes of messages decide where they are cut, so none depends on the machine.
             (error_text, "traceback", _TRACEBACKS),
+            (awaited_envs, "awaited_calls", lambda _: "calls"),
             (start_orders, "StartOrder", partial(start_orders.StartOrder, trainer_pid=1)),
             *self.network.replacements(),
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),

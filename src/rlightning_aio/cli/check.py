@@ -8,6 +8,7 @@ observations of another shape.
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 from dataclasses import asdict, dataclass, field
@@ -20,6 +21,7 @@ import typer
 
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
+from rlightning_aio._core.hosts.memory import resident_mb
 from rlightning_aio.batch.contents import all_agents, summed_rewards
 from rlightning_aio.cli.options import AsJson, Config, Overrides
 from rlightning_aio.cli.policies import Responder, respond_to_all
@@ -34,7 +36,7 @@ from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.policies.masks import allowed_action
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.registry import ENVS
+from rlightning_aio.registry import ENVS, placement_of
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -70,7 +72,8 @@ class _Finding:
         steps: how many steps it made; none if only a policy can choose its actions.
         is_played: with ``--steps``; episodes: number that have ended then; step_us: median time of
             a step in its env.
-        problems: in words, each with what to do.
+        problems: in words, each with what to do; leaks: memory grows; is_random: a seed does not
+            repeat its results.
     """
 
     name: str
@@ -87,6 +90,8 @@ class _Finding:
     episodes: int = 0
     step_us: float | None = None
     problems: list[str] = field(default_factory=list[str])
+    leaks: bool = False
+    is_random: bool = False
 
 
 def check(
@@ -137,8 +142,8 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
 
 async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
     """Build one env of the entry and step it."""
-    one = [config.model_copy(update={"num_workers": 1})]
-    async with rlightning_aio.build_env_group(one) as group:
+    one = config.model_copy(update={"num_workers": 1, "recycle": {}})
+    async with rlightning_aio.build_env_group([one]) as group:
         (meta,) = group.metas
         found.observation_space = str(meta.observation_space)
         found.action_space = str(meta.action_space)
@@ -154,10 +159,12 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
                 batch, _ = await group.collect_async()
             found.steps = _STEPS
             if steps:
-                await _play(group, steps, found)
+                await _play(config, group, steps, found)
                 await _repeat(group, min(steps, _REPEATED), found)
         if steps:
             await _compare_spaces(group, min(steps, _LOOKED_AT), found)
+    if steps and (config.recycle or found.leaks) and not found.is_random:
+        await _renew(one, found)
 
 
 def _has_no_samples(space: Any) -> bool:
@@ -172,10 +179,10 @@ def _has_no_samples(space: Any) -> bool:
 # -- what is wrong with an env ----------------------------------------------------------
 
 
-async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
+async def _play(config: EnvConfig, group: EnvGroup, steps: int, found: _Finding) -> None:
     """Play `steps` steps, and look at rewards, at times, and at what episodes leave behind."""
     (worker,) = group.get_workers()
-    pid, samples, times = worker["pid"] or "self", list[dict[str, float]](), list[int]()
+    pid, samples, times = worker["pid"] or os.getpid(), list[dict[str, float]](), list[int]()
     rewards = bad = 0
     respond = Responder(group, None, 0)
     batch, _ = await group.reset(seed=0)
@@ -191,25 +198,30 @@ async def _play(group: EnvGroup, steps: int, found: _Finding) -> None:
     found.step_us = float(np.median(times)) / 1e3 if times else None
     if bad:
         found.problems.append(f"{bad} of {rewards} rewards are NaN or infinite")
-    found.problems += _leaks(samples)
+    leaks = _leaks(samples, can_recycle=_can_recycle(config))
+    found.problems, found.leaks = found.problems + leaks, any("recycle" in text for text in leaks)
 
 
-def _held(pid: int | str) -> dict[str, float]:
-    """Return what a process holds: open descriptors, threads, children, memory in MB."""
+def _held(pid: int) -> dict[str, float]:
+    """Return what a process holds: open descriptors, threads, children; and MB, with theirs."""
     process = Path(f"/proc/{pid}")
     if not process.exists():
         return {}
     children = sum(len(one.read_text().split()) for one in process.glob("task/*/children"))
-    pages = int((process / "statm").read_text().split()[1])
     return {
         "open descriptors": len([*(process / "fd").iterdir()]),
         "threads": len([*(process / "task").iterdir()]),
         "child processes": children,
-        "MB of memory": pages * os.sysconf("SC_PAGE_SIZE") / 1e6,
+        "MB of memory": resident_mb(pid),
     }
 
 
-def _leaks(samples: list[dict[str, float]]) -> list[str]:
+def _can_recycle(config: EnvConfig) -> bool:
+    refuses = placement_of(config.backend, config.placement).refuses
+    return "recycle" not in refuses and not ENVS.is_hardware(config.backend)
+
+
+def _leaks(samples: list[dict[str, float]], *, can_recycle: bool) -> list[str]:
     """Say what has grown from the second episode to the last; the first loads and compiles."""
     if len(samples) < 4:
         return []
@@ -221,13 +233,36 @@ def _leaks(samples: list[dict[str, float]]) -> list[str]:
                 f"{more:.0f} more {name} after {count} episodes: close or drop in reset what the "
                 "episode before has opened"
             )
+            if name == "MB of memory" and can_recycle:
+                # Room for a hundred such episodes.
+                limit = 100 * math.ceil((before + 100 * more / count) / 100)
+                found[-1] += (
+                    f"; an episode leaves {more / count:.2g} MB: recycle: {{memory_mb: {limit}}} "
+                    "has a worker with one env replaced in time"
+                )
     return found
+
+
+async def _renew(config: EnvConfig, found: _Finding) -> None:
+    """Look whether an env's random numbers go on in the next worker."""
+    played: list[list[bytes]] = []
+    for recycle in ({}, {"episodes": 1}):
+        one = config.model_copy(update={"recycle": recycle})
+        async with rlightning_aio.build_env_group([one]) as group:
+            batches = [(await group.reset(seed=seed))[0] for seed in (1, None, None)]
+        played.append([_contents(batch) for batch in batches])
+    if played[0] != played[1]:
+        found.problems.append(
+            "its random numbers begin anew when its worker is replaced (recycle): keep generators "
+            "in attributes of the env or its wrappers, or define save_state() and load_state()"
+        )
 
 
 async def _repeat(group: EnvGroup, steps: int, found: _Finding) -> None:
     """Play twice with the same seed and actions."""
     first, again = [await _played(group, steps) for _ in range(2)]
     differs = next((k for k in range(steps + 1) if first[k] != again[k]), None)
+    found.is_random = differs is not None
     if differs is not None:
         where = "the reset" if differs == 0 else f"step {differs}"
         found.problems.append(

@@ -162,6 +162,12 @@ def _check_on_env_error(config: EnvConfig) -> str | None:
     return None
 
 
+def _check_recycle(config: EnvConfig) -> str | None:
+    if config.recycle and ENVS.is_hardware(config.backend):
+        return f"what backend {config.backend!r} moves can't belong to two workers at a time"
+    return None
+
+
 _COMPARED_WITH = {
     "task": ("num_workers",),
 }
@@ -174,6 +180,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "on_env_error": _check_on_env_error,
+    "recycle": _check_recycle,
 }
 
 

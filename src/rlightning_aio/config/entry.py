@@ -94,6 +94,10 @@ class EnvConfig(_Fields):
     env and begin another episode, whose first result is marked like that of a replaced worker."""
     max_restarts: int = Field(default=3, ge=0)
     """Number of restarts in a row, without a completed step in between, before giving up."""
+    recycle: dict[Literal["episodes", "memory_mb"], Annotated[int, Field(ge=1)]] = {}
+    """When a worker is replaced between two episodes, before a leak ends it: once it has played so
+    many (``{episodes: 500}``, of all its envs together), or before its resident memory, with that
+    of its descendants, exceeds a limit in MB (``{memory_mb: 4000}``). Nothing is lost or marked."""
     imports: tuple[str, ...] = Field(default=(), strict=False)
     """Modules imported in the worker before the env is built."""
     interpreter: str | None = None

@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import io
 import pickle
+import random
 import sys
 from dataclasses import dataclass
 from inspect import iscoroutinefunction, unwrap
-from types import FunctionType, ModuleType
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import gymnasium as gym
@@ -29,7 +30,15 @@ from rlightning_aio.protocol.pickling import CodePickler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-__all__ = ["SavedState", "load_state", "parts_of", "save_state", "versions_of"]
+__all__ = [
+    "SavedState",
+    "load_generators",
+    "load_state",
+    "parts_of",
+    "save_generators",
+    "save_state",
+    "versions_of",
+]
 
 NOT_STATE: Final = frozenset(
     ("config", "worker_index", "env_id", "trainer_pid", "_preprocess_fn", "_background")
@@ -391,3 +400,91 @@ def load_state(env: Any, state: SavedState) -> None:
     # Models come before the data that are computed from them.
     for path, _ in sorted(state.parts, key=lambda part: not part[1].startswith("MjModel")):
         parts[path].kind.load(parts[path].value, states[path])
+
+
+# -- generators alone ---------------------------------------------------------------------
+
+_GENERATORS: Final = (
+    *(np.random.Generator, np.random.RandomState, np.random.BitGenerator),
+    random.Random,
+)
+_CODE: Final = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
+_WITHOUT: Final[tuple[type[Any], ...]] = (*_PLAIN, *_CODE, *_GENERATORS, np.ndarray)
+_OF_GYMNASIUM: Final = ("_np_random", "_np_random_seed")
+"""Attributes of envs and spaces; they are None until the first draw."""
+
+
+def save_generators(env: Any) -> dict[str, Any]:
+    """Return the random generators of an env, its wrappers and all that they hold; to be pickled.
+
+    With them, another env goes on with the random numbers of this one from its next reset on. What
+    saves itself (see `BaseEnv.save_state`), and a console, is saved as a whole.
+
+    Raises:
+        NotImplementedError: a state can't be read.
+    """
+    found: dict[str, Any] = {}
+    for path, holder in _holders(env):
+        if (kind := _saves_generators(holder)) is not None:
+            found[path] = kind.save(holder)
+        elif own := {k: v for k, v in _members(holder) if _is_generator(k, v)}:
+            found[path] = own
+    return found
+
+
+def load_generators(env: Any, saved: Mapping[str, Any]) -> None:
+    """Go on with the random numbers of another env; what isn't made yet begins as it is made."""
+    for path, holder in _holders(env):
+        if path not in saved:
+            continue
+        if (kind := _saves_generators(holder)) is not None:
+            kind.load(holder, saved[path])
+        elif type(holder) is list:
+            for place, generator in saved[path].items():
+                cast("list[Any]", holder)[place : place + 1] = [generator]
+        else:
+            held = cast("dict[Any, Any]", holder if type(holder) is dict else _held(holder))
+            held.update(saved[path])
+
+
+def _is_generator(name: Any, value: Any) -> bool:
+    return isinstance(value, _GENERATORS) or name in _OF_GYMNASIUM
+
+
+def _saves_generators(holder: Any) -> _Kind | None:
+    """Return how to save an object whose generators are only in its whole state."""
+    kind = cast("Any", type(holder))
+    if hasattr(kind, "save_state") and hasattr(kind, "load_state"):
+        is_default = kind.save_state.__module__ == "rlightning_aio.envs.base"
+        return None if is_default else _OWN
+    known = _kind_of(holder)
+    return known if known is not None and known.save is _console_state else None
+
+
+def _holders(env: Any) -> Iterator[tuple[str, Any]]:
+    """Yield all that an env consists of, by path; each object once."""
+    queue = [("env", env)]
+    known = {id(env)}
+    for path, holder in queue:
+        yield path, holder
+        for name, value in sorted(_members(holder), key=_name_first):
+            if id(value) in known or isinstance(value, _WITHOUT) or name in NOT_STATE:
+                continue
+            if _kind_of(value) is not _KEPT:
+                known.add(id(value))
+                queue.append((f"{path}.{name}", value))
+
+
+def _name_first(member: tuple[Any, Any]) -> str:
+    return str(member[0])
+
+
+def _members(holder: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield what an object, a list or a dict holds, by name."""
+    if type(holder) is list:
+        if holder and not isinstance(holder[0], _PLAIN):
+            yield from enumerate(cast("list[Any]", holder))
+    elif type(holder) is dict:
+        yield from cast("dict[Any, Any]", holder).items()
+    else:
+        yield from getattr(holder, "__dict__", {}).items()

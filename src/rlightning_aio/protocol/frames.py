@@ -34,6 +34,7 @@ class FrameKind(IntEnum):
     CLOSED = 12  # worker: errors of close(), by env
     ABORT = 13  # trainer; the request's entry
     LOST = 14  # worker; index of an env: why it is gone, and the entry of its request
+    MOVED = 15  # worker; the request's entry: a reset that the next worker executes
 
 
 class Frame(NamedTuple):

@@ -206,10 +206,17 @@ class WorkerRings:
 
     Attributes:
         own: the worker's own counts; see `exchange`.
-        made: how often each env was made, by this worker and by those that it replaces.
+        made: how often each env was made, by this worker and by those that it replaces; in the
+            memory of these rings unless that of others is given.
     """
 
-    def __init__(self, buffer: memoryview, num_envs: int, bell: WorkerBell) -> None:
+    def __init__(
+        self,
+        buffer: memoryview,
+        num_envs: int,
+        bell: WorkerBell,
+        made: memoryview | None = None,
+    ) -> None:
         self._words, requests, reports = _split(buffer, num_envs)
         self._reports = reports
         self._mask = _capacity(num_envs) - 1
@@ -220,7 +227,7 @@ class WorkerRings:
         self._frames_sent = 0
         self._stops = _stops(self._words, num_envs)
         self._stopped = [0] * num_envs
-        self.made = _made(self._words, num_envs)
+        self.made = _made(self._words if made is None else _split(made, num_envs)[0], num_envs)
 
     def to_stop(self, first_slot: int) -> list[int]:
         """Return the indices of the envs that must stop now.

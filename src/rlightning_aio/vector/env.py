@@ -18,12 +18,14 @@ from gymnasium.vector import AutoresetMode, utils
 from rlightning_aio._core.group.api.sync import due_for_reset
 from rlightning_aio._core.group.state.episodes import as_int
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.contents import lost_rows, reported_infos
+from rlightning_aio.batch.contents import lost_rows, reported_info_list, reported_infos
+from rlightning_aio.batch.infos import listed, vector_infos
 from rlightning_aio.envs.adapted.makers import adapted
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.errors import BadAction, EnvFault, ResetNeeded, SnapshotError
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
+from rlightning_aio.trees import index
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Stepped, with_deaths
@@ -123,7 +125,10 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         self._mask: Any = None
         # Every call so far has returned what it was about, and nothing is in flight.
         self._is_whole = True
-        config = adapted(env_fns, self.autoreset_mode, entry)
+        mode = self.autoreset_mode
+        # A worker can be renewed before a reset, but not within a step.
+        self._resets = mode == AutoresetMode.SAME_STEP and bool(entry.get("recycle"))
+        config = adapted(env_fns, AutoresetMode.DISABLED if self._resets else mode, entry)
         if max_concurrency is not None:
             together = per_worker(max_concurrency, len(env_fns))
             config = {"envs_per_process": together, **config}
@@ -342,6 +347,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
 
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
         self._answerable, self._lost = batch, None
+        lost = np.zeros(self.num_envs, np.bool_)
         if lost_rows(batch):
             stepped, lost = with_deaths(batch, self._observations, self._due, self.autoreset_mode)
             if self.autoreset_mode == AutoresetMode.NEXT_STEP and lost.any():
@@ -349,9 +355,25 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         else:
             ends = batch.terminated, batch.truncated
             stepped = Stepped(batch.observation, batch.reward, *ends, self._infos(batch))
+        if self._resets:
+            stepped = self._with_resets(stepped, lost)
         found = (self._observed(stepped.observations), *stepped[1:])
         self._is_whole = True
         return found
+
+    def _with_resets(self, last: Stepped, lost: NDArray[np.bool_]) -> Stepped:
+        """Reset the envs whose episodes have ended in a step; see `SameStep`."""
+        # Those that have lost theirs have begun another.
+        chosen = np.flatnonzero((last.terminated | last.truncated) & ~lost)
+        if not len(chosen):
+            return last
+        batch, _ = self.group.reset(env_ids=self._ids(chosen.tolist()))
+        each = listed(last.infos, self.num_envs)
+        for k, info in zip(chosen.tolist(), reported_info_list(batch), strict=True):
+            final = copying.deepcopy(index(last.observations, k))
+            each[k] = {**info, "final_info": each[k], "final_obs": final}
+        observations = merged(last.observations, batch.observation, chosen, self.num_envs)
+        return last._replace(observations=observations, infos=vector_infos(each))
 
     # -- both -------------------------------------------------------------------------
 

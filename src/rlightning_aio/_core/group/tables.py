@@ -6,8 +6,12 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
+    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.conditions import Conditions, Lifetime, Observed
     from rlightning_aio._core.group.state.env_table import EnvTable
@@ -71,3 +75,8 @@ class Tables:
             if record.is_hardware:
                 host = record.host
                 host.stop(slot - host.first_slot, self.requests.numbering.number(slot))
+
+    def slots_of(self, record: HostRecord) -> NDArray[np.intp]:
+        """Return the slots of the envs that a host has now: others may be with its peer."""
+        slots = np.array(record.slots, np.intp)
+        return slots[self.requests.hosts[slots] == record.host.host_id]

@@ -169,7 +169,7 @@ class Trace(Scope):
     def _note_unfinished(self, record: HostRecord, now: int) -> None:
         """Note the requests that a host executes, from their beginning in the env until now."""
         requests = self._core.requests
-        slots = np.array(record.slots, np.intp)
+        slots = self._core.tables.slots_of(record)
         owed: dict[int, int] = {}  # Times of sending by entry, the oldest first.
         for slot in requests.owed(slots).tolist():
             sent = requests.sent_ns.item(slot)

@@ -17,6 +17,7 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     ErrorText,
     Lost,
+    Moved,
     NewSchema,
     NotBuilt,
     Raised,
@@ -79,6 +80,7 @@ _ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
     Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
     Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
     Lost: lambda it: (FrameKind.LOST, it.env_index, pickle.dumps(it[2:])),
+    Moved: lambda it: (FrameKind.MOVED, it.entry, pickle.dumps(it[2:])),
     Closed: lambda it: (FrameKind.CLOSED, 0, pickle.dumps(it.errors)),
 }
 """By the class of a completion: kind, number and payload of its frame."""
@@ -96,6 +98,7 @@ _DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
     FrameKind.VALUE: lambda host, entry, payload: Value(host, entry, pickle.loads(payload)),
     FrameKind.ERROR: lambda host, entry, payload: Raised(host, entry, pickle.loads(payload)),
     FrameKind.LOST: lambda host, index, payload: Lost(host, index, *pickle.loads(payload)),
+    FrameKind.MOVED: lambda host, entry, payload: Moved(host, entry, *pickle.loads(payload)),
     FrameKind.CLOSED: lambda host, _, payload: Closed(host, pickle.loads(payload)),
 }
 """By the kind of a frame: its completion, of a host, a number and a payload."""

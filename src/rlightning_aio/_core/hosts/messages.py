@@ -42,6 +42,7 @@ __all__ = [
     "EnvState",
     "ErrorText",
     "Lost",
+    "Moved",
     "NewSchema",
     "NotBuilt",
     "OutOfBand",
@@ -129,6 +130,8 @@ class WorkerPlace:
         host_id: of its host, one of `num_hosts`.
         first_slot, num_envs: slots of its envs.
         bell_offset, rings_offset: in the arena.
+        made_offset: of the rings whose memory counts how often each env was made: its own, or
+            those of the peer that it is renewed for.
     """
 
     host_id: int
@@ -137,6 +140,7 @@ class WorkerPlace:
     num_envs: int
     bell_offset: int
     rings_offset: int
+    made_offset: int
 
 
 # -- completions ------------------------------------------------------------------
@@ -273,6 +277,23 @@ class Lost(NamedTuple):
     answered: int = 0
 
 
+class Moved(NamedTuple):
+    """A reset was not executed, as the worker is renewed (`EnvConfig.recycle`).
+
+    Attributes:
+        entry: of the reset.
+        arguments: packed, of the same reset in the next worker, or in this one.
+        is_due: the next worker executes it, if there is one; else that is only to be started.
+        resident_mb: memory of the worker.
+    """
+
+    host_id: int
+    entry: int
+    arguments: bytes
+    is_due: bool
+    resident_mb: float
+
+
 class Withdrawn(NamedTuple):
     """A request that was aborted will not be answered: it had not begun."""
 
@@ -297,7 +318,7 @@ class Taken(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Lost | Withdrawn | Taken
+    | Reported | Result | Value | Raised | Lost | Moved | Withdrawn | Taken
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

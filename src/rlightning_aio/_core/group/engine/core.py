@@ -65,6 +65,7 @@ class Core:
         self.lifetime = tables.lifetime
         self.sums = tables.sums
         self.results = results = Results(tables, zero_copy=zero_copy)
+        supervisor.renewals.on_move = results.use_schemas
         self.intake = intake = Intake(tables, supervisor, results)
         self.apply_completions = intake.apply_completions
         self.waiting = waiting = Waiting(tables, supervisor, poller, intake)
@@ -81,7 +82,8 @@ class Core:
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
         """Start the hosts."""
         for record in self.supervisor.records:
-            self.results.begin_schemas(record.slots)
+            slots: list[int] = self.tables.slots_of(record).tolist()
+            self.results.begin_schemas(record.host.host_id, slots)
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
         self.steps.begin()

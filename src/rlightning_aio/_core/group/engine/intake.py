@@ -20,6 +20,7 @@ from rlightning_aio._core.hosts.messages import (
     Died,
     ErrorText,
     Lost,
+    Moved,
     NewSchema,
     NotBuilt,
     Raised,
@@ -74,6 +75,7 @@ class Intake:
             Value: self._on_value,
             Raised: self._on_raised,
             Lost: self._on_lost,
+            Moved: self._on_moved,
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Taken: self._on_taken,
@@ -246,8 +248,20 @@ class Intake:
         self._fail(slots, error_for)
 
     def _on_new_schema(self, completion: NewSchema) -> None:
-        slots = self._supervisor.records[completion.host_id].slots
-        self._results.note_schema(slots.start, completion.number, completion.schema)
+        self._results.note_schema(completion.host_id, completion.number, completion.schema)
+
+    def _on_moved(self, completion: Moved) -> None:
+        """Send a reset that a worker has handed on to the next one, or back."""
+        slot = self._requests.end(completion.host_id, completion.entry)
+        if slot is None:
+            return
+        renewals = self._supervisor.renewals
+        host_id = renewals.take_over(completion, slot)
+        self._requests.anything_ended = True  # To start a worker disarms the bell.
+        self._requests.in_flight[host_id] += 1
+        entries = np.array([completion.entry], np.int64)
+        self._supervisor.submit(host_id, entries, [completion.arguments])
+        renewals.close_if_left(completion.host_id)
 
     def _fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
@@ -271,7 +285,7 @@ class Intake:
             episodes.give_up(loss.slots)
             self._fail(owed, loss.error)
             return
-        self._keep_ready(loss.slots)
+        self._keep_ready(loss.host_id, loss.slots)
         record = self._supervisor.records[loss.host_id]
         is_lost = loss.resets if record.place is None else record.was_shown
         if is_lost:
@@ -281,14 +295,14 @@ class Intake:
         # A replacement answers steps and resets only.
         again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN) & loss.resets
         self._fail(owed[~again], loss.error)
-        self._supervisor.replace(loss.host_id)
-        self._send_again(loss.host_id, owed[again])
+        host_id = self._supervisor.replace(loss.host_id)
+        self._send_again(host_id, owed[again])
 
-    def _keep_ready(self, slots: range) -> None:
+    def _keep_ready(self, host_id: int, slots: Sequence[int]) -> None:
         """Decode infos of results that are ready, as a replacement announces other schemas."""
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
             self._results.detach_info(slot)
-        self._results.begin_schemas(slots)
+        self._results.begin_schemas(host_id, slots)
 
     def _send_again(self, host_id: int, slots: NDArray[np.intp]) -> None:
         """Send the steps and resets that a dead worker owed, as resets."""

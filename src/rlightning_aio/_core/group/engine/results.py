@@ -18,7 +18,7 @@ from rlightning_aio.protocol.slab import TRUNCATED
 from rlightning_aio.trees import holds_tensor, index, mapped, stacked
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,6 +50,7 @@ class Results:
         self._out_of_band: dict[int, Any] = {}
         # Of each slot's host; a host's slots share one dict.
         self._schemas: list[dict[int, InfoSchema]] = [{} for _ in range(len(envs))]
+        self._schemas_of: dict[int, dict[int, InfoSchema]] = {}
         # Bytes of a row's info that any schema uses; 0 if there is none.
         self._info_width = 0
         self._restarted = np.zeros(len(envs), np.bool_)
@@ -99,17 +100,21 @@ class Results:
             self._out_of_band[slot] = out_of_band
             self._conditions.note(BESIDE_ROWS, True)
 
-    def begin_schemas(self, slots: range) -> None:
-        """The host of `slots` announces its ways of holding infos (anew, after a restart)."""
-        shared: dict[int, InfoSchema] = {}
+    def begin_schemas(self, host_id: int, slots: Sequence[int]) -> None:
+        """A host, of `slots`, announces its ways of holding infos (anew, after a restart)."""
+        self._schemas_of[host_id] = {}
+        self.use_schemas(host_id, slots)
+
+    def use_schemas(self, host_id: int, slots: Sequence[int]) -> None:
+        """The infos of `slots` come from a host from now on."""
         # A new list: batches that were handed out still read the old one.
         self._schemas = list(self._schemas)
         for slot in slots:
-            self._schemas[slot] = shared
+            self._schemas[slot] = self._schemas_of[host_id]
 
-    def note_schema(self, first_slot: int, number: int, schema: InfoSchema) -> None:
+    def note_schema(self, host_id: int, number: int, schema: InfoSchema) -> None:
         """A host holds infos in one more way."""
-        self._schemas[first_slot][number] = schema
+        self._schemas_of[host_id][number] = schema
         self._info_width = max(self._info_width, schema.size, 1)
 
     def mark_restarted(self, report: Report) -> None:

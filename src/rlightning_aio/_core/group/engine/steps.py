@@ -111,9 +111,10 @@ class Steps:
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
         self._has_places = bool(self._supervisor.places.servers)
         # Places are empty as yet; `_asks_a_place` finds requests to them.
-        local = [host for host in hosts if host.first_slot < envs.num_local]
+        own: set[int] = {*self._requests.hosts[: envs.num_local].tolist()}
+        local = [hosts[host_id] for host_id in own]
         is_inline = len(local) == 1 and isinstance(local[0], Executing)
-        self._requests.in_rings = None not in self._requests.rings[: len(local)]
+        self._requests.in_rings = all(self._requests.rings[host_id] for host_id in own)
         in_one_slab = len(slabs) == 1 and envs.num_local > 0
         ordinary = (
             in_one_slab

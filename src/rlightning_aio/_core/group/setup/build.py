@@ -67,9 +67,10 @@ def assemble(plan: Plan, driver: Driver, *, shares_thread: bool) -> Core:
 
 def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core:
     arena = tables.arena
-    bell_offset = arena.append(bell_size(len(orders)))
-    bell_memory = arena.map(bell_offset, bell_size(len(orders)))
-    bell = TrainerBell(bell_memory, len(orders))
+    num_hosts = len(tables.requests.rings)
+    bell_offset = arena.append(bell_size(num_hosts))
+    bell_memory = arena.map(bell_offset, bell_size(num_hosts))
+    bell = TrainerBell(bell_memory, num_hosts)
     tables.resources["bell"] = bell
     supervisor = Supervisor(tables)
     poller = Poller(tables.requests, bell, tables.num_cores, clock=tables.clock)
@@ -80,7 +81,7 @@ def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core
         bell=bell,
         bell_offset=bell_offset,
         rings=tables.requests.rings,
-        num_hosts=len(orders),
+        num_hosts=num_hosts,
         configs=[order.config for order in orders],
         objection=supervisor.objection,
         busy_since=tables.requests.busy_since,
@@ -92,6 +93,14 @@ def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
+    for order, record in zip(orders, list(tables.records), strict=True):
+        if not order.config.recycle:
+            continue
+        host_id = len(supervisor.hosts)
+        host = host_class(order.config)(host_id, record.slots.start, order, wiring)
+        host.count_with(record.host)
+        supervisor.add(host, order.config, record)
+        poller.add(host)
     return Core(tables, supervisor, poller, zero_copy=plan.zero_copy)
 
 
@@ -113,7 +122,8 @@ def _tables(
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)
-    requests = Requests(hosts, len(orders), conditions)
+    num_peers = sum(bool(order.config.recycle) for order in orders)
+    requests = Requests(hosts, len(orders) + num_peers, conditions)
     records: list[HostRecord] = []
     return Tables(
         envs=envs,

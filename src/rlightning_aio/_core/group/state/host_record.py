@@ -47,7 +47,10 @@ class Stage(Enum):
     REBUILDING = auto()
     """A replacement is starting."""
     GIVEN_UP = auto()
+    CLOSING = auto()
+    """All its envs are in the next worker."""
     CLOSED = auto()
+    """It has no worker. Where the entry is recycled, one may be started."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +58,7 @@ class HostLoss:
     """The loss of the states of a host's envs, described when it was found.
 
     Attributes:
-        host_id, slots: of the host.
+        host_id, slots: of the host, and of the envs that it had.
         owed: its slots with a request in flight.
         death: of its worker, with the cause as the group knows it.
         replaced: a replacement is started; else the host is given up.
@@ -70,7 +73,7 @@ class HostLoss:
     """
 
     host_id: int
-    slots: range
+    slots: Sequence[int]
     owed: NDArray[np.intp]
     death: Death
     replaced: bool
@@ -122,7 +125,8 @@ class HostRecord:
     Attributes:
         started: its envs, once built.
         order: the rows of its envs, once assigned.
-        start_by: the deadline of its start; late: it missed that, and is being killed.
+        start_by: the deadline of its start, or of its end while it is `CLOSING`; late: it missed
+            that, and is being killed.
         traffic: see `Killable`, when `note_traffic` was last called.
         restart_at: the time of its next restart; restarts: the number so far.
         held: requests (entries and arguments) since its death, kept until a replacement is up.
@@ -137,6 +141,10 @@ class HostRecord:
         rebuild_error: the error of its replacement while rebuilding the envs.
         gone: by slot, the errors of envs that are not replaced though their host goes on.
         last_loss: its last death.
+        peer: the host that starts the next worker of the same envs; None unless they are recycled.
+        is_next: its worker takes over the envs of the one in the peer, which goes on meanwhile.
+        recycled: its workers that were replaced so; resident_mb: the most that one is known to
+            have had; waits: resets that waited for the start of the next one.
         killable: the host, if it can be killed; place: if its worker starts itself.
         was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
             user may set it in motion again; lost_client: its client was, not its episode alone.
@@ -144,7 +152,7 @@ class HostRecord:
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
-        slots: of its envs.
+        slots: of its envs; some may be in the peer's worker (`Tables.slots_of`).
     """
 
     host: Host
@@ -170,6 +178,11 @@ class HostRecord:
     rebuild_error: ErrorText | None = None
     gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     last_loss: HostLoss | None = None
+    peer: HostRecord | None = field(default=None, repr=False)
+    is_next: bool = False
+    recycled: int = 0
+    resident_mb: float = 0.0
+    waits: int = 0
     killable: Killable | None = field(init=False)
     place: SelfStarting | None = field(init=False)
     was_shown: bool = False

@@ -69,7 +69,7 @@ class Sums:
         self._kept: list[tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.int64], int, int]]
         self._ends: list[tuple[NDArray[Any], NDArray[np.bool_], NDArray[Any], NDArray[Any]]]
         self._kept, self._ends, self._room = [], [], _MOST_ROWS
-        # By host and number of its restarts, as its worker's accounts end with it.
+        # By host and number of its replacements, as its worker's accounts end with it.
         self._computing_ns: dict[tuple[int, int], int] = {}
 
     # -- what comes in ----------------------------------------------------------------
@@ -222,6 +222,9 @@ class Sums:
         chosen = set(slots.tolist())
         records = [record for record in self._records if record.slots.start in chosen]
         found["restarts"] = sum(record.restarts for record in records)
+        found["recycled"] = sum(record.recycled for record in records)
+        found["recycle_waits"] = sum(record.waits for record in records)
+        found["largest_resident_mb"] = max((_memory_of(record) for record in records), default=0.0)
         computing = self._computing_of(records)
         return found if computing is None else {**found, "seconds_computing": computing}
 
@@ -246,7 +249,8 @@ class Sums:
         A replaced worker counts as it was when it was last asked for.
         """
         for record in records:
-            key, now = (record.host.host_id, record.restarts), record.host.processor_ns()
+            number = record.restarts + record.recycled
+            key, now = (record.host.host_id, number), record.host.processor_ns()
             if now is not None:  # Of living threads: one may have ended.
                 self._computing_ns[key] = max(now, self._computing_ns.get(key, 0))
         hosts = {record.host.host_id for record in records}
@@ -283,6 +287,12 @@ class Sums:
                 for kind, name in kinds.items()
             },
         }
+
+
+def _memory_of(record: HostRecord) -> float:
+    """Return the most resident memory that a worker is known to have had, in MB."""
+    record.resident_mb = max(record.resident_mb, record.host.resident_mb())
+    return record.resident_mb
 
 
 def _ended(

@@ -127,6 +127,7 @@ def host_loss(
     requests: Requests,
     record: HostRecord,
     death: Death,
+    slots: Sequence[int],
     owed: NDArray[np.intp],
     then: str,
     *,
@@ -147,7 +148,7 @@ def host_loss(
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     return HostLoss(
         host_id=record.host.host_id,
-        slots=record.slots,
+        slots=slots,
         owed=owed,
         death=death,
         replaced=replaced,

@@ -16,13 +16,12 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from rlightning_aio._core.group.state.host_record import Stage
 from rlightning_aio._core.group.supervision.fault_messages import culprit_of
 from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.host_record import HostRecord
@@ -140,7 +139,7 @@ class HangDetector:
             self._kill_aborted(record, slot_of(entry))
             return math.inf
         record.is_hung = True
-        busy = self._requests.owed(np.array(record.slots, np.intp))
+        busy = self._requests.owed(self._tables.slots_of(record))
         record.culprit = culprit_of(record, (entry,), self._requests, busy)
         if (observer := self._tables.observed.observer) is not None:
             observer.note_hang(record)
@@ -162,7 +161,7 @@ class HangDetector:
     def _progress(self, record: HostRecord, current: tuple[int, int]) -> tuple[int, ...]:
         """Return numbers that change with every request, reply, part of a reply, sign of life."""
         assert record.killable is not None
-        slots = slice(record.slots.start, record.slots.stop)
+        slots = self._tables.slots_of(record)
         entries = int(self._requests.numbering.entry[slots].sum())
         # Where all envs wait, the worker says now and then that its event loop runs.
         return self._in_flight(record), entries, record.killable.traffic, *current

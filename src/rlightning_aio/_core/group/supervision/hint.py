@@ -77,7 +77,7 @@ class Hint:
         sums = self._tables.sums
         entries: dict[str, list[HostRecord]] = {}
         for record in self._tables.records:
-            if record.is_worker_here:
+            if record.is_worker_here and len(self._tables.slots_of(record)):
                 entries.setdefault(record.config.name, []).append(record)
         for name, records in entries.items():
             now = sums.of(np.concatenate([np.array(r.slots) for r in records]))

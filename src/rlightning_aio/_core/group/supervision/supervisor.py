@@ -35,6 +35,7 @@ from rlightning_aio._core.group.supervision.hang_detector import HangDetector, r
 from rlightning_aio._core.group.supervision.hint import Hint
 from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.places import Places
+from rlightning_aio._core.group.supervision.renewals import Renewals
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
 from rlightning_aio._core.hosts.limits import restart_pause
@@ -82,7 +83,8 @@ class Supervisor:
         places: the hosts whose workers start themselves.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hint: on settings; crash_log: of
-            restarts; losses: of single envs; overdue: names envs that owe a result for long.
+            restarts; losses: of single envs; overdue: names envs that owe a result for long;
+            renewals: replaces workers before they fail.
         metas: one for each env; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
             step yet.
@@ -115,15 +117,21 @@ class Supervisor:
         self.hint = Hint(tables)
         self.overdue = Overdue(tables)
         self.crash_log = CrashLog()
+        self.renewals = Renewals(tables, self.replace, self._update_any_deaths)
         self.losses = EnvLosses(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False
 
-    def add(self, host: Host, config: EnvConfig) -> None:
-        """Add a host before the start; its slots follow those of the previous host."""
+    def add(self, host: Host, config: EnvConfig, peer: HostRecord | None = None) -> None:
+        """Add a host before the start; its slots follow those of the previous host.
+
+        That of a `peer` has the same slots, and is started when its worker is due.
+        """
         self.hosts.append(host)
-        record = HostRecord(host, config)
+        record = HostRecord(host, config, peer=peer)
+        if peer is not None:
+            peer.peer, record.stage = record, Stage.CLOSED
         self.records.append(record)
         self.detector.add(record)
         if record.place is not None:
@@ -139,11 +147,12 @@ class Supervisor:
             return self.metas
         try:
             self._now = now
-            for record in self.records:
+            first = [record for record in self.records if record.stage is Stage.NEW]
+            for record in first:
                 self._launch_first(record)
             yield from self._until(Stage.BUILT)
             self._lay_out_rows()
-            for record in self.records:
+            for record in first:
                 if record.place is not None:
                     self.places.leave(record)
                     record.host.attach(
@@ -247,15 +256,17 @@ class Supervisor:
                 self._on_attached(record)
         else:
             was_built = record.stage not in (Stage.BUILDING, Stage.REBUILDING)
-            record.stage = Stage.CLOSED
             # The start error of a host that was killed while it started is known already.
-            owed = self._requests.owed(np.array(record.slots, np.intp))
+            owed = self._requests.owed(self._tables.slots_of(record))
             for index, error in completion.errors if was_built else ():
                 if len(owed) and error.type_name == "WorkerDied":
                     late = self._envs.env_ids[owed.item(0)]
                     error = replace(error, text=f"{error.text}; {late} owed a reply")  # noqa: PLW2901
                 env_id = self._envs.env_ids[record.slots[index]]
                 self.close_errors.append((env_id, error))
+            record.stage = Stage.CLOSED
+            if self._lifetime.open:
+                self.renewals.note_closed(record)
 
     def _on_built(self, record: HostRecord, started: list[Any]) -> None:
         if record.stage is Stage.BUILDING:
@@ -276,6 +287,8 @@ class Supervisor:
         held, record.held = record.held, []
         for entries, arguments in held:
             record.host.submit(entries, arguments)
+        if record.peer is not None:
+            self.renewals.close_if_left(record.peer.host.host_id)
 
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
         if self._lifetime.open:
@@ -305,7 +318,7 @@ class Supervisor:
             return
         for record in self.records:
             if record.stage is Stage.GIVEN_UP and record.last_loss is not None:
-                asked = slots[np.isin(slots, record.slots)]
+                asked = slots[np.isin(slots, self._tables.slots_of(record))]
                 if len(asked):
                     raise record.last_loss.refusal(asked)
 
@@ -377,10 +390,12 @@ class Supervisor:
             return None
         if death.refused:
             record.restarts -= 1  # It has not started.
-        owed = self._requests.owed(np.array(record.slots, np.intp))
+        was_up = record.stage is Stage.UP
+        if not was_up:
+            self.renewals.give_back(record)
+        owed = self._requests.owed(self._tables.slots_of(record))
         if record.place is not None:
             return self._lose_client(record, death, owed)
-        was_up = record.stage is Stage.UP
         loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None
         if not loss.replaced:
@@ -434,9 +449,16 @@ class Supervisor:
         """Return the reason why the env of a client doesn't fit the group, or None."""
         return self.places.objection(meta, self.metas)
 
-    def replace(self, host_id: int) -> None:
-        """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
-        self._restart(self.records[host_id], self.clock())
+    def replace(self, host_id: int) -> int:
+        """Start the replacement of a host at once, if it needn't pause: `check` starts others.
+
+        Returns the host that has its envs now: the next worker may have been started already.
+        """
+        record = self.records[host_id]
+        if record.peer is not None and self.renewals.inherits(record):
+            return record.peer.host.host_id
+        self._restart(record, self.clock())
+        return host_id
 
     def _restart(self, record: HostRecord, now: float) -> None:
         if record.restart_at is None or record.restart_at > now:
@@ -466,14 +488,15 @@ class Supervisor:
         record.deaths[record.culprit] = deaths
         self._note_deaths(True)
         replaced, then = True, "it is replaced"
-        if is_fault:
+        slots: list[int] = self._tables.slots_of(record).tolist()
+        if is_fault and slots:  # Else the worker before goes on.
             replaced, then = record.restart_policy.count(deaths)
         if record.place is not None:
             then = then if not replaced else "its place waits for a client"
         if is_fault and replaced and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
-        loss = host_loss(self._envs, requests, record, death, owed, then, replaced=replaced)
+        loss = host_loss(self._envs, requests, record, death, slots, owed, then, replaced=replaced)
         if not is_fault:
             _log.info("%s", loss.message)
         elif replaced:

@@ -36,14 +36,18 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        return [self._described(record, now_ns) for record in self._tables.records]
+        return [
+            self._described(record, now_ns)
+            for record in self._tables.records
+            if record.peer is None or len(self._tables.slots_of(record))
+        ]
 
     def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
         env_ids, requests = self._envs.env_ids, self._tables.requests
-        slots = np.array(record.slots, np.intp)
+        slots = self._tables.slots_of(record)
         busy = requests.owed(slots)
         is_empty = record.place is not None and record.stage is Stage.DOWN
-        lost = record.slots if record.stage is Stage.GIVEN_UP else sorted(record.gone)
+        lost = slots if record.stage is Stage.GIVEN_UP else sorted(record.gone)
         return {
             "entry": record.config.name,
             "env_ids": [env_ids[slot] for slot in slots],
@@ -62,8 +66,11 @@ class Workers:
         `now_ns` is from the monotonic clock.
         """
         starting = [r for r in self._tables.records if r.is_starting]
-        if starting:
-            names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
+        if any(len(self._tables.slots_of(record)) for record in starting):
+            slots: list[int] = []
+            for record in starting:
+                slots += self._tables.slots_of(record).tolist()
+            names = [self._envs.env_ids[slot] for slot in slots]
             return f"not started yet: {_listed(names)}"
         env_ids, requests = self._envs.env_ids, self._tables.requests
         busy: list[int] = requests.owed(np.arange(len(self._envs))).tolist()
@@ -75,7 +82,7 @@ class Workers:
     def summary(self) -> str:
         """Summarise entries, envs, placement and worker processes in one line."""
         entries: dict[str, list[HostRecord]] = {}
-        for record in self._tables.records:
+        for record in (r for r in self._tables.records if r.stage is not Stage.CLOSED):
             entries.setdefault(record.config.name, []).append(record)
         return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
 

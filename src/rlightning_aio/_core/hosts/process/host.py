@@ -14,11 +14,13 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
+from rlightning_aio._core.hosts.memory import resident_mb
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -294,13 +296,15 @@ class ProcessHost(Host):
         self._start_payload = dumped_with_code(order)
         self._fork_server = ForkServerHandle.shared(order.config, wiring)
         self._wiring = wiring
+        rings_offset = wiring.arena.append(rings_size(self.num_envs))
         self._place = WorkerPlace(
             host_id,
             wiring.num_hosts,
             first_slot,
             self.num_envs,
             wiring.bell_offset,
-            wiring.arena.append(rings_size(self.num_envs)),
+            rings_offset,
+            rings_offset,
         )
         self._rings: memoryview | None = None
         self._link: Link | None = None
@@ -330,6 +334,10 @@ class ProcessHost(Host):
             raise
         self._alive = True
         self._link.send(FrameKind.START, payload=self._start_payload)
+
+    def count_with(self, peer: Host) -> None:
+        if isinstance(peer, ProcessHost):
+            self._place = replace(self._place, made_offset=peer._place.rings_offset)  # noqa: SLF001
 
     def attach(self, order: AttachOrder) -> None:
         self._fork_server.note_used(self, order.close_seconds)
@@ -422,6 +430,9 @@ class ProcessHost(Host):
 
     def current_request(self) -> tuple[int, int]:
         return (0, 0) if self._link is None else self._link.current_request()
+
+    def resident_mb(self) -> float:
+        return 0.0 if self.pid is None else resident_mb(self.pid)
 
     def processor_ns(self) -> int | None:
         return None if self.pid is None else processor_ns(self.pid)

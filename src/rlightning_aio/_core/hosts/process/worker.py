@@ -423,8 +423,10 @@ def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
     bell_memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
     bell = WorkerBell(bell_memory, place.num_hosts, place.host_id)
     rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
-    rings = WorkerRings(rings_memory, place.num_envs, bell)
-    worker = Worker(channel, arena, rings, place.first_slot, (bell_memory, rings_memory))
+    made_memory = map_shared(arena, place.made_offset, rings_size(place.num_envs))
+    rings = WorkerRings(rings_memory, place.num_envs, bell, made_memory)
+    shared = bell_memory, rings_memory, made_memory
+    worker = Worker(channel, arena, rings, place.first_slot, shared)
     # Not for ever: the env and what it holds are dropped with the worker.
     known = weakref.ref(worker)
 

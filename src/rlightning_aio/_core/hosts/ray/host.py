@@ -188,6 +188,7 @@ class RayHost(Host):
         self._life: _Life | None = None
         self._num_lives = 0
         self._started: list[EnvStarted] = []
+        self._order: AttachOrder | None = None
         self._table: RowTable | None = None
         self._closing = False
         # Only Ray knows the progress of a transfer.
@@ -212,13 +213,17 @@ class RayHost(Host):
 
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""
+        self._order = order
+        # A replacement is not built yet.
+        if self._life is not None and self._life.is_built:
+            self._attached(order)
+
+    def _attached(self, order: AttachOrder) -> None:
         if self._table is None:
             found = placed(self._started, order, self._wiring.arena.map)
             places = [(slab, row) for _, slab, row in found]
             self._table = RowTable(self.first_slot, places)
-        # A replacement is not built yet.
-        if self._life is not None and self._life.is_built:
-            self._post(Attached(self.host_id))
+        self._post(Attached(self.host_id))
 
     def kill(self, *, dump: bool) -> None:
         """Kill the actor, which writes no stacks."""
@@ -348,8 +353,8 @@ class RayHost(Host):
             return
         self._started = completion.started
         life.is_built = True
-        if self._table is not None:  # A replacement has its rows already.
-            self._post(Attached(self.host_id))
+        if self._order is not None:  # A replacement has its order already.
+            self._attached(self._order)
 
     def _on_reply(self, sent: _Sent, life: _Life, outcome: Reply | Exception) -> None:
         """Apply replies in the order of execution: results need the schemas of earlier ones.

@@ -44,7 +44,7 @@ class AwaitedRunner(EnvRunner):
     def use_rows_of(self, other: AwaitedRunner) -> None:
         """Take over the row of `other`, which this env replaces, and its episode."""
         self.attach(other._slab, other._row, other._announce)
-        self.reset_with = other.reset_with
+        self.reset_with, self.renewal = other.reset_with, other.renewal
 
     def note_begin(self) -> None:
         """Say in its row that its request has left the queue."""

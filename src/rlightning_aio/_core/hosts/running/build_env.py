@@ -10,6 +10,7 @@ import gymnasium as gym
 
 from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
+from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
@@ -66,8 +67,11 @@ def built_envs(
         seed_generators()
         register_tasks(order.tasks)
     built: list[EnvRunner] = []
-    for index in range(len(order.worker_indices)):
+    num_envs = len(order.worker_indices)
+    renewal = Renewal(order.config, num_envs) if order.config.recycle else None
+    for index in range(num_envs):
         built.append(built_env(order, made, index, inline=inline))
+        built[-1].renewal = renewal
         check_distinct(built)
         yield built[-1]
 

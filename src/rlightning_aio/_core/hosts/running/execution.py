@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.hosts.messages import ErrorText, Raised, Result, Value
+from rlightning_aio._core.hosts.messages import ErrorText, Moved, Raised, Result, Value
+from rlightning_aio._core.hosts.running.renewal import HandedOn
 from rlightning_aio.envs.results import explained
 from rlightning_aio.protocol.entries import answers_with_value, op_of
 from rlightning_aio.protocol.pickling import dumped
@@ -26,7 +27,7 @@ def execute(
     entry: int,
     arguments: Any,
     on_end: Callable[[BaseException | None], object] | None = None,
-) -> Result | Value | Raised | None:
+) -> Result | Value | Raised | Moved | None:
     """Execute one request.
 
     Args:
@@ -54,7 +55,7 @@ def completion_of(
     entry: int,
     outcome: Any,
     error: BaseException | None = None,
-) -> Result | Value | Raised | None:
+) -> Result | Value | Raised | Moved | None:
     """Return the completion of a request, or None if the row holds the whole result.
 
     What can't leave this process is an error of the env.
@@ -66,6 +67,8 @@ def completion_of(
         outcome: the part of the result that is out of band; for a call, its value.
         error: what the env has raised instead.
     """
+    if isinstance(error, HandedOn):
+        return Moved(host_id, entry, error.arguments, error.is_due, error.resident_mb)
     returns_value = answers_with_value(op_of(entry))
     travels = outcome is not None and not (returns_value or runner.inline)
     if error is None and travels:

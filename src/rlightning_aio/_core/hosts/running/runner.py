@@ -26,6 +26,7 @@ from rlightning_aio._core.hosts.messages import (
     OutOfBand,
 )
 from rlightning_aio._core.hosts.running.env_calls import call_env
+from rlightning_aio._core.hosts.running.renewal import HandedOn
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
@@ -38,7 +39,7 @@ from rlightning_aio.envs.results import (
     reads_extras,
     step_of,
 )
-from rlightning_aio.envs.state import versions_of
+from rlightning_aio.envs.state import load_generators, save_generators, versions_of
 from rlightning_aio.errors import ResetNeeded
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
+    from rlightning_aio._core.hosts.running.renewal import Renewal
     from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
@@ -97,6 +99,7 @@ class EnvRunner:
         is_hardware: see above.
         step: steps with the action in the row.
         is_awaitable: its requests are awaited, together with those of other envs.
+        renewal: of its worker; None unless the entry is recycled.
         is_spent: another env takes its place before the next request.
         has_closed: it was closed, or is being closed.
     """
@@ -120,6 +123,9 @@ class EnvRunner:
         self.step: Execute = self._not_attached
         self._read_action: Callable[[], Any] = _no_action
         self._has_result = False
+        self.renewal: Renewal | None = None
+        # The next reset may be one that it has handed on, and that nobody else can execute.
+        self._has_handed_on = False
         self._attach_again: Callable[[], None]
         self._adopt(env)
 
@@ -340,10 +346,51 @@ class EnvRunner:
 
     def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
         """Start a new episode."""
+        if self.renewal is not None:
+            arguments = self._renewed(arguments, self.renewal)
         seed, options = self._seed_and_options(arguments)
         bare = self._bare_reset if options is None else None
         finish = partial(self._finish_reset, is_bare=bare is not None)
         return partial(bare or self.env.reset, seed=seed, options=options), finish
+
+    def _renewed(self, arguments: Any, renewal: Renewal) -> tuple[Any, Any]:
+        """Return seed and options of a reset that this worker executes.
+
+        Raises:
+            HandedOn: the next one does.
+        """
+        if arguments and len(arguments) > 2:  # Of a worker before, or handed on in vain.
+            *chosen, generators = arguments
+            if not self._has_handed_on:
+                self._take_over(generators)
+        else:
+            chosen = self._seed_and_options(arguments)
+            begins = "reset_mask" not in (chosen[1] or {})  # Else some parts go on.
+            is_due = renewal.is_due() if begins else None
+            if is_due is not None:
+                self._has_handed_on = True
+                given = dumped((*chosen, self._generators()), "its reset")
+                raise HandedOn(given, is_due=is_due)
+        self._has_handed_on = False
+        renewal.begin()
+        return chosen[0], chosen[1]
+
+    def _generators(self) -> bytes | str:
+        """Return the state of the env's generators, or why it can't be read."""
+        try:
+            return pickle.dumps(save_generators(self.env))
+        except Exception as error:  # It may hold anything.
+            return f"{type(error).__name__}: {error}"
+
+    def _take_over(self, generators: bytes | str) -> None:
+        """Go on with the random numbers of the env before."""
+        try:
+            if isinstance(generators, str):
+                raise ValueError(generators)
+            load_generators(self.env, pickle.loads(generators))
+        except Exception as error:
+            text = "env %r begins with fresh generators in its new worker (recycle): %s"
+            _log.warning(text, self.env.env_id, error)
 
     def _seed_and_options(self, arguments: Any) -> tuple[int | None, dict[str, Any] | None]:
         """Return what to reset the env with: a copy, as the env may change it, and it may be

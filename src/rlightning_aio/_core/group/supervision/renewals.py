@@ -1,0 +1,131 @@
+"""`Renewals`: replaces workers before they fail (`EnvConfig.recycle`), one env after the other.
+
+Each host of such an entry has a peer with the same slots. Some time before its worker is due, the
+peer starts the next. Each env goes over when its own episode has ended, so that none waits for the
+others, and the worker that has no env left is closed. If the next one can't be started, the worker
+goes on, and it is tried again.
+Left out: when a worker is due (see `hosts.running.renewal`).
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from rlightning_aio._core.group.state.host_record import Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.messages import Moved
+
+_log = logging.getLogger("rlightning_aio")
+
+
+class Renewals:
+    """See the module.
+
+    Args:
+        tables: of the group.
+        start: starts the worker of a host that is down, at once.
+        note_change: a worker starts or closes, so that somebody has to look at the time.
+
+    Attributes:
+        on_move: gets a host, and the slots that it has from now on.
+    """
+
+    def __init__(
+        self,
+        tables: Tables,
+        start: Callable[[int], object],
+        note_change: Callable[[], None],
+    ) -> None:
+        self._tables = tables
+        self._start = start
+        self._note_change = note_change
+        self.on_move: Callable[[int, Sequence[int]], None]
+
+    def take_over(self, moved: Moved, slot: int) -> int:
+        """Return the host that executes a reset: the next one, or the same."""
+        record = self._tables.records[moved.host_id]
+        record.resident_mb = max(record.resident_mb, moved.resident_mb)
+        peer = record.peer
+        assert peer is not None
+        if peer.stage is Stage.CLOSED and (moved.is_due or not self._has_spare(record)):
+            peer.started, peer.order = record.started, record.order
+            peer.stage, peer.is_next, peer.restart_at = Stage.DOWN, True, self._tables.clock()
+            peer.restarts -= 1  # This is none.
+            peer.deaths = {None: 0}
+            self._note_change()
+            self._start(peer.host.host_id)
+        is_coming = peer.is_down and not any(peer.deaths.values())
+        if not (moved.is_due and peer.is_next and (is_coming or peer.stage is Stage.UP)):
+            return moved.host_id
+        record.waits += is_coming
+        self._move(peer, [slot])
+        return peer.host.host_id
+
+    def _has_spare(self, record: HostRecord) -> bool:
+        """Return True if the entry has a worker that waits for its first env."""
+        name = record.config.name
+        own = (r for r in self._tables.records if r.is_next and r.config.name == name)
+        return any(not len(self._tables.slots_of(other)) for other in own)
+
+    def _move(self, record: HostRecord, slots: Sequence[int]) -> None:
+        """Give envs to a host, with what they are blamed for."""
+        for slot in slots:
+            if count := self._tables.record_of(slot).deaths.pop(slot, 0):
+                record.deaths[slot] = count
+        self._tables.requests.hosts[slots] = record.host.host_id
+        self.on_move(record.host.host_id, slots)
+
+    def close_if_left(self, host_id: int) -> None:
+        """Close the worker of a host if all its envs have gone over to one that is up."""
+        record = self._tables.records[host_id]
+        peer = record.peer
+        if peer is None or not peer.is_next or not record.stage is peer.stage is Stage.UP:
+            return
+        if len(self._tables.slots_of(record)):
+            return
+        record.stage, record.late, record.deaths = Stage.CLOSING, False, {None: 0}
+        record.recycled += 1
+        record.host.close()
+        record.note_traffic()
+        record.start_by = self._tables.clock() + record.close_seconds
+        self._note_change()
+        text = "entry %r: a worker of %.0f MB was replaced by a new one (recycle)"
+        _log.info(text, record.config.name, record.resident_mb)
+
+    def note_closed(self, record: HostRecord) -> None:
+        """Note that the worker of a host has closed, or has died with a next one in the peer."""
+        assert record.peer is not None
+        record.stage, record.start_by, record.restart_at = Stage.CLOSED, None, None
+        record.deaths, record.dying, record.peer.is_next = {}, False, False
+        self._note_change()
+
+    def give_back(self, record: HostRecord) -> None:
+        """Let the worker before go on with all envs, as the next one could not be started."""
+        peer = record.peer
+        if peer is None or not record.is_next or peer.stage is not Stage.UP:
+            return
+        requests, slots = self._tables.requests, self._tables.slots_of(record)
+        count = len(requests.owed(slots))
+        requests.in_flight[record.host.host_id] -= count
+        requests.in_flight[peer.host.host_id] += count
+        self._move(peer, slots.tolist())
+        held, record.held = record.held, []
+        for entries, arguments in held:
+            peer.host.submit(entries, arguments)
+
+    def inherits(self, record: HostRecord) -> bool:
+        """Give all envs of a worker that has died to the next one; False if there is none."""
+        peer = record.peer
+        if peer is None or not peer.is_next or peer.stage is Stage.GIVEN_UP:
+            return False
+        self._move(peer, self._tables.slots_of(record).tolist())
+        peer.deaths |= record.deaths
+        peer.restarts += 1  # Here it is one.
+        self.note_closed(record)
+        return True

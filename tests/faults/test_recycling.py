@@ -1,0 +1,287 @@
+"""Workers are renewed between two episodes, and nobody notices but for their memory."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from kit.scripted import Awaitable
+
+import rlightning_aio as aio
+import rlightning_aio.sync as rl
+from rlightning_aio import BatchedData, ConfigError, EnvConfig, PolicyResponse
+from rlightning_aio.attempts import EpisodeSpec, play
+from rlightning_aio.collecting import Collector
+from rlightning_aio.evaluation import evaluate
+from rlightning_aio.vector import VectorEnv
+
+
+class Walk(gym.Env[Any, Any]):
+    """Episodes of random lengths, of several generators, each of which may leave memory behind."""
+
+    observation_space = spaces.Box(-10, 10, (4,), np.float64)
+    action_space = spaces.Discrete(3)
+
+    def __init__(self, leaks_mb: float = 0.0) -> None:
+        self.leaks_mb, self.kept = leaks_mb, list[Any]()
+        self.draws, self.more = random.Random(3), {"dice": [np.random.default_rng(5)]}
+        self.steps = self.length = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        if self.leaks_mb:
+            self.kept.append(np.ones(int(self.leaks_mb * 1e6), np.uint8))
+        self.steps, self.length = 0, int(self.np_random.integers(2, 9))
+        return self.observed(), {"pid": os.getpid()}
+
+    def observed(self) -> Any:
+        dice = self.more["dice"][0].random()
+        return np.array([self.np_random.random(), self.draws.random(), dice, self.steps])
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        return self.observed(), float(action), self.steps >= self.length, False, {}
+
+
+def played(make: Any, num_steps: int = 120, **fields: Any) -> tuple[list[Any], dict[str, float]]:
+    """What six envs in two workers show in a vector env, and its numbers."""
+    envs = VectorEnv([make] * 6, envs_per_process=3, **fields)
+    shown = [envs.reset(seed=3)[0]]
+    for k in range(num_steps):
+        *some, infos = envs.step(np.full(6, k % 3))
+        shown += [*some, *(one for one in infos.get("final_obs", ()) if one is not None)]
+    numbers = envs.group.metrics()
+    envs.close()
+    return shown, numbers
+
+
+@pytest.mark.parametrize("recycle", [{"episodes": 1}, {"episodes": 9}, {"memory_mb": 90}])
+def test_results_are_those_of_one_env_bit_for_bit(recycle: dict[str, int]) -> None:
+    """Three envs of a worker end at different times, and none waits for the others."""
+    shown, _ = played(Walk)
+    renewed, numbers = played(partial(Walk, 1.0), recycle=recycle)
+    assert len(shown) == len(renewed)
+    assert all(map(np.array_equal, shown, renewed))
+    assert numbers["envs/recycled"] >= 2
+    assert numbers["envs/restarts"] == 0
+    assert numbers["envs/outcomes_env_died"] == 0
+    assert 0 < numbers["envs/largest_resident_mb"] < (120 if "memory_mb" in recycle else 1000)
+
+
+def test_no_result_is_marked_and_each_episode_is_of_one_process() -> None:
+    with rl.build_env_group(
+        EnvConfig(task=Walk, num_workers=2, envs_per_process=2, recycle={"episodes": 2})
+    ) as group:
+        batch, _ = group.reset(seed=0)
+        pids = {one.info["pid"] for one in batch.values()}
+        with group.auto_reset(on_done=True, max_episode_steps=100):
+            for _ in range(100_000):
+                if len(pids) > 4:
+                    break
+                batch, _ = group.step(batch.respond(action=[1, 1]))
+                assert batch.restarted is None or not batch.restarted.any()
+                pids |= {one.info["pid"] for one in batch.values() if "pid" in one.info}
+        assert len(pids) > 4
+        assert len({worker["pid"] for worker in group.get_workers()}) <= 2
+        assert group.metrics()["envs/recycled"] >= 2
+
+
+@pytest.mark.parametrize("make", [Walk, partial(Awaitable, Walk)])
+def test_reset_with_seed_and_options_goes_over(make: Any) -> None:
+    with rl.build_env_group(EnvConfig(task=make, recycle={"episodes": 1})) as group:
+        shown = [group.reset(seed=seed, options={"some": 1})[0].observation for seed in (4, 4, 4)]
+        assert np.array_equal(shown[0][:, 0], shown[1][:, 0])
+        assert not np.array_equal(shown[0][:, 1], shown[1][:, 1])  # A seed concerns its own alone.
+
+
+class Fresh(Walk):
+    """An env that can't be started twice while `path` exists, or whose generator can't be read."""
+
+    def __init__(self, path: str = "", *, hides: bool = False) -> None:
+        super().__init__()
+        if path:
+            Path(path).touch(exist_ok=False)
+        if hides:
+            self.draws = Hidden()
+
+
+class Hidden(random.Random):
+    def getstate(self) -> Any:
+        raise TypeError("it can't be read")
+
+
+def test_env_that_cannot_be_read_begins_with_a_fresh_generator() -> None:
+    with rl.build_env_group(
+        EnvConfig(task=partial(Fresh, hides=True), recycle={"episodes": 1})
+    ) as group:
+        reset_until_recycled(group)
+
+
+def test_worker_goes_on_if_the_next_one_cannot_be_started(tmp_path: Path) -> None:
+    path = str(tmp_path / "there")
+    config = EnvConfig(task=partial(Fresh, path), recycle={"episodes": 1}, max_restarts=0)
+    with rl.build_env_group(config) as group:
+        for _ in range(3):
+            batch, _ = group.reset()
+            assert batch.restarted is None or not batch.restarted.any()
+        Path(path).unlink()
+        reset_until_recycled(group)
+
+
+@pytest.mark.parametrize("which", [0, -1])
+def test_death_while_envs_go_over_is_one_like_any_other(which: int) -> None:
+    with rl.build_env_group(
+        EnvConfig(task=Walk, num_workers=2, envs_per_process=2, recycle={"episodes": 2})
+    ) as group:
+        group.reset(seed=0)
+        group.reset(env_ids=["Walk-0"])
+        assert [worker["env_ids"] for worker in group.get_workers()] == [["Walk-1"], ["Walk-0"]]
+        os.kill(group.get_workers()[which]["pid"], signal.SIGKILL)
+        lost = []
+        while not any(lost):
+            batch, _ = stepped(group)
+            lost = [bool(batch.restarted is not None and batch.restarted[k]) for k in range(2)]
+        assert lost == ([False, True] if which == 0 else [True, False])
+        assert group.metrics()["envs/restarts"] == 1
+        stepped(group)
+
+
+def test_death_in_a_step_of_envs_that_are_reset_in_it() -> None:
+    """The episode that it ends is truncated, and the others end and begin as without it."""
+    envs = VectorEnv(
+        [Walk] * 2, envs_per_process=1, recycle={"episodes": 2}, autoreset_mode="SameStep"
+    )
+    first, _ = envs.reset(seed=3)
+    (worker,) = (one for one in envs.group.get_workers() if one["env_ids"] == ["env-0"])
+    os.kill(worker["pid"], signal.SIGKILL)
+    truncated = np.array([False])
+    while not truncated.any():
+        before = first
+        first, _, terminated, truncated, infos = envs.step(np.ones(2, int))
+    assert truncated.tolist() == [True, False]
+    assert not terminated[0]
+    assert np.array_equal(infos["final_obs"][0], before[0])
+    for _ in range(20):
+        first, _, terminated, _, infos = envs.step(np.ones(2, int))
+        assert np.array_equal(first[:, 3] == 0, terminated)
+        assert np.array_equal(infos.get("_final_obs", terminated), terminated)
+    envs.close()
+
+
+def reset_until_recycled(group: Any) -> None:
+    """Reset until a worker was renewed: the one before may still close, or the next one pause."""
+    deadline = time.monotonic() + 60
+    while not group.metrics()["envs/recycled"]:
+        group.reset()
+        assert time.monotonic() < deadline
+
+
+def stepped(group: Any) -> Any:
+    batch = BatchedData.from_dict(
+        {env_id: PolicyResponse(env_id=env_id, action=1) for env_id in group.env_ids}
+    )
+    return group.step(batch)
+
+
+def make_config(recycle: dict[str, int]) -> EnvConfig:
+    """Four envs in two workers."""
+    return EnvConfig(task=Walk, num_workers=4, envs_per_process=2, recycle=recycle)
+
+
+def vectored(recycle: dict[str, int], autoreset_mode: str) -> Any:
+    return played(Walk, recycle=recycle, autoreset_mode=autoreset_mode)
+
+
+def stable_baselines(recycle: dict[str, int]) -> Any:
+    pytest.importorskip("stable_baselines3")
+    from rlightning_aio import sb3
+
+    envs = sb3.VecEnv([Walk] * 4, envs_per_process=2, recycle=recycle)
+    envs.seed(3)
+    shown = [envs.reset()]
+    for k in range(60):
+        *some, infos = envs.step(np.full(4, k % 3))
+        shown += [*some, *(info.get("terminal_observation", []) for info in infos)]
+    numbers = envs.group.metrics()
+    envs.close()
+    return shown, numbers
+
+
+def collected(recycle: dict[str, int]) -> Any:
+    with rl.build_env_group(make_config(recycle)) as group:
+        collector = Collector(group, _all_ones, num_transitions=160, wait_all=True, seed=0)
+        return [collector.collect().observation for _ in range(3)], group.metrics()
+
+
+def evaluated(recycle: dict[str, int]) -> Any:
+    with rl.build_env_group(make_config(recycle)) as group:
+        found = evaluate(group, _all_ones, [EpisodeSpec("", seed=k) for k in range(24)])
+        return sorted((one.spec.seed, one.length) for one in found.attempts), group.metrics()
+
+
+def attempted(recycle: dict[str, int]) -> Any:
+    return asyncio.run(_attempted(recycle))
+
+
+async def _attempted(recycle: dict[str, int]) -> Any:
+    async def agent(episode: Any) -> None:
+        while True:  # It is left at the end of the env's episode.
+            if (await episode.step(1)).last_terminated:
+                return
+
+    async with aio.build_env_group(make_config(recycle)) as group:
+        tasks = [EpisodeSpec("", seed=k) for k in range(8)]
+        found = [group async for group in play(group, tasks, agent, 3)]
+        rewards = sorted((one.spec.seed, one.reward) for own in found for one in own.attempts)
+        return rewards, group.metrics()
+
+
+def _all_ones(batch: Any) -> dict[str, Any]:
+    return {"action": np.ones(len(batch), int)}
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        partial(vectored, autoreset_mode="NextStep"),
+        partial(vectored, autoreset_mode="SameStep"),
+        pytest.param(stable_baselines, marks=pytest.mark.simulators),
+        collected,
+        evaluated,
+        attempted,
+    ],
+)
+def test_behind_every_interface(use: Any) -> None:
+    (plain, _), (renewed, numbers) = [use(recycle) for recycle in ({}, {"episodes": 3})]
+    assert len(plain) == len(renewed)
+    assert all(map(np.array_equal, plain, renewed))
+    assert numbers["envs/recycled"] > 0
+    assert numbers["envs/restarts"] == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        ({"recycle": {"episode": 1}}, "should be 'episodes' or 'memory_mb'"),
+        ({"recycle": {"episodes": 0}}, "greater than or equal to 1"),
+    ],
+)
+def test_wrong_settings_are_refused(fields: dict[str, Any], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        EnvConfig(task=Walk, **fields)
+
+
+@pytest.mark.parametrize("placement", ["inline", "loop"])
+def test_without_workers_there_is_nothing_to_renew(placement: str) -> None:
+    with pytest.raises(ConfigError, match="no worker that could die"):
+        rl.build_env_group(Walk, placement=placement, recycle={"episodes": 1})
