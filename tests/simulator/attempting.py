@@ -351,7 +351,9 @@ class Attempts(InContext):
         # An agent may end by itself in the moment in which its time is over or it is a surplus.
         cut_short = ["cancelled"] * (rules.first is not None or played.end == "cancelled")
         if rules.attempt_timeout is not None and rules.on_timeout == "end":
-            cut_short += ["truncated" if attempt.length else "timed_out", "env_hung"]
+            # Its first step may be over in the moment in which its time is.
+            cut_short += ["truncated"] * (attempt.length > 0) + ["timed_out"] * (attempt.length < 2)
+            cut_short += ["env_hung"]
         elif rules.attempt_timeout is not None:
             cut_short += ["timed_out"]
         if played.end == "over":
@@ -363,6 +365,8 @@ class Attempts(InContext):
             require(outcome.kind in own, "another end", own)
         elif played.end == "cancelled":
             require(outcome.kind in cut_short, "another end", cut_short)
+        elif played.end == "agent_raised":
+            require(outcome.kind in (played.end, *cut_short), "another failure", played.end)
         else:
             require(outcome.kind == played.end, "another failure", played.end)
         if outcome.kind not in _LOST and "zero_copy" not in self.features:
