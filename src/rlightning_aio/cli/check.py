@@ -56,6 +56,7 @@ _REPEATED: Final = 100
 """Most steps that are done twice with the same seed."""
 _LOOKED_AT: Final = 20
 """Most results whose observations are compared with their space."""
+_MEMORY: Final = "MB of memory"
 _SLACK_MB: Final = 16.0
 """Memory that caches may take between the second episode and the last."""
 _NUMBERS: Final[Any] = (
@@ -72,8 +73,8 @@ class _Finding:
         steps: how many steps it made; none if only a policy can choose its actions.
         is_played: with ``--steps``; episodes: number that have ended then; step_us: median time of
             a step in its env.
-        problems: in words, each with what to do; leaks: memory grows; is_random: a seed does not
-            repeat its results.
+        problems: in words, each with what to do.
+        leaks: memory grows, and `recycle` helps; is_random: a seed does not repeat its results.
     """
 
     name: str
@@ -198,8 +199,10 @@ async def _play(config: EnvConfig, group: EnvGroup, steps: int, found: _Finding)
     found.step_us = float(np.median(times)) / 1e3 if times else None
     if bad:
         found.problems.append(f"{bad} of {rewards} rewards are NaN or infinite")
-    leaks = _leaks(samples, can_recycle=_can_recycle(config))
-    found.problems, found.leaks = found.problems + leaks, any("recycle" in text for text in leaks)
+    can_recycle = _can_recycle(config)
+    leaks = _leaks(samples, can_recycle=can_recycle)
+    found.problems += leaks.values()
+    found.leaks = can_recycle and _MEMORY in leaks
 
 
 def _held(pid: int) -> dict[str, float]:
@@ -212,7 +215,7 @@ def _held(pid: int) -> dict[str, float]:
         "open descriptors": len([*(process / "fd").iterdir()]),
         "threads": len([*(process / "task").iterdir()]),
         "child processes": children,
-        "MB of memory": resident_mb(pid),
+        _MEMORY: resident_mb(pid),
     }
 
 
@@ -221,22 +224,26 @@ def _can_recycle(config: EnvConfig) -> bool:
     return "recycle" not in refuses and not ENVS.is_hardware(config.backend)
 
 
-def _leaks(samples: list[dict[str, float]], *, can_recycle: bool) -> list[str]:
-    """Say what has grown from the second episode to the last; the first loads and compiles."""
+def _leaks(samples: list[dict[str, float]], *, can_recycle: bool) -> dict[str, str]:
+    """Say what has grown from the second episode to the last, by its name in the samples.
+
+    The first episode loads and compiles.
+    """
+    found: dict[str, str] = {}
     if len(samples) < 4:
-        return []
-    count, found = len(samples) - 2, list[str]()
+        return found
+    count = len(samples) - 2
     for name, before in samples[1].items():
         more = samples[-1].get(name, before) - before
-        if more >= max(count / 2, 2) if name != "MB of memory" else more > _SLACK_MB:
-            found.append(
+        if more >= max(count / 2, 2) if name != _MEMORY else more > _SLACK_MB:
+            found[name] = (
                 f"{more:.0f} more {name} after {count} episodes: close or drop in reset what the "
                 "episode before has opened"
             )
-            if name == "MB of memory" and can_recycle:
+            if name == _MEMORY and can_recycle:
                 # Room for a hundred such episodes.
                 limit = 100 * math.ceil((before + 100 * more / count) / 100)
-                found[-1] += (
+                found[name] += (
                     f"; an episode leaves {more / count:.2g} MB: recycle: {{memory_mb: {limit}}} "
                     "has a worker with one env replaced in time"
                 )
