@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from rlightning_aio import sync
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, evaluate
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     import rlightning_aio as rl
     from rlightning_aio.types import EnvRet
 
@@ -34,15 +37,17 @@ class Counting(CountingEnv):
         return super().is_finish() or has_left
 
 
-def served(connect_timeout: float = HANG) -> sync.EnvGroup:
-    """Two places, of a and b."""
+@contextmanager
+def served(names: str, connect_timeout: float = HANG) -> Iterator[tuple[sync.EnvGroup, list[Any]]]:
+    """Two places, of a and b, and the envs of the clients with these names, which all end."""
     kwargs = {"clients": ["a", "b"], "connect_timeout": connect_timeout}
-    return sync.build_env_group({"name": "r", "backend": "env_server", "env_kwargs": kwargs})
-
-
-def clients(group: sync.EnvGroup, **envs: Counting) -> list[ClientThread]:
-    address: str = group["r-0"].address
-    return [ClientThread(address, name, env, hardware=False) for name, env in envs.items()]
+    entry = {"name": "r", "backend": "env_server", "env_kwargs": kwargs}
+    with sync.build_env_group(entry) as group:
+        address: str = group["r-0"].address
+        clients = [ClientThread(address, name, Counting(), hardware=False) for name in names]
+        yield group, [client.env for client in clients]
+    for client in clients:
+        client.join()
 
 
 def nothing(batch: rl.BatchedData) -> Any:
@@ -55,8 +60,7 @@ def ends(found: Evaluation) -> Counter[tuple[str, str]]:
 
 def test_episodes_of_an_empty_place_have_failed() -> None:
     """They are no silence, and nobody waits for the client while the others play."""
-    with served() as group:
-        here = clients(group, a=Counting())
+    with served("a") as (group, _):
         group.reset(env_ids=["r-0/a"])
         found = evaluate(group, nothing, 2)
         assert ends(found) == {("terminated", "r-0/a"): 2, ("env_away", "r-0/b"): 2}
@@ -65,35 +69,25 @@ def test_episodes_of_an_empty_place_have_failed() -> None:
         }
         found = evaluate(group, nothing, [EpisodeSpec("", seed) for seed in range(3)])
         assert ends(found) == {("terminated", "r-0/a"): 3}
-    for client in here:
-        client.join()
 
 
 def test_clients_that_leave_together_fail_their_episodes() -> None:
     """One error names several places, and what waits for them is not given to them."""
-    with served(connect_timeout=0.5) as group:
-        here = clients(group, a=Counting(), b=Counting())
+    with served("ab", connect_timeout=0.5) as (group, envs):
         group.reset()
-        for client in here:
-            env: Any = client.env
+        for env in envs:
             env.leaves_after = 2
         found = evaluate(group, nothing, 3, min_results=2, retries=1)
     assert ends(found) == {("env_away", f"r-0/{name}"): 3 for name in "ab"}
     assert sum(len(one.failures) for one in found.attempts) == 0
-    for client in here:
-        client.join()
 
 
 def test_an_episode_is_tried_again_on_whoever_is_left() -> None:
-    with served(connect_timeout=0.5) as group:
-        here = clients(group, a=Counting(), b=Counting())
+    with served("ab", connect_timeout=0.5) as (group, envs):
         group.reset()
-        first: Any = here[0].env
-        first.leaves_after = 2
+        envs[0].leaves_after = 2
         specs = [EpisodeSpec("", seed) for seed in range(6)]
         found = evaluate(group, nothing, specs, min_results=1)
     assert ends(found) == {("terminated", "r-0/b"): 6}
     (lost,) = [one for attempt in found.attempts for one in attempt.failures]
     assert (lost.kind, lost.env_id) == ("env_away", "r-0/a")
-    for client in here:
-        client.join()
