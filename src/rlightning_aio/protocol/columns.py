@@ -152,6 +152,8 @@ def fitted_tree(space: gym.Space[Any], value: Any, what: str) -> Tree:
     Raises:
         Misfit: see `row_writer`.
     """
+    if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
+        return value
 
     def of_array(part: spaces.Box[Any], given: Any, path: Path) -> NDArray[Any]:
         if type(given) is np.ndarray and given.shape == part.shape and given.dtype == part.dtype:
@@ -178,17 +180,24 @@ def placed(
     """
     if isinstance(tree, dict):
         parts = cast("dict[str, Tree]", tree)
-        if not hasattr(value, "keys") or value.keys() != parts.keys():
-            expected = f"a dict with keys {sorted(map(str, parts))}"
-            raise _misplaced(what, path, expected, value)
+        _check_keys(value, parts, what, path)
         return {k: placed(function, part, value[k], what, (*path, k)) for k, part in parts.items()}
     if isinstance(tree, tuple):
         several = cast("tuple[Tree, ...]", tree)
-        if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != len(several):
-            raise _misplaced(what, path, f"a tuple of {len(several)}", value)
-        both = enumerate(zip(several, cast("list[Any]", value), strict=True))
+        _check_length(value, len(several), what, path)
+        both = enumerate(zip(several, value, strict=True))
         return tuple(placed(function, part, own, what, (*path, k)) for k, (part, own) in both)
     return function(tree, value, path)
+
+
+def _check_keys(value: Any, parts: dict[str, Any], what: str, path: Path) -> None:
+    if not hasattr(value, "keys") or value.keys() != parts.keys():
+        raise _misplaced(what, path, f"a dict with keys {sorted(map(str, parts))}", value)
+
+
+def _check_length(value: Any, count: int, what: str, path: Path) -> None:
+    if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != count:
+        raise _misplaced(what, path, f"a tuple of {count}", value)
 
 
 def _misplaced(what: str, path: Path, expected: str, value: Any) -> Misfit:
@@ -199,24 +208,37 @@ def _misplaced(what: str, path: Path, expected: str, value: Any) -> Misfit:
     return Misfit(f"{place} doesn't fit its space: expected {expected}, found {found}")
 
 
-def row_writer(tree: Tree, row: int, what: str) -> Callable[[Any], None]:
+def row_writer(tree: Tree, row: int, what: str, path: Path = ()) -> Callable[[Any], None]:
     """Make a function that copies a value of a space into `row` of `tree`, its columns.
 
-    Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments.
+    Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments. Each step
+    calls it, so it knows its parts in advance, where `placed` finds them anew.
 
     Raises (from the function):
         Misfit: the value has another shape, structure or kind of dtype, or numbers out of range;
             a part of it may have been written.
     """
-    each = iter([_array_writer(array, row, path, what) for path, array in walked(tree)])
-    writers: Any = mapped(lambda _: next(each), tree)
-    if not isinstance(writers, dict | tuple):
-        return writers
+    if isinstance(tree, dict):
+        parts = cast("dict[str, Tree]", tree)
+        by_key = {k: row_writer(part, row, what, (*path, k)) for k, part in parts.items()}
 
-    def write(value: Any) -> None:
-        placed(lambda writer, part, _: writer(part), writers, value, what)
+        def write_dict(value: Any) -> None:
+            _check_keys(value, by_key, what, path)
+            for key, write in by_key.items():
+                write(value[key])
 
-    return write
+        return write_dict
+    if isinstance(tree, tuple):
+        several = enumerate(cast("tuple[Tree, ...]", tree))
+        in_order = [row_writer(part, row, what, (*path, k)) for k, part in several]
+
+        def write_tuple(value: Any) -> None:
+            _check_length(value, len(in_order), what, path)
+            for write, part in zip(in_order, value, strict=True):
+                write(part)
+
+        return write_tuple
+    return _array_writer(tree, row, path, what)
 
 
 def _array_writer(column: NDArray[Any], row: int, path: Path, what: str) -> Callable[[Any], None]:
