@@ -35,16 +35,11 @@ class Players:
 
     def __init__(self, group: Any) -> None:
         self._group = group
-        self.entry_of: dict[str, str] = {
-            env_id: worker["entry"]
-            for worker in group.get_workers()
-            for env_id in worker["env_ids"]
-        }
-        self.worker_of: dict[str, list[str]] = {
-            env_id: worker["env_ids"]
-            for worker in group.get_workers()
-            for env_id in worker["env_ids"]
-        }
+        self.entry_of: dict[str, str] = {}
+        self.worker_of: dict[str, list[str]] = {}
+        for worker in group.get_workers():
+            for env_id in worker["env_ids"]:
+                self.entry_of[env_id], self.worker_of[env_id] = worker["entry"], worker["env_ids"]
         self._players: dict[str, _Player] = {}
         self._kinds: dict[_Player, None] = {}  # All that differ, the last of the envs last.
         for meta in group.metas:

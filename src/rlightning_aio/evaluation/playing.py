@@ -167,13 +167,13 @@ class PolicyPlay:
         players = self._queue.players
         for job in self._queue.withdraw_all():
             env_id = job.spec.env_id
-            alone = players.left_alone.intersection({env_id} if env_id else players.left_alone)
-            cause = "no client is there that could play it"
-            if alone:
-                cause = str(players.refusal(min(alone)))
-            outcome = Outcome("env_away", "infrastructure", cause, env_id)
+            alone = players.left_alone & {env_id} if env_id else players.left_alone
             if job.failures:  # Those say more.
                 outcome = job.failures.pop()
+            else:
+                away = "no client is there that could play it"
+                cause = str(players.refusal(min(alone))) if alone else away
+                outcome = Outcome("env_away", "infrastructure", cause, env_id)
             attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
             self._keep(job, attempt, is_last=True)
 

@@ -35,9 +35,9 @@ DEFAULT_HEARTBEAT: Final = 5.0
 HARDWARE_HEARTBEAT: Final = 1.0
 MIN_HEARTBEAT: Final = 0.4
 MAX_HEARTBEAT: Final = 86400
+"""Seconds within which an end that is gone is found."""
 _MAX_TTL_MS: Final = 6553599
 """The longest that ZMQ accepts."""
-"""Seconds within which an end that is gone is found."""
 HANDSHAKE_SECONDS: Final = 2.0
 """Time for the handshake of a connection."""
 
