@@ -36,6 +36,7 @@ from patience import HANG as LONG
 import rlightning_aio as rl
 import rlightning_aio.sync
 from rlightning_aio._core.group.drivers.aio_driver import AioDriver
+from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio.errors import (
     ConfigError,
     EnvBusy,
@@ -135,6 +136,25 @@ async def test_a_collect_wakes_once_for_the_number_it_waits_for() -> None:
         for gate in gates.values():
             gate.set()
         assert len((await group.collect_async(wait_all=True))[0]) == 30
+
+
+async def test_looks_for_late_requests_do_not_multiply(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is planned at a time, also when a late request makes room for one that waits."""
+    plan, planned = AwaitedEnvs._plan_look, list[bool]()
+
+    def counted(self: Any) -> None:
+        planned.append(self._look is None)
+        plan(self)
+
+    monkeypatch.setattr(AwaitedEnvs, "_plan_look", counted)
+    fields: Any = {"max_concurrency": 1, "step_timeout": 0.05, "on_worker_death": "restart"}
+    async with rl.build_env_group(entry(num_workers=3, max_restarts=9, **fields)) as group:
+        batch, _ = await group.reset()
+        with contextlib.suppress(EnvHung):
+            await group.step(batch.respond(action=[HANG, STEP, HANG]))
+        await group.drain()
+    assert planned
+    assert all(planned)
 
 
 async def test_max_concurrency_limits_how_many_are_busy() -> None:

@@ -385,12 +385,15 @@ class AwaitedEnvs:
         While something else blocked the event loop, no env could go on, so that isn't counted.
         """
         self._look = None
+        if self._ending:
+            return
         now = time.monotonic()
         for record in self._records:
             record.due += max(0.0, now - planned)
             if now >= record.due:
                 self._expire(record)
-        if any(record.due < math.inf for record in self._records):
+        # What has begun in place of a request that was late may have planned one.
+        if self._look is None and any(record.due < math.inf for record in self._records):
             self._plan_look()
 
     def _expire(self, record: _EnvRecord) -> None:
