@@ -168,3 +168,19 @@ def test_workers_import_a_task_of_the_program_when_they_make_it(
     assert list(envs.reset()[1]["told"]) == ["False", f"False {LIMIT}"]
     envs.close()
     del sys.modules["a_simulator"]
+
+
+def test_envs_of_a_worker_have_the_same_class_of_the_program() -> None:
+    """A class may hold what its envs share."""
+
+    class Numbered(Told):
+        made = 0
+
+        def __init__(self) -> None:
+            type(self).made += 1
+            super().__init__(told=str(self.made))
+
+    gym.register("Numbered-v0", Numbered)
+    envs = VectorEnv([lambda: gym.make("Numbered-v0")] * 2, max_concurrency=1)
+    assert list(envs.reset()[1]["told"]) == ["1", "2"]
+    envs.close()

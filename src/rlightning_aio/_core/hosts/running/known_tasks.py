@@ -60,14 +60,27 @@ class _Deferred:
 
     def __init__(self, pickled: bytes) -> None:
         self._pickled = pickled
+        self._loaded: list[Any] = []
+
+    def _itself(self) -> Any:
+        """Return the class or function: always the same, as it may have a state."""
+        if not self._loaded:
+            self._loaded.append(pickle.loads(self._pickled))
+        return self._loaded[0]
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        return pickle.loads(self._pickled)(*args, **kwargs)
+        return self._itself()(*args, **kwargs)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):  # Asked by pickle and copy, before there is anything to unpickle.
             raise AttributeError(name)
-        return getattr(pickle.loads(self._pickled), name)
+        return getattr(self._itself(), name)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Deferred, (self._pickled,)
+
+    def __deepcopy__(self, memo: Any) -> _Deferred:
+        return self  # Like a function.
 
 
 def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
