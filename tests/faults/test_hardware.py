@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from threading import Event, Semaphore
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -451,3 +452,32 @@ def test_an_action_timeout_is_a_number_of_seconds(arm: Any, seconds: Any) -> Non
         sync.build_env_group(arm("inline", action_timeout=seconds)),
     ):
         pass
+
+
+def test_a_stop_that_hangs_is_not_begun_again() -> None:
+    """While it runs; the other envs are stopped again and again."""
+    looks, hanging, others = Semaphore(0), list[bool](), list[bool]()
+    go_on = Event()
+
+    class Hangs:
+        env_id = "a"
+
+        def stop(self) -> None:
+            hanging.append(True)
+            go_on.wait(HANG)
+
+    class Stops:
+        env_id = "b"
+
+        def stop(self) -> None:
+            others.append(True)
+            looks.release()
+
+    envs: Any = [Hangs(), Stops()]
+    end = watched(lambda: envs)
+    for _ in range(4):
+        assert looks.acquire(timeout=HANG)
+    assert len(hanging) == 1
+    go_on.set()
+    end()
+    assert len(others) >= 4

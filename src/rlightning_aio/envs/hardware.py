@@ -123,9 +123,14 @@ def watched(due: Callable[[], Iterable[BaseEnv]]) -> Callable[[], None]:
 
     def watch() -> None:
         is_last = False
+        stops: dict[int, Thread] = {}  # That still run: one that hangs is not begun again.
         while not is_last:
             is_last = is_over.is_set()
-            stop_all(due())
+            stops = {key: thread for key, thread in stops.items() if thread.is_alive()}
+            envs = [env for env in due() if id(env) not in stops]
+            stops |= zip(map(id, envs), begin_stops(envs), strict=True)
+            for thread in stops.values():
+                thread.join(_STOP_SECONDS)
             is_over.wait(_LOOK_SECONDS)
 
     thread = Thread(target=watch, name="stops hardware", daemon=True)
