@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
-from rlightning_aio.envs.hardware import stop
+from rlightning_aio.envs.hardware import stop_all
 from rlightning_aio.protocol.entries import answers_with_value
 
 if TYPE_CHECKING:
@@ -65,8 +65,8 @@ class AwaitedRunner(EnvRunner):
 
     async def close(self) -> None:  # type: ignore[override]
         """Close the env, once; hardware is stopped before."""
-        if self.is_hardware:
-            await asyncio.to_thread(stop, self.env)
+        if self.is_hardware and not self.has_closed:
+            await asyncio.to_thread(stop_all, [self.env])
         closing = super().close()
         if inspect.isawaitable(closing):
             await closing
