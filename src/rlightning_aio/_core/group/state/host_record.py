@@ -140,7 +140,7 @@ class HostRecord:
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
         gone: by slot, the errors of envs that are not replaced though their host goes on.
-        last_loss: its last death.
+        last_loss: its last death; launches: how often a worker of it was started.
         peer: the host that starts the next worker of the same envs; None unless they are recycled.
         is_next: its worker takes over the envs of the one in the peer, which goes on meanwhile.
         recycled: its workers that were replaced so; resident_mb: the most that one is known to
@@ -178,6 +178,7 @@ class HostRecord:
     rebuild_error: ErrorText | None = None
     gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     last_loss: HostLoss | None = None
+    launches: int = 0
     peer: HostRecord | None = field(default=None, repr=False)
     is_next: bool = False
     recycled: int = 0

@@ -249,8 +249,7 @@ class Sums:
         A replaced worker counts as it was when it was last asked for.
         """
         for record in records:
-            number = record.restarts + record.recycled
-            key, now = (record.host.host_id, number), record.host.processor_ns()
+            key, now = (record.host.host_id, record.launches), record.host.processor_ns()
             if now is not None:  # Of living threads: one may have ended.
                 self._computing_ns[key] = max(now, self._computing_ns.get(key, 0))
         hosts = {record.host.host_id for record in records}

@@ -184,6 +184,7 @@ class Supervisor:
     def _launch(self, record: HostRecord, stage: Stage) -> None:
         record.stage = stage
         record.late = False
+        record.launches += 1
         record.host.start()
         record.give_time(self.clock())
 

@@ -65,11 +65,11 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        starting = [r for r in self._tables.records if r.is_starting]
-        if any(len(self._tables.slots_of(record)) for record in starting):
-            slots: list[int] = []
-            for record in starting:
+        slots: list[int] = []
+        for record in self._tables.records:
+            if record.is_starting:
                 slots += self._tables.slots_of(record).tolist()
+        if slots:
             names = [self._envs.env_ids[slot] for slot in slots]
             return f"not started yet: {_listed(names)}"
         env_ids, requests = self._envs.env_ids, self._tables.requests
