@@ -449,11 +449,17 @@ class FakeInline(FakeHost):
     def answer(self, reply: Any) -> None:
         self.post(reply)
 
-    def execute_next(self) -> bool:
-        if not self.waiting:
-            return False
+    def execute(self, most: int, is_over: Callable[[], bool] | None) -> int:
+        count = 0
+        while self.waiting and count < most:
+            self.execute_one()
+            count += 1
+            if is_over is not None and is_over():
+                break
+        return count
+
+    def execute_one(self) -> None:
         self.finish()
-        return True
 
 
 class FakeGroup:

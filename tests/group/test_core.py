@@ -75,13 +75,13 @@ def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) 
 def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) -> None:
     """Not before the env was stepped, however long that takes."""
     group = new_group(1, 1, inline=[True, False])
-    execute_next = group.hosts[0].execute_next
+    execute_one = group.hosts[0].execute_one
 
-    def run_slowly() -> bool:
-        group.now += 2.0 if group.hosts[0].waiting else 0.0
-        return execute_next()
+    def run_slowly() -> None:
+        group.now += 2.0
+        execute_one()
 
-    group.hosts[0].execute_next = run_slowly
+    group.hosts[0].execute_one = run_slowly
     group.steps.step_async(steps(0, 1), group.now)
     running = collect(group, timeout=1.0)
     group.pass_time(0.5)
@@ -97,13 +97,13 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
     """The wait ends after the current env; the others are left to the next call."""
     group = new_group(5, inline=[True])
     host = group.hosts[0]
-    execute_next = host.execute_next
+    execute_one = host.execute_one
 
-    def execute_slowly() -> bool:
+    def execute_slowly() -> None:
         group.now += 1.0
-        return execute_next()
+        execute_one()
 
-    host.execute_next = execute_slowly
+    host.execute_one = execute_slowly
     group.steps.step_async(steps(*range(5)), group.now)
     running = collect(group, min_results=5 if "deadline" in rules else 1, **rules)
     if "deadline" in rules:

@@ -64,12 +64,14 @@ class Inline(Host):
     waiting: int
     log: list[int] = field(default_factory=list)
 
-    def execute_next(self) -> bool:
-        if not self.waiting:
-            return False
-        self.waiting -= 1
-        self.log.append(self.host_id)
-        return True
+    def execute(self, most: int, is_over: Any) -> int:
+        count = 0
+        while self.waiting and count < most:
+            self.waiting, count = self.waiting - 1, count + 1
+            self.log.append(self.host_id)
+            if is_over is not None and is_over():
+                break
+        return count
 
 
 class Scene:
@@ -240,15 +242,19 @@ def inline_scene(*waiting: int, workers: int = 0, clock: Any = time.monotonic) -
 def test_inline_hosts_execute_the_results_that_workers_cannot_provide(
     waiting: list[int], wanted: int
 ) -> None:
-    """At most the wanted number, in turns; `execute` returns True if there was anything to do."""
+    """At most the wanted number, host by host; returns True if there was anything to do."""
     scene = inline_scene(*waiting)
     assert scene.poller.execute(wanted, None) == (sum(waiting) > 0)
     log = scene.hosts[0].log
-    assert len(log) == min(wanted, sum(waiting))
-    counts = [log.count(k) for k in range(len(waiting))]
-    assert max(counts) - min(counts) <= 1 or any(
-        count == n < max(counts) for count, n in zip(counts, waiting, strict=True)
-    )
+    assert log == [k for k, count in enumerate(waiting) for _ in range(count)][:wanted]
+
+
+def test_the_host_whose_turn_it_is_next_begins() -> None:
+    """So none waits forever for another one, which gets new requests all the time."""
+    scene = inline_scene(9, 9)
+    for _ in range(4):
+        assert scene.poller.execute(2, None)
+    assert scene.hosts[0].log == [0, 0, 1, 1, 0, 0, 1, 1]
 
 
 def test_one_at_a_time_is_executed_while_workers_have_something_to_do() -> None:

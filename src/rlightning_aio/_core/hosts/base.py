@@ -221,8 +221,11 @@ class Killable(Protocol):
 class Executing(Protocol):
     """A host that executes requests in the thread of the caller."""
 
-    def execute_next(self) -> bool:
-        """Execute one waiting request and append its completion; return False if there is none."""
+    def execute(self, most: int, is_over: Callable[[], bool] | None) -> int:
+        """Execute up to `most` waiting requests, and append their completions.
+
+        `is_over` is asked after each, and ends it, too. Returns how many it has executed.
+        """
         ...
 
 

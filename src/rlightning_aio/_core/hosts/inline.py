@@ -8,8 +8,11 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
+from itertools import repeat
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 from weakref import WeakSet
+
+import numpy as np
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
@@ -28,7 +31,6 @@ from rlightning_aio.trees import copied
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Wiring
@@ -40,8 +42,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
 
-_Waiting: TypeAlias = "tuple[int, NDArray[np.int64], Callable[[], Any]]"
-"""An entry, by itself and as an array of one, and the function that executes it."""
+_Waiting: TypeAlias = "tuple[int, Any]"
+"""An entry and its arguments, which are None if they are in the row."""
 _STEP: Final = int(Operation.STEP)
 _HARDWARE: Final[WeakSet[BaseEnv]] = WeakSet()
 """Envs of this process that move something real."""
@@ -86,15 +88,8 @@ class InlineHost(Host):
         return copied(arguments)
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
-        asked, own = cast("list[int]", entries.tolist()), entries.copy()
-        for position, entry in enumerate(asked):
-            runner = self._runners[slot_of(entry) - self.first_slot]
-            given = None if arguments is None else arguments[position]
-            if given is not None or op_of(entry) != _STEP:
-                execute = partial(runner.execute, op_of(entry), given)
-            else:
-                execute = runner.step
-            self._queue.append((entry, own[position : position + 1], execute))
+        asked = cast("list[int]", entries.tolist())
+        self._queue.extend(zip(asked, arguments or repeat(None), strict=False))
 
     def abort(self, entries: NDArray[np.int64]) -> None:
         aborted = set(cast("list[int]", entries.tolist()))
@@ -107,28 +102,45 @@ class InlineHost(Host):
         del number  # None is being executed now.
         stop_one(self._runners, index)
 
-    def execute_next(self) -> bool:
-        if not self._queue:
-            return False
-        entry, alone, execute = self._queue.popleft()
-        outcome = error = None
-        runner = self._runners[slot_of(entry) - self.first_slot]
-        try:
-            if self._order.is_hardware:
-                with stopped_by_signals(_HARDWARE):
-                    outcome = self._driver.interruptible(execute)
+    def execute(self, most: int, is_over: Callable[[], bool] | None) -> int:
+        queue, first, in_rows, count = self._queue, self.first_slot, cast("list[int]", []), 0
+        run = self._run_hardware if self._order.is_hardware else self._driver.interruptible
+        while queue and count < most:
+            entry, arguments = queue.popleft()
+            count += 1
+            runner = self._runners[slot_of(entry) - first]
+            is_plain = arguments is None and op_of(entry) == _STEP
+            outcome = error = None
+            try:
+                outcome = run(
+                    runner.step if is_plain else partial(runner.execute, op_of(entry), arguments)
+                )
+            except BaseException as raised:
+                error = raised
+            completion = None
+            if outcome is not None or error is not None or not is_plain:
+                completion = completion_of(self.host_id, runner, entry, outcome, error)
+            if completion is None:
+                in_rows.append(entry)
             else:
-                outcome = self._driver.interruptible(execute)
-        except BaseException as raised:
-            error = raised
-        completion = None
-        if outcome is not None or error is not None or op_of(entry) != _STEP:
-            completion = completion_of(self.host_id, runner, entry, outcome, error)
-        # The group records all that are reported side by side in one go.
-        self._post(completion or Reported(self.host_id, alone))
-        if isinstance(error, KeyboardInterrupt):
-            raise error  # It is meant for the program, but the request ends, too.
-        return True
+                self._report(in_rows)
+                self._post(completion)
+            if isinstance(error, KeyboardInterrupt):
+                raise error  # It is meant for the program, but the request ends, too.
+            if is_over is not None and is_over():
+                break
+        self._report(in_rows)
+        return count
+
+    def _run_hardware(self, execute: Callable[[], Any]) -> Any:
+        with stopped_by_signals(_HARDWARE):
+            return self._driver.interruptible(execute)
+
+    def _report(self, in_rows: list[int]) -> None:
+        """Report what has its whole result in its row, and empty the list."""
+        if in_rows:
+            self._post(Reported(self.host_id, np.array(in_rows, np.int64)))
+            in_rows.clear()
 
     def close(self) -> None:
         """Close the envs immediately."""

@@ -346,15 +346,14 @@ class Poller:
         if len(hosts) < len(in_flight):
             own = sum([in_flight[host_id] for host_id, _ in hosts])
             wanted = wanted if own == sum(in_flight) else 1
+        is_over = None if until is None else lambda: self._clock() >= until
         count = num_idle = 0
         while count < wanted and num_idle < len(hosts):
             _, host = hosts[0]
             hosts.rotate(-1)  # In turn, so that none waits forever.
-            if not host.execute_next():
-                num_idle += 1
-                continue
-            count, num_idle = count + 1, 0
-            if until is not None and self._clock() >= until:
+            executed = host.execute(wanted - count, is_over)
+            count, num_idle = count + executed, 0 if executed else num_idle + 1
+            if executed and is_over is not None and is_over():
                 break
         return count > 0
 

@@ -29,9 +29,9 @@ _WORTH: Final = 1.5
 _BRIEF: Final = 200e-6
 """Limit of steps that are no longer than what it costs to wake the process of each."""
 _TINY: Final = 30e-6
-_IN_WORKERS: Final = (120e-6, 3e-6)
+_IN_WORKERS: Final = (40e-6, 2e-6)
 """What a batch costs beside the steps, and each env of a worker in it, in seconds."""
-_INLINE: Final = (30e-6, 3e-6)
+_INLINE: Final = (30e-6, 0.5e-6)
 _ENOUGH_SECONDS: Final = 0.02
 _ENOUGH_RESULTS: Final = 16
 _MANY_RESULTS: Final = 250
