@@ -1,8 +1,7 @@
-"""Programs of pages and examples for trainers of language models, with the real trainer."""
+"""Examples for trainers of language models, with the real trainer."""
 
 from __future__ import annotations
 
-import re
 import runpy
 from pathlib import Path
 from typing import Any
@@ -13,28 +12,13 @@ import rlightning_aio as rl
 
 pytestmark = [pytest.mark.simulators, pytest.mark.filterwarnings("ignore")]
 
-DOCS = Path(__file__).parents[2] / "docs"
-
-
-def program(page: str, module: str) -> str:
-    """The program of a page that imports a module."""
-    pytest.importorskip(module)
-    text = (DOCS / f"{page}.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    imports = rf"^(from|import) {module}\b"
-    (code,) = [block for block in blocks if re.search(imports, block, re.MULTILINE)]
-    return code
-
-
-def names_of(page: str, module: str) -> dict[str, Any]:
-    names: dict[str, Any] = {"__name__": "page"}
-    exec(compile(program(page, module), page, "exec"), names)  # Of this project.
-    return names
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def test_trl(tmp_path: Path) -> None:
     """Half of the rollouts reach their sum; what the env says is masked."""
-    names = names_of("migrating", "trl")
+    pytest.importorskip("trl")
+    names = runpy.run_path(str(EXAMPLES / "trl_grpo.py"))
     from datasets import Dataset
     from trainers.tiny import tiny_model, tokenizer, trainer_args
 
@@ -63,7 +47,7 @@ def test_trl(tmp_path: Path) -> None:
 async def test_tinker_cookbook() -> None:
     """Half of the attempts at each question are right; one at the second question has failed."""
     pytest.importorskip("tinker_cookbook")
-    names = runpy.run_path(str(DOCS.parent / "examples" / "tinker_groups.py"))
+    names = runpy.run_path(str(EXAMPLES / "tinker_groups.py"))
     import tinker
     from tinker_cookbook.completers import TokensWithLogprobs
 

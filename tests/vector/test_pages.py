@@ -17,7 +17,6 @@ DOCS = Path(__file__).parents[2] / "docs"
     ("page", "needed"),
     [
         ("stable_baselines3", ["stable_baselines3"]),
-        ("migrating#LeRobot", ["lerobot"]),
         ("migrating#TorchRL", ["torchrl"]),
         ("migrating#RLlib", ["ray", "tree", "torch"]),
         ("migrating#RL Zoo", ["rl_zoo3"]),
@@ -48,11 +47,19 @@ def test_programs_run(
 
 
 @pytest.mark.simulators
-@pytest.mark.parametrize("name", ["tianshou", "skyrl"])
-def test_examples_for_other_libraries_run(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("name", "needed"),
+    [
+        ("tianshou_env", "tianshou"),
+        ("skyrl_env", "skyrl_gym"),
+        ("lerobot_policy", "lerobot"),
+        ("lerobot_dataset", "lerobot"),
+    ],
+)
+def test_examples_for_other_libraries_run(name: str, needed: str) -> None:
     """Each runs to its end, and prints something."""
-    pytest.importorskip({"skyrl": "skyrl_gym"}.get(name, name))
-    assert output_of(DOCS.parent / "examples" / f"{name}_env.py").strip()
+    pytest.importorskip(needed)
+    assert output_of(DOCS.parent / "examples" / f"{name}.py").strip()
 
 
 DYING = """
@@ -84,8 +91,7 @@ def test_cleanrls_loop_prints_no_return_of_a_lost_episode(
 ) -> None:
     """Its end may be the only one of a step, where there is no return at all."""
     monkeypatch.setenv("DIES", str(int(dies)))
-    text = (DOCS / "migrating.md").read_text().partition("\n## CleanRL\n")[2]
-    (block, *_) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    block = (DOCS.parent / "examples" / "cleanrl_loop.py").read_text()
     block = block.replace("Pendulum-v1", "Dying-v0").replace(
         "range(0, 1000, 4)", "range(0, 1700, 4)"
     )
