@@ -21,6 +21,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")
 LOOPS = ("async_loop", "sync_loop")
+RUN = (*LOOPS, "remote_arm")
 # Run by other tests: they need other packages, or are not complete programs.
 ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
@@ -58,7 +59,7 @@ PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE
 @pytest.mark.parametrize("pages", [[ROOT / "README.md"], *(PAGES[k::4] for k in range(4))], ids=len)
 def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
     """It ends without a warning, and prints what its page shows; the examples write no error."""
-    examples = [ROOT / "examples" / f"{name}.py" for name in LOOPS if len(pages) == 1]
+    examples = [ROOT / "examples" / f"{name}.py" for name in RUN if len(pages) == 1]
     programs = list(examples)
     shown: dict[str, str] = {}
     (tmp_path / "configs").symlink_to(ROOT / "configs")

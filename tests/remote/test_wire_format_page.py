@@ -19,7 +19,6 @@ from rlightning_aio.protocol.net.wire import (
     ClientHello,
     ClientResult,
     Reader,
-    Step,
     Writer,
 )
 
@@ -39,7 +38,6 @@ def written(message: Any, space: gym.Space[Any] | None = None, value: Any = None
 
 
 EXAMPLES = [
-    written(Step(number=1), ACTIONS, 1),
     written(
         ClientResult(
             number=1,
@@ -70,16 +68,15 @@ def examples_of_the_page() -> list[list[bytes]]:
 
 
 def test_the_bytes_are_those_that_are_written() -> None:
-    """Each message of the example, header and frames."""
+    """The message of the example, header and frames."""
     assert examples_of_the_page() == EXAMPLES
 
 
 def test_the_bytes_are_read() -> None:
-    """The receiver can read each message of the example."""
+    """The receiver can read the message of the example."""
     for parts in examples_of_the_page():
         kind = msgspec.msgpack.decode(parts[0])["type"]
-        side = wire.FromServer if kind == "step" else wire.FromClient
-        reader: Reader[Any] = Reader(side)
+        reader: Reader[Any] = Reader(wire.FromClient)
         message, _ = reader.read(parts)
         assert message.__struct_config__.tag == kind
 
@@ -90,8 +87,8 @@ def test_every_field_is_named(kind: Any) -> None:
     tag = kind.__struct_config__.tag
     titles = [title for title in re.findall(r"^### (.*)$", PAGE, re.MULTILINE) if tag in title]
     section = PAGE.partition(f"### {titles[0]}\n")[2].partition("\n#")[0]
-    rows = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
-    assert re.findall(r"`(\w+)`", " ".join(rows)) == [*kind.__struct_fields__]
+    items = re.findall(r"^- (`.*?) \(", section, re.MULTILINE)
+    assert re.findall(r"`(\w+)`", " ".join(items)) == [*kind.__struct_fields__]
 
 
 @pytest.mark.parametrize("dtype", wire.DTYPES)
@@ -101,11 +98,12 @@ def test_every_dtype_is_named(dtype: str) -> None:
 
 
 def test_the_limits_are_those_of_the_code() -> None:
-    """In mebibytes, and in parts."""
-    assert f"| header | {wire.MAX_HEADER_BYTES >> 20} MiB |" in PAGE
-    assert f"| header of a hello | {wire.MAX_HELLO_BYTES >> 10} KiB |" in PAGE
-    assert f"| frame | {wire.MAX_FRAME_BYTES >> 20} MiB |" in PAGE
-    assert f"| parts of a message | {wire.MAX_PARTS:,} |" in PAGE
+    """Those of headers, frames and parts."""
+    header, hello = wire.MAX_HEADER_BYTES >> 20, wire.MAX_HELLO_BYTES >> 10
+    limits = " ".join(PAGE.partition("## Limits")[2].split())
+    assert f"A header has at most {header} MiB (that of a hello {hello} KiB)" in limits
+    assert f"a frame or an array of a space {wire.MAX_FRAME_BYTES >> 20} MiB" in limits
+    assert f"a message {wire.MAX_PARTS:,} parts" in limits
 
 
 def test_the_hello_is_read() -> None:
