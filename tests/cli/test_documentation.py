@@ -73,7 +73,6 @@ def test_every_option_of_the_page_exists(command: str) -> None:
 
 
 def test_every_command_is_on_the_page() -> None:
-    """The page lists the same commands as --help."""
+    """Each one that --help lists has a section."""
     known = set(re.findall(r"^│ (\w+) ", invoke("--help").stdout, re.MULTILINE))
-    rows = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE))))
-    assert known <= rows
+    assert known == set(re.findall(r"^## (\w+)$", PAGE, re.MULTILINE))
