@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 import json
 import re
-import tomllib
-from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -123,25 +121,6 @@ def test_every_configuration_loads(tmp_path: Path) -> None:
         # Paths of interpreters differ between machines.
         here = [f"envs.{k}.interpreter=null" for k, e in enumerate(entries) if "interpreter" in e]
         assert len(load_config(file, here)) == len(entries)
-
-
-def test_the_documented_versions_are_those_of_the_project() -> None:
-    """The lowest are what the package asks for, and the tested ones what is installed; LeRobot is
-    in none of these environments.
-    """
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
-    wanted.append(f"python{project['requires-python']}")
-    bounds = re.findall(r"^([\w-]+)(?:\[\w+\])?[>=~]=([\d.]+)", "\n".join(wanted), re.MULTILINE)
-    constraints = (ROOT / "constraints.txt").read_text().lower().replace("_", "-")
-    pinned = dict(re.findall(r"^([\w-]+)==(\S+)", constraints, re.MULTILINE))
-    table = (DOCS / "model.md").read_text().partition("## Supported versions")[2]
-    rows = re.findall(r"^\| `([\w-]+)` \| ([\d.]*) ?\| (.*) \|$", table, re.MULTILINE)
-    assert len(rows) == 15
-    for name, least, tested in rows:
-        assert dict(bounds).get(name, "") == least, name
-        if name not in {"python", "lerobot"}:
-            assert pinned[name] == tested, name
 
 
 def test_lists_are_lists_on_the_site() -> None:
