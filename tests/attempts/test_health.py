@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def in_an_outage(env_id: str = "") -> Health:
     """Slow from second 10 on."""
     health = Health()
-    kind = "env_died" if env_id else "agent_raised"
+    kind = "env_raised" if env_id else "agent_raised"
     for _ in range(4):
         health.note(Outcome(kind, "infrastructure", "away", env_id or "box-0"), 4, 10.0)
     assert health.is_slow
@@ -37,4 +37,4 @@ def test_an_outage_names_an_env_only_if_envs_fail(caplog: pytest.LogCaptureFixtu
     in_an_outage("box-1")
     of_model, of_envs = [one.getMessage() for one in caplog.records]
     assert "most attempts fail (3 agent_raised): others" in of_model
-    assert "most attempts fail (3 env_died, such as on env 'box-1'): others" in of_envs
+    assert "most attempts fail (3 env_raised, such as on env 'box-1'): others" in of_envs

@@ -996,6 +996,33 @@ async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFix
     assert len([one for one in said if "succeed again" in one]) == 1
 
 
+async def test_what_fails_when_an_outage_begins_costs_no_try(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The service fails all that play at once, then each of them once more, and comes back."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if (episode.spec.seed or 0) >= 8:
+            if next(arrived) == 8:
+                Sandbox.is_away = True
+                all_play.set()
+            await all_play.wait()
+        await once(episode)
+
+    def note_begin(self: Health, now: float) -> None:
+        del self, now
+        begun.append(None)
+        Sandbox.is_away = len(begun) <= 8
+
+    arrived, all_play, begun = itertools.count(1), asyncio.Event(), list[None]()
+    monkeypatch.setattr(Health, "note_begin", note_begin)
+    async with sandboxes(8) as group:
+        found = await played(group, tasks(16), agent, 1, Rules(retries=1))
+    failures = {attempts.spec.seed: len(attempts[0].failures) for attempts in found}
+    assert all(attempts.is_complete for attempts in found)
+    assert {seed: failures[seed] >= 2 for seed in range(16)} == {k: k >= 8 for k in range(16)}
+
+
 async def test_an_attempt_that_goes_well_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:
     """However long the pause would be: others begin when there is something to begin."""
 

@@ -13,6 +13,7 @@ import tempfile
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
@@ -26,6 +27,7 @@ from simulator.training import InContext
 from simulator.world import Faults
 
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, file, play
+from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.rules import is_retried
 from rlightning_aio.errors import BadAction, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import BLAMES, is_bystanders
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from simulator.scripted import Act
 
     from rlightning_aio.attempts import Attempt, AttemptEpisode, AttemptGroup
+    from rlightning_aio.attempts.queue import Job
 
 _LOST: Final = ("env_died", "env_hung", "env_raised", "env_away", "not_started")
 _SIZED: Final = ("vector", "single", "digits", "number")
@@ -178,14 +181,15 @@ class Attempts(InContext):
         if self.has_ended:
             return
         self.op_seed, self.played, self.stubborn = rng.getrandbits(32), {}, set()
-        self.is_bug = False
+        self.is_bug, self.excused = False, dict[Any, int]()
         specs = self.specs(rng, 6)
         size, rules = rng.randint(1, 4), self._rules(rng)
         leave = self._leave(rng, len(specs))
         leaves = leave != (None, None)
         may_time_out = rules.attempt_timeout is not None
         self.may_hang = may_time_out or leave[0] is not None
-        with tempfile.TemporaryDirectory() as folder:
+        excuse = patch.object(AttemptQueue, "excuse", self._excusing(AttemptQueue.excuse))
+        with tempfile.TemporaryDirectory() as folder, excuse:
             path = Path(folder) / "attempts" if rng.random() < 0.3 else None
             self.has_file = path is not None
             tasks = partial(_loaded, specs) if rng.random() < 0.3 else specs.copy
@@ -200,6 +204,17 @@ class Attempts(InContext):
             require(keys == sorted(spec.key for spec in specs), "other groups", keys)
         if self.stubborn:
             await asyncio.wait(self.stubborn)
+
+    def _excusing(self, excuse: Callable[..., None]) -> Callable[..., None]:
+        """Note which failures don't count, because most attempts fail."""
+
+        def noted(queue: AttemptQueue, playing: list[Job]) -> None:
+            excuse(queue, playing)
+            self.counts["outages"] += 1
+            jobs = [*playing, *chain.from_iterable(queue.queues())]
+            self.excused |= {(job.spec.key, job.index): job.num_excused for job in jobs}
+
+        return noted
 
     def _rules(self, rng: Random) -> Rules:
         times = "timeouts" in self.features and rng.random() < 0.6
@@ -313,9 +328,11 @@ class Attempts(InContext):
         for one in outcomes:
             require(bool(one.cause) and one.blame in BLAMES, "without a cause", one)
         require(all(map(is_retried, attempt.failures)), "tried again, and it should not be")
-        counted = sum(not is_bystanders(one) for one in attempt.failures)
+        excused = self.excused.get((attempt.spec.key, attempt.index), 0)
+        counted = sum(not is_bystanders(one) for one in attempt.failures[excused:])
         require(counted <= rules.retries, "tried too often", counted)
-        may_go_on = is_bystanders(outcome) or counted < rules.retries
+        is_excused = outcome.attempt < excused and not self.has_file  # Or by the run before.
+        may_go_on = is_bystanders(outcome) or counted < rules.retries or is_excused
         require(not (is_retried(outcome) and may_go_on), "not tried again")
         if outcome.kind == "cancelled":
             require(rules.first is not None and is_full, "cancelled, and no surplus")

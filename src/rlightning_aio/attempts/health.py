@@ -2,7 +2,8 @@
 
 Rule: a broken env fails in milliseconds, so without a rest it would be free for every attempt. And
 a service that is away fails attempts at many times the normal pace, so they begin one at a time,
-after growing pauses, until one succeeds. It reads no clock.
+after growing pauses, until one succeeds. A worker's death says little of its other envs, so it is
+one failure at most. It reads no clock.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import logging
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.attempts.rules import is_final, is_of_env
+from rlightning_aio.attempts.rules import is_final, is_of_env, is_retried, is_unnamed
+from rlightning_aio.outcomes import is_bystanders
 
 if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
@@ -36,18 +38,29 @@ class Health:
 
     def __init__(self) -> None:
         self.is_slow = False
+        self._has_succeeded = False  # An attempt, since most failed.
         self._in_a_row = Counter[str]()
         self._rests: dict[str, float] = {}
         self._recent = deque[str]()  # The kinds of failures, and an empty text for a success.
         self._pause = self._since = self._next = 0.0
 
-    def note(self, outcome: Outcome, num_playing: int, now: float) -> None:
-        """Note the end of a try; `num_playing` may play at once."""
+    def note(self, outcome: Outcome, num_playing: int, now: float) -> bool:
+        """Note the end of a try; `num_playing` may play at once.
+
+        Returns True if an outage begins: most fail from now on, and at least one has succeeded
+        since that was so before.
+        """
         self.note_env(outcome, now)
+        was_slow = self.is_slow
         if is_final(outcome):
+            self._has_succeeded = True
             self._note_recent("", num_playing, now)
-        elif outcome.blame != "caller" and outcome.kind != "timed_out":
+        elif is_retried(outcome) and not (is_bystanders(outcome) or is_unnamed(outcome)):
             self._note_recent(outcome.kind, num_playing, now)
+        if was_slow or not self.is_slow:
+            return False
+        had_succeeded, self._has_succeeded = self._has_succeeded, False
+        return had_succeeded
 
     def note_env(self, outcome: Outcome, now: float) -> None:
         """Note the end of a try for its env alone, which rests if it has failed too often."""

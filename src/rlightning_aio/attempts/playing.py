@@ -306,7 +306,8 @@ class _Engine:
             queue.free[one.env_id] = None
         for env_id in queue.players.gone | queue.players.left_alone:
             queue.free.pop(env_id, None)
-        self._health.note(attempt.outcome, self._most, time.monotonic())
+        if self._health.note(attempt.outcome, self._most, time.monotonic()):
+            queue.excuse([job, *(other for other, _ in self._playing.values())])
         has_ended = queue.end(job, attempt)
         is_retried = not (has_ended or job.task.is_settled)
         self._numbers.note_end(attempt.outcome, is_retried=is_retried)

@@ -57,6 +57,7 @@ class Job:
         sub_env: of the env that it waits for.
         since: when it began to wait for an env, in monotonic seconds.
         failures: outcomes of its tries so far.
+        num_excused: how many failures, from the first one on, don't count.
     """
 
     task: TaskInPlay
@@ -64,6 +65,7 @@ class Job:
     sub_env: int = 0
     since: float = 0.0
     failures: list[Outcome] = field(default_factory=list["Outcome"])
+    num_excused: int = 0
 
     @property
     def spec(self) -> EpisodeSpec:
@@ -162,8 +164,12 @@ class AttemptQueue:
 
     def __len__(self) -> int:
         """The number of attempts that wait."""
-        pinned = sum(len(queue) for queues in self._pinned.values() for queue in queues.values())
-        return pinned + sum(map(len, self._waiting.values()))
+        return sum(map(len, self.queues()))
+
+    def queues(self) -> Iterable[deque[Job]]:
+        """All that waits: for each entry, and for each env that episodes name."""
+        pinned = chain.from_iterable(queues.values() for queues in self._pinned.values())
+        return chain(self._waiting.values(), pinned)
 
     def withdraw(self, task: TaskInPlay) -> list[Job]:
         """Remove the attempts at a task that wait, and return them."""
@@ -180,10 +186,8 @@ class AttemptQueue:
 
     def withdraw_all(self) -> list[Job]:
         """Remove all attempts that wait, and return them."""
-        pinned = chain.from_iterable(queues.values() for queues in self._pinned.values())
-        queues = [*self._waiting.values(), *pinned]
-        removed = [*chain.from_iterable(queues)]
-        for queue in queues:
+        removed = [*chain.from_iterable(self.queues())]
+        for queue in self.queues():
             queue.clear()
         self._kept_for.clear()
         return removed
@@ -272,7 +276,7 @@ class AttemptQueue:
         self._keep_nothing_for(job)
         if job.task.is_settled:
             return False
-        if not is_last and tries_again(self._rules, outcome, job.failures):
+        if not is_last and tries_again(self._rules, outcome, job.failures, job.num_excused):
             job.failures.append(outcome)
             self._wait(job)
             return False
@@ -281,6 +285,13 @@ class AttemptQueue:
         if self._results is not None:
             self._results.add(attempt)
         return True
+
+    def excuse(self, playing: Iterable[Job]) -> None:
+        """Count no failure so far, nor the next one of what plays: an outage has begun."""
+        for job in chain.from_iterable(self.queues()):
+            job.num_excused = len(job.failures)
+        for job in playing:
+            job.num_excused = len(job.failures) + 1
 
     def flush(self) -> None:
         """Wait until what has ended is in the file."""

@@ -54,9 +54,10 @@ class Rules:
             has earned (``end``). Without a completed step it has failed all the same, and if a step
             has taken more than half of the time, it is ``env_hung``.
         retries: how often an attempt that has failed is tried again, on another env than before. A
-            failure for which another env of the worker is to blame isn't counted. What the policy
-            alone or the caller has caused isn't tried again, and neither is ``timed_out``. After
-            the death of a worker in which several were executed, each of them is tried again in a
+            failure for which another env of the worker is to blame isn't counted, and neither are
+            those with which an outage begins: most attempts fail, after one has succeeded. What the
+            policy alone or the caller has caused isn't tried again, nor is ``timed_out``. After the
+            death of a worker in which several were executed, each of them is tried again in a
             worker where nobody else plays.
         first: as soon as this many attempts have not failed, the group is complete, and the others
             are cancelled; None: it is complete if none has failed.
@@ -93,10 +94,16 @@ class Rules:
             raise ValueError(f"on_timeout must be fail or end, not {self.on_timeout!r}")
 
 
-def tries_again(rules: Rules, outcome: Outcome, before: Sequence[Outcome]) -> bool:
-    """Return True if an attempt is tried again after a try, and those `before` that failed."""
-    counted = sum(not is_bystanders(one) for one in before)
-    return is_retried(outcome) and (is_bystanders(outcome) or counted < rules.retries)
+def tries_again(
+    rules: Rules, outcome: Outcome, before: Sequence[Outcome], num_excused: int
+) -> bool:
+    """Return True if an attempt is tried again after a try, and those `before` that failed.
+
+    Its first `num_excused` failures don't count.
+    """
+    counted = sum(not is_bystanders(one) for one in before[num_excused:])
+    is_excused = is_bystanders(outcome) or len(before) < num_excused
+    return is_retried(outcome) and (is_excused or counted < rules.retries)
 
 
 def needed(rules: Rules, size: int) -> int:
