@@ -44,6 +44,8 @@ _OF_SINGLE_ENVS: Final = ("wrapper_class", "wrapper_kwargs", "monitor_dir", "mon
 """Arguments of Stable-Baselines3's `make_vec_env` that keep envs from being stepped together."""
 _IGNORED: Final = {"start_method"}
 """Arguments of `VecEnv` without a meaning."""
+_FEWEST_TOGETHER: Final = 4
+"""Envs of a MuJoCo task for which a batch is faster than a loop, with what is around them."""
 
 
 def make_vec_env(
@@ -57,9 +59,10 @@ def make_vec_env(
 ) -> Any:
     """Make monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
 
-    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped together, in
-    threads of this process, inside a `VecMonitor`, unless they need a wrapper or a file each.
-    Classic control, toy text and a single env are what Stable-Baselines3 makes, a `DummyVecEnv`.
+    Four envs or more of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped
+    together, in threads of this process, inside a `VecMonitor`, unless they need a wrapper or a
+    file each. Fewer of them, classic control, toy text and a single env are what Stable-Baselines3
+    makes, a `DummyVecEnv`.
     All else is a `VecEnv` of separate envs in workers, each in a `Monitor` that restarts continue.
 
     Args:
@@ -97,12 +100,14 @@ def make_vec_env(
     spec = spec_of(env_id) if isinstance(env_id, str) else None
     kwargs = {"render_mode": "rgb_array", **(env_kwargs or {})}
     separate = not decides or any(more.get(name) for name in _OF_SINGLE_ENVS)
-    if spec is not None and steps_together(spec, kwargs, separate=separate):
+    together = spec is not None and steps_together(spec, kwargs, separate=separate)
+    few = n_envs < _FEWEST_TOGETHER and "num_threads" not in kwargs
+    if spec is not None and together and not few:
         kwargs = {"disable_env_checker": True, **kwargs}
         made = VecEnv(batch_of(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
         made.seed(seed)
         return vec_envs.VecMonitor(made)
-    if decides and (n_envs == 1 or (spec is not None and is_brief(spec))):
+    if decides and (n_envs == 1 or together or (spec is not None and is_brief(spec))):
         vec_env_cls = dummy
     kind = dummy if vec_env_cls is dummy else VecEnv
     return make(env_id, n_envs, seed, vec_env_cls=kind, vec_env_kwargs=fields, **given)

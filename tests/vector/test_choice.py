@@ -105,7 +105,9 @@ def test_stable_baselines3s_function_decides_likewise() -> None:
         (OWN, 1, {}, vec_env.DummyVecEnv),
         (lambda **_: gym.make("Pendulum-v1"), 1, {}, vec_env.DummyVecEnv),
         (lambda **_: gym.make("Pendulum-v1"), 2, {"vec_env_cls": VecEnv}, VecEnv),
-        ("Hopper-v5", 3, {}, vec_env.VecMonitor),
+        ("Hopper-v5", 4, {}, vec_env.VecMonitor),
+        ("Hopper-v5", 3, {}, vec_env.DummyVecEnv),
+        ("Hopper-v5", 1, {"env_kwargs": {"num_threads": 1}}, vec_env.VecMonitor),
         ("Hopper-v5", 3, {"vec_env_cls": vec_env.DummyVecEnv}, vec_env.DummyVecEnv),
         ("Hopper-v5", 3, {"vec_env_cls": vec_env.SubprocVecEnv}, VecEnv),
     ):

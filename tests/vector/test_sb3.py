@@ -258,7 +258,7 @@ def test_a_vector_env_in_another_mode_is_refused() -> None:
     pole = gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")])
     with pytest.raises(ConfigError, match=r"NEXT_STEP; Stable-Baselines3 needs"):
         VecEnv(pole)
-    envs: Any = make_vec_env("Hopper-v5", 2)
+    envs: Any = make_vec_env("Hopper-v5", 4)
     with pytest.raises(AttributeError, match="without a group"):
         _ = envs.venv.group
     with pytest.raises(ConfigError, match=r"^task: the envs are those of the callables"):
@@ -267,7 +267,7 @@ def test_a_vector_env_in_another_mode_is_refused() -> None:
         VecEnv(envs.venv.envs, step_timeout=3.0)
     with pytest.raises(ValueError, match="MujocoVectorEnv can't set frame_skip of only"):
         envs.set_attr("frame_skip", 2, indices=[1])
-    envs.set_options([{"a": 1}, {}])
+    envs.set_options([{"a": 1}, {}, {}, {}])
     with pytest.raises(ValueError, match="options of envs differ, and a MujocoVectorEnv resets"):
         envs.reset()
     envs.close()
@@ -404,7 +404,7 @@ def test_the_vector_env_of_ale_py() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_envs", [1, 4])
 def test_ppo_learns_the_same_on_envs_that_are_stepped_together(n_envs: int) -> None:
     """The same weights as with Stable-Baselines3's own envs, in a `VecMonitor`."""
     from stable_baselines3 import PPO
