@@ -86,10 +86,8 @@ def make_vec_env(
     vec_envs = import_module("stable_baselines3.common.vec_env")
     dummy = vec_envs.DummyVecEnv
     if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, dummy):
-        raise ValueError(
-            f"vec_env_cls is {vec_env_cls.__name__}, and these envs are in a {VecEnv.__name__}: "
-            "leave it out, or call Stable-Baselines3's make_vec_env"
-        )
+        remedy = "leave it out, or call Stable-Baselines3's make_vec_env"
+        raise ValueError(f"vec_env_cls is {vec_env_cls.__name__}: {remedy}")
     make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
     given = {**more, "env_kwargs": env_kwargs, "monitor_kwargs": _Continued(more)}
     inspect.signature(make).bind(env_id, n_envs, seed, vec_env_kwargs=vec_env_kwargs, **given)
@@ -99,17 +97,16 @@ def make_vec_env(
     decides = vec_env_cls is None and not fields
     spec = spec_of(env_id) if isinstance(env_id, str) else None
     kwargs = {"render_mode": "rgb_array", **(env_kwargs or {})}
-    separate = not decides or any(more.get(name) for name in _OF_SINGLE_ENVS)
+    separate = not decides or any(map(more.get, _OF_SINGLE_ENVS))
     together = spec is not None and steps_together(spec, kwargs, separate=separate)
-    few = n_envs < _FEWEST_TOGETHER and "num_threads" not in kwargs
-    if spec is not None and together and not few:
+    enough = n_envs >= _FEWEST_TOGETHER or "num_threads" in kwargs
+    if spec is not None and together and enough:
         kwargs = {"disable_env_checker": True, **kwargs}
         made = VecEnv(batch_of(spec, kwargs, n_envs, AutoresetMode.SAME_STEP))
         made.seed(seed)
         return vec_envs.VecMonitor(made)
-    if decides and (n_envs == 1 or together or (spec is not None and is_brief(spec))):
-        vec_env_cls = dummy
-    kind = dummy if vec_env_cls is dummy else VecEnv
+    is_short = n_envs == 1 or together or (spec is not None and is_brief(spec))
+    kind = dummy if vec_env_cls is dummy or (decides and is_short) else VecEnv
     return make(env_id, n_envs, seed, vec_env_cls=kind, vec_env_kwargs=fields, **given)
 
 
