@@ -53,12 +53,14 @@ def test_the_configuration_block_loads(tmp_path: Path) -> None:
     assert [config.num_workers for config in configs] == [16, 8]
 
 
-def test_the_configuration_table_names_every_field() -> None:
-    """Each field of `EnvConfig` has its row, and no row names another."""
+def test_the_page_on_configuration_names_every_field() -> None:
+    """Each field of `EnvConfig` has its item, and no item names another."""
     from rlightning_aio import EnvConfig
 
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", CONFIGURATION, re.MULTILINE)
-    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    items = re.findall(r"^- (.*?): ", CONFIGURATION, re.MULTILINE)
+    named = {
+        name for item in items for name in re.findall(r"`(\w+)`", re.sub(r"\(.*?\)", "", item))
+    }
     assert named == set(EnvConfig.model_fields)
 
 
