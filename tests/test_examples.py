@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")
 LOOPS = ("async_loop", "sync_loop")
-RUN = (*LOOPS, "remote_arm")
+RUN = (*LOOPS, "openpi_policy", "remote_arm")
 # Run by other tests: they need other packages, or are not complete programs.
 ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
