@@ -14,7 +14,7 @@ import pytest
 
 from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.payload import Packed, SpaceLayout
-from rlightning_aio.protocol.net.space_description import describe, space_from
+from rlightning_aio.protocol.net.space_description import space_from
 from rlightning_aio.protocol.net.wire import (
     ClientHello,
     ClientResult,
@@ -113,10 +113,3 @@ def test_the_hello_is_read() -> None:
     assert hello.version == wire.VERSION
     spaces = (hello.observation_space, hello.action_space)
     assert tuple(map(space_from, spaces)) == (OBSERVATIONS, ACTIONS)
-
-
-def test_the_described_space_is_one() -> None:
-    """The JSON example describes a space, which describes itself in the same way."""
-    (text,) = re.findall(r"^```json\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    description = json.loads(text)
-    assert describe(space_from(description), "space") == description
