@@ -210,7 +210,7 @@ $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 
 $(TRAINERS)/installed: pyproject.toml constraints.txt requirements/test.txt requirements/trainers.txt | $(TRAINERS)/bin/python
 	$(PIP_INSTALL) --constraint constraints.txt --editable . --requirement requirements/test.txt --requirement requirements/trainers.txt
-	$(PIP_INSTALL) --no-deps tinker-cookbook==0.6.1
+	$(PIP_INSTALL) --no-deps tinker-cookbook==0.6.1 verifiers==0.4.0 verl==0.9.1
 	@touch $@
 
 $(LEROBOT)/bin/python: PYTHON := $(PYTHON_OF_LEROBOT)
