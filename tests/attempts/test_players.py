@@ -69,8 +69,10 @@ def leave(group: sync.EnvGroup, client: ClientThread, batch: BatchedData) -> Non
 
 
 def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more(
-    group: sync.EnvGroup,
+    group: sync.EnvGroup, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Looking takes its time, so it is done now and then, or at once where nothing else is left."""
+    monkeypatch.setattr("rlightning_aio.attempts.queue.LOOK_SECONDS", 1e6)
     client = dial(group, hardware=False)
     batch, _ = group.reset()
     queue = AttemptQueue(group, Rules())
@@ -80,9 +82,11 @@ def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more(
     assert not queue.free
     client = dial(group, hardware=False)
     until_it_is("up", group)
-    queue.look(["robots-0/0"])
+    queue.look(["robots-0/0"], at_once=True)
     assert not queue.free
     queue.look(())
+    assert not queue.free
+    queue.look((), at_once=True)
     assert [*queue.free] == ["robots-0/0"]
     group.reset()  # A client that has not read its welcome has no session that could end.
     group.close()

@@ -52,6 +52,11 @@ class Players:
         self.present: set[str] = set()
         self.refresh()
 
+    @property
+    def out(self) -> set[str]:
+        """Envs that are gone, or left alone."""
+        return self.gone | self.left_alone
+
     def refresh(self) -> set[str]:
         """Look which envs are there now; return those that are."""
         present: set[str] = set()
@@ -63,7 +68,7 @@ class Players:
                 self.left_alone.update(
                     id_ for id_ in worker["env_ids"] if is_lost(self._group, id_)
                 )
-        self.present = present - self.gone - self.left_alone
+        self.present = present - self.out
         return self.present
 
     def note(self, outcome: Outcome) -> None:
@@ -114,7 +119,7 @@ class Players:
 
     def can_play(self, entries: Iterable[str], *, alone: bool = False) -> bool:
         """Return True unless all envs of one of these entries are gone, or left alone."""
-        out = self.gone | self.left_alone if alone else self.gone
+        out = self.out if alone else self.gone
         if not out:
             return True
         left = {entry for env_id, entry in self.entry_of.items() if env_id not in out}
@@ -123,7 +128,7 @@ class Players:
 
     def is_nobody_left(self) -> bool:
         """Return True if all envs are gone, or left alone."""
-        return self.entry_of.keys() <= self.gone | self.left_alone
+        return self.entry_of.keys() <= self.out
 
     def refusal(self, env_id: str) -> RLightningError:
         """The error for attempts that only an env which is left alone could play."""

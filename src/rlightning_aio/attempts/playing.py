@@ -22,7 +22,7 @@ from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.numbers import Numbers
-from rlightning_aio.attempts.queue import AttemptQueue
+from rlightning_aio.attempts.queue import LOOK_SECONDS, AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
 from rlightning_aio.attempts.tasks import TaskSource
@@ -31,7 +31,7 @@ from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterable, Iterable
+    from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
 
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.attempts.queue import Job, TaskInPlay
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 
 _BURST: Final = 16
 """Most attempts that begin in one turn of the event loop, so that it is free for others."""
-_LOOK_SECONDS: Final = 0.2
-"""Between looks for clients that have dialled in."""
 _MOST_LACKING: Final = 1000
 """Most attempts that wait for entries without an env while tasks are read for the others."""
 _LAST: Final = 100
@@ -160,7 +158,6 @@ class _Engine:
         self._ahead = 2 if is_plain and not self._has_clients else 1
         self._playing: dict[asyncio.Task[Attempt], tuple[Job, Try]] = {}
         self._ended = deque[asyncio.Task[Attempt]]()
-        self._look_at = 0.0
         self._logged = set[type[BaseException]]()
         self._turns = asyncio.Semaphore(rules.max_concurrency or sys.maxsize)
         self._health = health = Health()
@@ -203,12 +200,12 @@ class _Engine:
                     return
                 seconds = self._health.seconds_left(time.monotonic()) if waiting else None
                 if self._has_clients:
-                    seconds = min(seconds or _LOOK_SECONDS, _LOOK_SECONDS)
+                    seconds = min(seconds or LOOK_SECONDS, LOOK_SECONDS)
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(seconds):
                         await self._wake.wait()
                 if self._has_clients:
-                    self._look()
+                    self._queue.look(self._busy())
         finally:
             self._clock.stop()
             await self._end_all()
@@ -304,7 +301,7 @@ class _Engine:
         queue.players.note(attempt.outcome)
         if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
             queue.free[one.env_id] = None
-        for env_id in queue.players.gone | queue.players.left_alone:
+        for env_id in queue.players.out:
             queue.free.pop(env_id, None)
         if self._health.note(attempt.outcome, self._most, time.monotonic()):
             queue.excuse([job, *(other for other, _ in self._playing.values())])
@@ -365,7 +362,10 @@ class _Engine:
 
     def _num_lacking(self) -> int:
         """Number of attempts that wait for an entry without an env."""
-        return self._queue.lacking(one.env_id for _, one in self._playing.values())
+        return self._queue.lacking(self._busy())
+
+    def _busy(self) -> Iterator[str]:
+        return (one.env_id for _, one in self._playing.values())
 
     def _check_envs(self) -> None:
         """Raise the last fault if attempts wait for an env that won't come."""
@@ -380,10 +380,3 @@ class _Engine:
             raise queue.players.refusal(min(queue.players.left_alone))
         if not self._has_clients:
             raise queue.fault or RLightningError("no env of this group is left that could play")
-
-    def _look(self) -> None:
-        """Look for clients that have come, come back or left, a few times in a second."""
-        if time.monotonic() < self._look_at:
-            return
-        self._look_at = time.monotonic() + _LOOK_SECONDS
-        self._queue.look(one.env_id for _, one in self._playing.values())

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.rules import is_of_env, is_unnamed, tries_again
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
     from rlightning_aio.errors import WorkerDied
     from rlightning_aio.outcomes import Outcome
+
+LOOK_SECONDS: Final = 0.2
+"""Between looks for clients that have dialled in or left."""
 
 
 @dataclass(eq=False, slots=True)
@@ -111,6 +114,7 @@ class AttemptQueue:
         # Envs whose worker is kept for a job that plays alone.
         self._kept_for: dict[str, Job] = {}
         self._places: set[tuple[EpisodeKey, int, int]] = set()
+        self._look_at = 0.0
 
     # -- what waits -------------------------------------------------------------------
 
@@ -324,8 +328,15 @@ class AttemptQueue:
     def _pinned_to(self) -> list[str]:
         return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
 
-    def look(self, busy: Iterable[str]) -> None:
-        """Look which envs are there: those that are not `busy` are free."""
+    def look(self, busy: Iterable[str], *, at_once: bool = False) -> None:
+        """Look which envs are there, a few times in a second: those that are not `busy` are free.
+
+        Looking at all places of an env_server takes its time.
+        """
+        now = time.monotonic()
+        if now < self._look_at and not at_once:
+            return
+        self._look_at = now + LOOK_SECONDS
         present = self.players.refresh().difference(busy)
         for env_id in self.free.keys() - present:
             del self.free[env_id]
