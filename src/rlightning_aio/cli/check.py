@@ -33,10 +33,12 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.config.documents import parse_configs
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.masks import allowed_action
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.registry import ENVS, placement_of
+from rlightning_aio.registry import ENVS
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -220,8 +222,11 @@ def _held(pid: int) -> dict[str, float]:
 
 
 def _can_recycle(config: EnvConfig) -> bool:
-    refuses = placement_of(config.backend, config.placement).refuses
-    return "recycle" not in refuses and not ENVS.is_hardware(config.backend)
+    try:
+        parse_configs([config.model_copy(update={"recycle": {"episodes": 1}})])
+    except ConfigError:
+        return False
+    return True
 
 
 def _leaks(samples: list[dict[str, float]], *, can_recycle: bool) -> dict[str, str]:

@@ -57,7 +57,7 @@ class Renewals:
             peer.started, peer.order = record.started, record.order
             peer.stage, peer.is_next, peer.restart_at = Stage.DOWN, True, self._tables.clock()
             peer.restarts -= 1  # This is none.
-            peer.deaths = {None: 0}
+            peer.deaths, peer.last_loss = {None: 0}, None
             self._note_change()
             self._start(peer.host.host_id)
         is_coming = peer.is_down and not any(peer.deaths.values())
@@ -106,9 +106,14 @@ class Renewals:
         self._note_change()
 
     def give_back(self, record: HostRecord) -> None:
-        """Let the worker before go on with all envs, as the next one could not be started."""
+        """Let the worker before go on with all envs, as the next one could not be started.
+
+        One that was up has played episodes since, which must not be played again.
+        """
         peer = record.peer
         if peer is None or not record.is_next or peer.stage is not Stage.UP:
+            return
+        if record.last_loss is not None:
             return
         requests, slots = self._tables.requests, self._tables.slots_of(record)
         count = len(requests.owed(slots))

@@ -27,13 +27,14 @@ class HandedOn(Exception):
     Args:
         arguments: of the reset there, packed: seed, options, and the env's generators.
         is_due: this worker is due; else the next is only to be started.
+        resident_mb: of this worker.
     """
 
-    def __init__(self, arguments: bytes, *, is_due: bool) -> None:
+    def __init__(self, arguments: bytes, *, is_due: bool, resident_mb: float) -> None:
         super().__init__()
         self.arguments = arguments
         self.is_due = is_due
-        self.resident_mb = resident_mb(os.getpid())
+        self.resident_mb = resident_mb
 
 
 class Renewal:
@@ -56,6 +57,10 @@ class Renewal:
     def begin(self) -> None:
         """Count an episode that begins here."""
         self._begun += 1
+
+    def resident_mb(self) -> float:
+        """Return the memory of the worker, as `is_due` has just measured it if it has to."""
+        return self._measured[-1] if self._measured else resident_mb(os.getpid())
 
     def is_due(self) -> bool | None:
         """Return whether the worker is due before another episode; False once, some time ahead of

@@ -364,13 +364,13 @@ class EnvRunner:
             if not self._has_handed_on:
                 self._take_over(generators)
         else:
-            chosen = self._seed_and_options(arguments)
+            chosen = arguments or self._seed_and_options(None)
             begins = "reset_mask" not in (chosen[1] or {})  # Else some parts go on.
             is_due = renewal.is_due() if begins else None
             if is_due is not None:
                 self._has_handed_on = True
                 given = dumped((*chosen, self._generators()), "its reset")
-                raise HandedOn(given, is_due=is_due)
+                raise HandedOn(given, is_due=is_due, resident_mb=renewal.resident_mb())
         self._has_handed_on = False
         renewal.begin()
         return chosen[0], chosen[1]
