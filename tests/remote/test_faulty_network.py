@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread
 from patience import HANG
 from remote.faulty_proxy import Faults, FaultyProxy
+from remote.recording import HEARTBEAT, RecordingEnv
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
 
@@ -18,34 +23,7 @@ if TYPE_CHECKING:
 
 REQUESTS = int(os.environ.get("RLIGHTNING_AIO_FAULTY_REQUESTS", "400"))
 """For each kind of network; 10,000 take some minutes."""
-HEARTBEAT = 0.8
 CLIENTS = 3
-
-
-class RecordingEnv(CountingEnv):
-    """Its observation is (identity, the request's number, steps since the reset).
-
-    The action's first element is the request's number.
-    """
-
-    def __init__(self, identity: int) -> None:
-        super().__init__(identity)
-        self.executed: list[int] = []
-        self.number = -1
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
-        self.number = -1
-        return super().reset(seed=seed, options=options)
-
-    def step(self, policy_resp: PolicyResponse) -> Any:
-        self.number = int(policy_resp.action[0] * 2**20)
-        self.executed.append(self.number)
-        return super().step(policy_resp)
-
-    def ret(self) -> Any:
-        ret = super().ret()
-        ret.observation[1] = self.number
-        return ret
 
 
 NETWORKS = {
@@ -55,42 +33,80 @@ NETWORKS = {
 }
 
 
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("network", NETWORKS)
-def test_no_request_is_executed_twice_and_each_ends_once(
-    network: str, record_property: Callable[[str, Any], None]
-) -> None:
-    """Every request of the trainer ends in its own result, or in a marked one."""
-    envs = [RecordingEnv(k) for k in range(CLIENTS)]
-    config = {
+def make_config(num_clients: int) -> dict[str, Any]:
+    return {
         "name": "robots",
         "backend": "env_server",
         "max_restarts": 1_000_000,
         "env_kwargs": {
-            "clients": [f"c{k}" for k in range(CLIENTS)],
+            "clients": [f"c{k}" for k in range(num_clients)],
             "heartbeat": HEARTBEAT,
             "connect_timeout": HANG,
         },
     }
-    with sync.build_env_group(config) as group:
-        with FaultyProxy(group["robots-0"].address, NETWORKS[network], seed=1) as proxy:
-            threads = [ClientThread(proxy.address, f"c{k}", env) for k, env in enumerate(envs)]
-            for env in envs:
-                env.stays = True
-            ends = exchange(group, REQUESTS)
-            for env in envs:
-                env.stays, env.finished = False, True
-            group.close()
-            for thread in threads:
-                thread.join()
-        record_property("network", proxy.tally)
-        record_property("requests", ends)
-    executed = [number for env in envs for number in env.executed]
+
+
+def check(ends: dict[str, int], folder: Path, proxy: FaultyProxy, faults: Faults) -> None:
+    """Compare what the trainer has got with what the clients have done."""
+    executed = [int(number) for file in folder.iterdir() for number in file.read_text().split()]
     assert len(executed) == len(set(executed)), "a request was executed twice"
-    assert sum(ends.values()) == REQUESTS
-    assert ends["answered"] <= len(executed) <= REQUESTS
-    fates = [name for name in ("cut", "silence") if getattr(NETWORKS[network], name)]
+    assert ends["answered"] <= len(executed) <= sum(ends.values())
+    fates = [name for name in ("cut", "silence") if getattr(faults, name)]
     assert all(proxy.tally[name] for name in fates), "the network had too few faults"
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_no_request_is_executed_twice_and_each_ends_once(
+    network: str, tmp_path: Path, record_property: Callable[[str, Any], None]
+) -> None:
+    """Every request of the trainer ends in its own result, or in a marked one."""
+    envs = [RecordingEnv(k, tmp_path / f"c{k}") for k in range(CLIENTS)]
+    with (
+        sync.build_env_group(make_config(CLIENTS)) as group,
+        FaultyProxy(group["robots-0"].address, NETWORKS[network], seed=1) as proxy,
+    ):
+        threads = [ClientThread(proxy.address, f"c{k}", env) for k, env in enumerate(envs)]
+        for env in envs:
+            env.stays = True
+        ends = exchange(group, REQUESTS)
+        for env in envs:
+            env.stays, env.finished = False, True
+        group.close()
+        for thread in threads:
+            thread.join()
+    record_property("network", proxy.tally)
+    record_property("requests", ends)
+    check(ends, tmp_path, proxy, NETWORKS[network])
+
+
+@pytest.mark.timeout(1500)
+def test_a_fleet_of_which_robots_are_killed_and_stopped(tmp_path: Path) -> None:
+    """Four of them; twenty, for some minutes, with RLIGHTNING_AIO_FLEET=20,200000 and -s."""
+    count, requests = map(int, os.environ.get("RLIGHTNING_AIO_FLEET", "4,800").split(","))
+    faults, began = Faults(cut=0.004, silence=0.002), time.monotonic()
+    program = [sys.executable, "-m", "remote.unlucky_clients"]
+    with (
+        sync.build_env_group(make_config(count)) as group,
+        FaultyProxy(group["robots-0"].address, faults, seed=1) as proxy,
+    ):
+        clients = subprocess.Popen(
+            [*program, proxy.address, str(count), str(tmp_path), "1"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parent.parent,
+        )
+        try:
+            ends = exchange(group, requests)
+        finally:
+            unlucky, _ = clients.communicate("")
+    sys.stdout.write(
+        f"{time.monotonic() - began:.0f} s, {count} clients: {ends}; the network: {proxy.tally}; "
+        f"clients: {unlucky}\n"
+    )
+    assert clients.returncode == 0
+    check(ends, tmp_path, proxy, faults)
 
 
 def exchange(group: Any, requests: int) -> dict[str, int]:

@@ -1,0 +1,63 @@
+"""``unlucky_clients.py ADDRESS COUNT FOLDER SEED``: clients that are killed and stopped at random.
+
+They are named c0, c1, …, and each appends the number of every step that it executes to a file of
+its name in FOLDER. One that was killed is started anew. All end with the standard input.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+
+from remote.recording import HEARTBEAT, RecordingEnv
+
+from rlightning_aio.remote import RemoteEnvClient
+
+
+def started(address: str, k: int, folder: str) -> int:
+    """Fork a client; return its pid."""
+    pid = os.fork()
+    if pid:
+        return pid
+    try:
+        env = RecordingEnv(k, Path(folder, f"c{k}"))
+        env.stays = True
+        with RemoteEnvClient(env, address, name=f"c{k}") as client:
+            client.run()
+    finally:
+        os._exit(1)
+
+
+def main(address: str, count: int, folder: str, seed: int) -> None:
+    chance = random.Random(seed)
+    pids = {k: started(address, k, folder) for k in range(count)}
+    stopped: list[tuple[float, int]] = []
+    tally = {"killed": 0, "stopped": 0}
+    while not select.select([sys.stdin], [], [], chance.expovariate(count / 4))[0]:
+        now, k = time.monotonic(), chance.randrange(count)
+        for until, pid in stopped:
+            if until <= now and pid in pids.values():
+                os.kill(pid, signal.SIGCONT)
+        stopped = [one for one in stopped if one[0] > now]
+        if chance.random() < 0.5:
+            tally["killed"] += 1
+            os.kill(pids[k], signal.SIGKILL)
+            os.waitpid(pids[k], 0)
+            pids[k] = started(address, k, folder)
+        else:
+            tally["stopped"] += 1
+            os.kill(pids[k], signal.SIGSTOP)
+            stopped.append((now + chance.uniform(0, 3 * HEARTBEAT), pids[k]))
+    for pid in pids.values():
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+    sys.stdout.write(repr(tally))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), sys.argv[3], int(sys.argv[4]))
