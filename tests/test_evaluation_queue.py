@@ -179,7 +179,7 @@ def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
     deed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others go on; what only it could play has failed, and says what to do."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
     fields = {"env_kwargs": {"breaks": {"2": deed}}, "on_worker_death": "restart"}
     fields |= {"placement": "process", "envs_per_process": 1}
     queue = [EpisodeSpec("2", 0), *(EpisodeSpec("1", seed) for seed in range(8))]

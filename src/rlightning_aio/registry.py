@@ -166,10 +166,19 @@ def _is_simulators(task: Any) -> bool:
     return spec is not None and is_of_simulator(spec)
 
 
-def _computes(maker: Any) -> bool:
-    """Return True if a callable says that its envs compute."""
+def _said_by_makers(task: Any, what: str) -> list[bool]:
+    """Return what each of the callables of a task says of its envs, by an attribute `what`."""
+    if isinstance(task, str):
+        return []
+    makers = cast("tuple[Any, ...]", task) if isinstance(task, tuple) else (task,)
+    return [_says(maker, what) for maker in {id(maker): maker for maker in makers}.values()]
+
+
+def _says(maker: Any, what: str) -> bool:
     maker = getattr(maker, "__wrapped__", maker)  # Of `VectorEnv`.
-    return bool(getattr(maker, "computes", False))
+    if getattr(maker, what, False) is True:
+        return True
+    return isinstance(maker, partial) and _says(cast("partial[Any]", maker).func, what)
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,8 +381,8 @@ class Registry:
         if name in self._classes or name not in ("gymnasium", CALLABLE):
             return True
         if name == CALLABLE:
-            makers = cast("tuple[Any, ...]", task) if isinstance(task, tuple) else (task,)
-            return all(map(_computes, {id(maker): maker for maker in makers}.values()))
+            said = _said_by_makers(task, "computes")
+            return bool(said) and all(said)
         return _is_simulators(task)
 
     def is_awaitable(self, name: str) -> bool:
@@ -389,10 +398,15 @@ class Registry:
         """Return the description of a built-in backend or of a plug-in, or None."""
         return BACKENDS.get(name) or _plugged_in(name)
 
-    def is_hardware(self, name: str) -> bool:
-        """Return True if backend `name` is known to move something real."""
+    def is_hardware(self, name: str, task: Any = "") -> bool:
+        """Return True if envs of `task`, of backend `name`, are known to move something real.
+
+        The backend says so, or its class or one of the callables, by an attribute ``hardware``.
+        """
         backend = self.described(name)
-        return self._hardware.get(name, backend is not None and backend.hardware)
+        said = self._hardware.get(name, backend is not None and backend.hardware)
+        known = (self._classes.get(name),)
+        return said or any(_said_by_makers(known, "hardware") + _said_by_makers(task, "hardware"))
 
     def knows(self, name: str) -> bool:
         """Return True if `name` can be resolved; imports nothing."""

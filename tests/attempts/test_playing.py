@@ -854,7 +854,7 @@ async def test_an_env_that_raises_is_rebuilt(place: dict[str, Any]) -> None:
 @pytest.fixture
 def moving(monkeypatch: pytest.MonkeyPatch) -> None:
     """All envs move something real."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
 
 
 @pytest.mark.usefixtures("moving")

@@ -508,7 +508,7 @@ async def test_envs_at_work_are_waited_for_after_others_were_given_up() -> None:
 @pytest.fixture
 def moving(monkeypatch: pytest.MonkeyPatch) -> None:
     """All envs move something real."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
 
 
 @pytest.mark.usefixtures("moving")

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from threading import Event, Semaphore
 from typing import TYPE_CHECKING, Any
@@ -384,6 +385,65 @@ def test_an_arm_on_its_way_to_the_reset_position_stops(
         trainer.send_signal(number)
         wait_for(log, "stop")
         trainer.wait(HANG)
+
+
+class GymnasiumArm(gym.Env[Any, Any]):
+    """One that no backend knows."""
+
+    hardware = True
+    observation_space = action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, log: Path) -> None:
+        self.log = log
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return action, 0.0, False, False, {}
+
+    def stop(self) -> None:
+        with self.log.open("a") as file:
+            file.write("stop\n")
+
+    def close(self) -> None:
+        with self.log.open("a") as file:
+            file.write("close\n")
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_an_arm_of_a_callable_is_hardware(log: Path, placement: str) -> None:
+    """It is what its class says, without a backend of its own."""
+    entry = {"name": "arm", "task": partial(GymnasiumArm, log), "placement": placement}
+    with sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        with pytest.raises(BadAction, match=r"holds 1\.5"):
+            group.step(batch.respond(action=np.full((1, 1), 1.5)))
+        before = lines(log)
+    assert set(before) == {"stop"}
+    assert lines(log)[len(before) :][-2:] == ["stop", "close"]
+    with pytest.raises(ConfigError, match="restart would move"):
+        sync.build_env_group({**entry, "on_env_error": "restart"})
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_an_arm_that_is_not_announced_as_one_is_refused(log: Path, placement: str) -> None:
+    """The group would not stop it."""
+    entry = {"name": "arm", "task": lambda: GymnasiumArm(log), "placement": placement}
+    with pytest.raises(RLightningError, match="on the callable, too"):
+        sync.build_env_group(entry).init()
+
+
+def test_after_the_death_of_the_trainer_a_line_says_why_the_arm_stands(log: Path) -> None:
+    """On stderr, for whoever stands beside it."""
+    command = [sys.executable, "-c", TRAINER, "process", str(log), "sync"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as trainer:
+        wait_for(log, "reset")
+        trainer.kill()
+        _, said = trainer.communicate(timeout=HANG)
+    assert said.count("env 'arm-0' was stopped, as the trainer has ended") == 1, said
+    assert lines(log) == ["reset", "stop"]
 
 
 def test_an_aborted_reset_stops_the_arm(arm: Any, log: Path) -> None:

@@ -106,6 +106,23 @@ class InterruptingEnv(CountingEnv):
         super().apply_evaluate_cfg()
 
 
+@ENVS.register("arm")
+class Arm(CountingEnv):
+    """Writes to a file when it is stopped and closed."""
+
+    hardware = True
+
+    def _note(self, what: str) -> None:
+        with Path(self.config.env_kwargs.log).open("a") as file:
+            file.write(f"{what}\n")
+
+    def on_disconnect(self) -> None:
+        self._note("stop")
+
+    def close(self) -> None:
+        self._note("close")
+
+
 @ENVS.register("plain_reset")
 class PlainResetEnv(CountingEnv):
     """Two sub-environments, a `reset` without arguments, and no spaces before `init`."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from rlightning_aio.errors import EnvRaised, StartFailed
+from rlightning_aio.errors import EnvFault, EnvRaised, ResetNeeded, StartFailed, WorkerDied
 from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 if is_rlightning_installed():
     pytest.skip("RLightning itself is installed", allow_module_level=True)
@@ -390,3 +392,35 @@ def test_an_env_keeps_its_id_after_a_restart() -> None:
     assert batch[env_id].observation.tolist() == [0.0, 1.0]
     assert group.env_list[0].get_env_id() == env_id
     group.close()
+
+
+def test_an_arm_stops_before_it_is_closed_and_when_its_step_raises(tmp_path: Path) -> None:
+    """It is hardware under RLightning's names, too."""
+    log = tmp_path / "log"
+    arm = build_env_group(entry("arm", env_kwargs={"log": str(log)}))
+    try:
+        ids = arm.reset()[0].ids()
+        with pytest.raises(EnvRaised, match="as asked"):
+            arm.step(responses(ids, wants="an error"))
+        stopped = log.read_text()
+    finally:
+        arm.close()
+    assert set(stopped.split()) == {"stop"}
+    assert log.read_text().removeprefix(stopped).split()[-2:] == ["stop", "close"]
+
+
+def test_a_lost_arm_is_reset_by_the_program_alone(tmp_path: Path) -> None:
+    """Its worker's death is raised, and so is each step until then."""
+    kwargs = {"log": str(tmp_path / "log")}
+    arm = build_env_group(entry("arm", env_kwargs=kwargs, on_worker_death="restart"))
+    try:
+        ids = arm.reset()[0].ids()
+        assert arm.env_list[0].trainer_pid == os.getpid()
+        with pytest.raises(WorkerDied, match="SIGKILL"):
+            arm.step(responses(ids, wants="an end"))
+        with pytest.raises((EnvFault, ResetNeeded)):
+            arm.step(responses(ids))
+        arm.reset()
+        assert arm.step(responses(ids))[0][ids[0]].observation.tolist() == [0.0, 1.0]
+    finally:
+        arm.close()

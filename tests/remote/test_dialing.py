@@ -131,7 +131,8 @@ def test_a_client_takes_a_gymnasium_env_or_a_callable(made: str) -> None:
             assert stops == ["stop"]
             group.close()
             thread.join(HANG)
-        assert stops == ["stop", "stop"]
+            assert stops == ["stop", "stop"]
+        assert stops == ["stop", "stop", "stop"], "it is stopped before it is closed"
 
 
 def test_an_awaitable_env_is_no_client() -> None:

@@ -38,7 +38,6 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.masks import allowed_action
 from rlightning_aio.policies.random_actions import sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.registry import ENVS
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -136,7 +135,7 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
         )
         if config.backend == "env_server":
             found.skipped = "its envs live with its clients"
-        elif ENVS.is_hardware(config.backend):
+        elif config.is_hardware:
             found.skipped = "it would move"
         else:
             await _try(config, found, steps)

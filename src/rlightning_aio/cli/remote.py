@@ -23,7 +23,6 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
-from rlightning_aio.registry import ENVS
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote.client import is_address
 from rlightning_aio.remote.keys import make_keys
@@ -81,7 +80,7 @@ def client(
     served: RemoteEnvClient | None = None
     try:
         with interruptible(), _faults_of(entry):
-            env = build_env(entry, is_hardware=ENVS.is_hardware(entry.backend))
+            env = build_env(entry, is_hardware=entry.is_hardware)
             options: dict[str, Any] = {"heartbeat": heartbeat, "compression": compression}
             served = _client_of(env, connect, keys=keys, name=name, **options)
             with served, connections_logged():

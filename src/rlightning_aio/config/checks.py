@@ -131,9 +131,9 @@ def _check_task(config: EnvConfig) -> str | None:
 
 
 def _check_placement(config: EnvConfig) -> str | None:
-    if config.placement == "ray" and ENVS.is_hardware(config.backend):
+    if config.placement == "ray" and config.is_hardware:
         return (
-            f"an actor of Ray can't be told to stop what backend {config.backend!r} moves while it "
+            f"an actor of Ray can't be told to stop what {config.name!r} moves while it "
             "is at work; use placement: process, or a client of an env_server on another machine"
         )
     return None
@@ -157,14 +157,14 @@ def _check_interpreter(config: EnvConfig) -> str | None:
 
 
 def _check_on_env_error(config: EnvConfig) -> str | None:
-    if config.on_env_error == "restart" and ENVS.is_hardware(config.backend):
-        return f"restart would move what backend {config.backend!r} moves; only your resets may"
+    if config.on_env_error == "restart" and config.is_hardware:
+        return f"restart would move what {config.name!r} moves; only your resets may"
     return None
 
 
 def _check_recycle(config: EnvConfig) -> str | None:
-    if config.recycle and ENVS.is_hardware(config.backend):
-        return f"what backend {config.backend!r} moves can't belong to two workers at a time"
+    if config.recycle and config.is_hardware:
+        return f"what {config.name!r} moves can't belong to two workers at a time"
     return None
 
 

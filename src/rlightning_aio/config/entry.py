@@ -114,6 +114,11 @@ class EnvConfig(_Fields):
         """Return the task, or an empty string if callables make the envs."""
         return self.task if isinstance(self.task, str) else ""
 
+    @property
+    def is_hardware(self) -> bool:
+        """Return True if the envs are known to move something real."""
+        return ENVS.is_hardware(self.backend, self.task)
+
     @model_validator(mode="before")
     @classmethod
     def _suggest_known_names(cls, fields: Any) -> Any:
@@ -179,7 +184,7 @@ class EnvConfig(_Fields):
     def _leave_hardware_stopped(self) -> EnvConfig:
         # A robot's worker is replaced only if the user asks for it. Assigned past pydantic, which
         # would count the field as set by the user.
-        if "on_worker_death" not in self.model_fields_set and ENVS.is_hardware(self.backend):
+        if "on_worker_death" not in self.model_fields_set and self.is_hardware:
             object.__setattr__(self, "on_worker_death", "raise")
         return self
 

@@ -69,6 +69,7 @@ class BaseEnv(abc.ABC):
             sets it once the env is built. A robot stops when that process is stopped.
         transforms_actions: set it on a subclass whose `step` takes actions that don't have to
             fit the action space (chunks, logits, dicts).
+        hardware: set it on a subclass that moves something real.
         agents: agent names of a multi-agent env, in order; empty otherwise.
         num_envs: sub-environments in each result.
         autoreset: what sub-environments do after the end of their episode; see `EnvMeta`.
@@ -77,6 +78,7 @@ class BaseEnv(abc.ABC):
     """
 
     transforms_actions: ClassVar[bool] = False
+    hardware: ClassVar[bool] = False
 
     env: Any = None
     trainer_pid: int | None = None
@@ -221,7 +223,7 @@ class BaseEnv(abc.ABC):
     def stop(self) -> None:
         """Stop what this env moves, at once. Default: `on_disconnect`.
 
-        Called of hardware only (see `Registry.register`): after a `reset` or `step` has raised or
+        Called of hardware only (see `Backend`): after a `reset` or `step` has raised or
         its result was refused, when an action is refused, when the trainer is gone or ends, and
         before it is closed.
         It may be called from another thread while `reset` or `step` is at work, and again and

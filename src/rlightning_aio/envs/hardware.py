@@ -31,6 +31,7 @@ __all__ = [
     "begin_stops",
     "checked_input_of",
     "limit_actions",
+    "says_hardware",
     "stop",
     "stop_all",
     "stopped_by_signals",
@@ -46,6 +47,12 @@ _STOP_SECONDS: Final = 0.1
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
+
+
+def says_hardware(env: BaseEnv) -> bool:
+    """Return True if an env, or what it wraps, says by ``hardware = True`` what it is."""
+    made: Any = env.env
+    return env.hardware or getattr(getattr(made, "unwrapped", made), "hardware", False) is True
 
 
 def stop(env: BaseEnv) -> None:

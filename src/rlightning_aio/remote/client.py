@@ -28,7 +28,7 @@ from zmq.utils.monitor import recv_monitor_message
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.hardware import checked_input_of, stop, watched
+from rlightning_aio.envs.hardware import checked_input_of, says_hardware, stop, stop_all, watched
 from rlightning_aio.envs.results import (
     explained,
     has_preprocess_fn,
@@ -61,7 +61,6 @@ from rlightning_aio.protocol.net.wire import (
     WireError,
     ping_ms,
 )
-from rlightning_aio.registry import ENVS
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
@@ -103,7 +102,7 @@ class RemoteEnvClient:
             the process id.
         hardware: the env moves something real: a trainer then never resets it by itself, an action
             that its space does not contain never reaches it, and `BaseEnv.stop` is called whatever
-            goes wrong. None: what the registry says of the backend of a `BaseEnv`; True of any
+            goes wrong. None: what a `BaseEnv` or its backend says; True of any
             other env, whose method ``stop`` is then called, if it has one.
         compression: ``zstd`` compresses images of observations, without loss; None sends them as
             they are. Both ends need the extra ``zstd``.
@@ -144,13 +143,13 @@ class RemoteEnvClient:
         self._address = _address(hostname, port)
         self._keys = None if keys is None else read_client_keys(keys)
         if hardware is None:
-            hardware = not isinstance(env, BaseEnv) or ENVS.is_hardware(env.config.backend)
+            hardware = not isinstance(env, BaseEnv) or says_hardware(env) or env.config.is_hardware
         self._is_hardware = hardware
         self._own_heartbeat = _checked_heartbeat(heartbeat)
         self._heartbeat = heartbeat or (HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT)
         compression = _checked_compression(compression)
         self._env = env = _own_env(env, self.name)
-        with _closed_on_error(env):
+        with _closed_on_error(env, is_hardware=hardware):
             self._session = ClientSession(
                 initialised(env),
                 self.name,
@@ -245,7 +244,7 @@ class RemoteEnvClient:
         if self._end_watch is not None:
             self._end_watch()
         self._context.destroy(linger=0)
-        self._env.close()
+        _close(self._env, is_hardware=self._is_hardware)
 
     def __enter__(self) -> Self:
         return self
@@ -541,8 +540,15 @@ def _own_env(env: Any, name: str) -> BaseEnv:
     return env
 
 
+def _close(env: BaseEnv, *, is_hardware: bool) -> None:
+    """Close `env`, hardware after it was stopped."""
+    if is_hardware:
+        stop_all([env])
+    env.close()
+
+
 @contextlib.contextmanager
-def _closed_on_error(env: BaseEnv) -> Generator[None]:
+def _closed_on_error(env: BaseEnv, *, is_hardware: bool) -> Generator[None]:
     """Close `env` if the client that owns it can't be made.
 
     Raises:
@@ -551,7 +557,7 @@ def _closed_on_error(env: BaseEnv) -> Generator[None]:
     try:
         yield
     except BaseException as error:
-        env.close()
+        _close(env, is_hardware=is_hardware)
         if isinstance(error, UnsupportedSpace | WireError):
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         raise

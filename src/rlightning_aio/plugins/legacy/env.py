@@ -141,7 +141,10 @@ class SimulatedEnv(BaseEnv):
 
     Attributes:
         native: the backend's own env, whose simulator is ``self.env``.
+        trainer_pid: the trainer's process, which a robot's watchdog looks at.
     """
+
+    trainer_pid: int | None = None
 
     def __init__(
         self,
@@ -175,6 +178,7 @@ class SimulatedEnv(BaseEnv):
         self, seed: int | None = None, options: dict[str, Any] | None = None, **kwargs: Any
     ) -> EnvRet:
         del kwargs  # RLightning's envs accept each other's arguments.
+        self.native.trainer_pid = self.trainer_pid
         result = self.native.reset(seed=seed, options=options)
         return EnvRet(self.env_id, result.observation, info=result.info)
 
@@ -197,6 +201,10 @@ class SimulatedEnv(BaseEnv):
 
     def is_finish(self) -> bool:
         return self.native.is_finish()
+
+    def stop(self) -> None:
+        """Stop what moves; called of hardware only."""
+        self.native.stop()
 
     def close(self) -> None:
         self.native.close()

@@ -50,6 +50,7 @@ class EnvMaker:
         preprocess_fn: the preprocess function, or None.
         env_id: of the env, also after a restart.
         computes: its steps are known to keep a core busy.
+        hardware: it moves something real, as its class or its backend says.
     """
 
     kind: Any
@@ -58,6 +59,7 @@ class EnvMaker:
     preprocess_fn: Any
     env_id: str
     computes: bool = False
+    hardware: bool = False
 
     def __call__(self) -> HostedEnv:
         """Make the env and wrap it as one of ours."""
@@ -91,6 +93,7 @@ class HostedEnv(BaseEnv):
     ) -> EnvRet:
         del seed  # `options` contains all of RLightning's arguments.
         args, kwargs = (options or {}).get(ARGUMENTS, ((), {}))
+        self.env.trainer_pid = self.trainer_pid
         return EnvRet(env_id=self.env_id, observation=self.env._reset(*args, **kwargs))  # noqa: SLF001
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
@@ -104,6 +107,13 @@ class HostedEnv(BaseEnv):
     def of_env(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Call method `name` of RLightning's env and return its value."""
         return getattr(self.env, name)(*args, **kwargs)
+
+    def stop(self) -> None:
+        """Call the method `stop` of RLightning's env, or its `on_disconnect`, if it has one."""
+        for name in ("stop", "on_disconnect"):
+            if callable(method := getattr(self.env, name, None)):
+                method()
+                return
 
     def close(self) -> None:
         self.env.close()
@@ -157,13 +167,13 @@ def entries_of(
 def _local_entry(name: str, replicas: list[EnvMaker]) -> EnvConfig:
     backend = ENVS.described(replicas[0].config.backend)
     fields = _passed_on(replicas[0].config)
+    for maker in replicas:
+        maker.hardware = ENVS.is_hardware(maker.config.backend, maker.kind)
     if fields.get("placement") != "inline":
         if backend is None or not backend.cpu_bound:
             fields.setdefault("envs_per_process", 1)
         for maker in replicas:
             maker.computes = backend is not None and backend.cpu_bound
-        if backend is not None and backend.hardware:
-            fields.setdefault("on_worker_death", "raise")
     return EnvConfig(name=name, backend="callable", task=tuple(replicas), **fields)
 
 

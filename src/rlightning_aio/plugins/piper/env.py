@@ -71,6 +71,7 @@ class PiperEnv(BaseEnv):
 
     # The group must not reject invalid actions, because only the env can stop the arm.
     transforms_actions = True
+    hardware = True
 
     def __init__(
         self,

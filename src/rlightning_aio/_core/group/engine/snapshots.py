@@ -21,7 +21,6 @@ from rlightning_aio._core.group.state.snapshot_format import (
 )
 from rlightning_aio.errors import SnapshotError
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,6 +51,7 @@ class Snapshots:
         waiting: Waiting,
     ) -> None:
         self._envs = tables.envs
+        self._record_of = tables.record_of
         self._lifetime = tables.lifetime
         self._requests = tables.requests
         self._episodes = tables.episodes
@@ -94,7 +94,7 @@ class Snapshots:
         self._dispatch.check_local(slots, "take a snapshot of, or restore,")
         each: list[int] = slots.tolist()
         for slot in each:
-            if ENVS.is_hardware(self._envs.configs[slot].backend):
+            if self._record_of(slot).is_hardware:
                 raise SnapshotError(
                     f"{self._envs.describe(slot)} moves something real, which a snapshot can't "
                     "restore"

@@ -45,7 +45,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
             preprocess_fns=tuple(fn for _, fn in share),
             spins=num_processes <= num_cores,
             tasks=tasks,
-            is_hardware=ENVS.is_hardware(config.backend),
+            is_hardware=config.is_hardware,
             logs=logs,
         )
         for host_id, (config, share) in enumerate(shares)

@@ -15,7 +15,7 @@ import numpy as np
 from rlightning_aio._core.hosts.base import Killable, SelfStarting
 from rlightning_aio._core.hosts.limits import RestartPolicy, close_seconds, limits_of
 from rlightning_aio.errors import WorkerDied
-from rlightning_aio.registry import ENVS, placement_of
+from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -205,7 +205,7 @@ class HostRecord:
         self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")
         self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted")
         self.is_local = placement_of(self.config.backend, self.config.placement).local
-        self.is_hardware = ENVS.is_hardware(self.config.backend)
+        self.is_hardware = self.config.is_hardware
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
 
     @property

@@ -15,7 +15,7 @@ from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
 from rlightning_aio.envs.adapted.makers import RESTARTS
-from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions
+from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions, says_hardware
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import CALLABLE, ENVS, placement_of
@@ -127,6 +127,7 @@ def built_env(
 
     Raises:
         TypeError: the env is awaitable and its placement can't await it, or the reverse.
+        ConfigError: the env says that it is hardware, and what makes it doesn't.
     """
     config, worker_index = order.config, order.worker_indices[index]
     if makers := makers_of(config):
@@ -145,6 +146,12 @@ def built_env(
         return env
 
     env = make()
+    if says_hardware(env) and not order.is_hardware:
+        raise ConfigError(
+            f"env {env.env_id!r} moves something real, as its attribute `hardware` says, and the "
+            "group has to know before it is made: set `hardware = True` on the callable, too, or "
+            "register a backend with hardware=True"
+        )
     kind = _runner_class(env, config)
     # Others are replaced by their host, with a runner of their own.
     rebuilt = not (kind.is_awaitable or order.is_hardware)
