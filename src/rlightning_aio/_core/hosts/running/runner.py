@@ -523,7 +523,14 @@ def close_all(
 
 
 def disconnect_all(runners: Sequence[EnvRunner]) -> None:
-    """Bring the envs of a host to a safe state, because the trainer is gone."""
+    """Bring the envs of a host to a safe state, because the trainer is gone.
+
+    Of hardware, one line says so, which explains at the robot why it stands still.
+    """
+    hardware = [runner.env for runner in runners if runner.is_hardware]
+    stop_all(hardware)
+    for env in hardware:
+        _log.warning("env %r was stopped, as the trainer has ended", env.env_id)
     for runner in runners:
         with contextlib.suppress(Exception):
             runner.env.on_disconnect()
