@@ -8,6 +8,8 @@ from pathlib import Path
 
 import yaml
 
+import rlightning_aio
+
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 # Names that differ on conda-forge, and what an extra of Gymnasium's brings.
@@ -18,7 +20,7 @@ OF_EXTRAS = {"imageio", "packaging"}
 def test_the_recipe_asks_for_what_the_project_asks_for() -> None:
     """The same version, and the same requirements with the same bounds."""
     recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
-    assert recipe["context"]["version"] == PROJECT["version"]
+    assert recipe["context"]["version"] == rlightning_aio.__version__
     assert f">={recipe['context']['python_min']}" == PROJECT["requires-python"]
     wanted = set()
     for requirement in PROJECT["dependencies"]:
