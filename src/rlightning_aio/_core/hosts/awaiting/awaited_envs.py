@@ -172,7 +172,7 @@ class AwaitedEnvs:
     async def build(self) -> list[EnvStarted] | None:
         """Build the envs, one in each turn of the loop; None if one can't be, which is posted."""
         self._loop = asyncio.get_running_loop()
-        context = copy_context()
+        context, simulations = copy_context(), dict[int, str]()
         index = 0
         try:
             for index in range(len(self._order.worker_indices)):
@@ -180,7 +180,7 @@ class AwaitedEnvs:
                 if (error := await self._build(record)) is not None:
                     raise error
                 self._records.append(record)
-                check_distinct(self.runners)
+                check_distinct(record.runner.env, simulations)
             return [runner.started() for runner in self.runners]
         except BaseException as error:
             self._post(NotBuilt(self._host_id, index, ErrorText.of(error)))

@@ -21,7 +21,7 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableSequence, Sequence
+    from collections.abc import Iterator, MutableSequence
 
     from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.config import EnvConfig
@@ -66,31 +66,34 @@ def built_envs(
     if not inline:
         seed_generators()
         register_tasks(order.tasks)
-    built: list[EnvRunner] = []
+    simulations: dict[int, str] = {}
     num_envs = len(order.worker_indices)
     renewal = Renewal(order.config, num_envs) if order.config.recycle else None
     for index in range(num_envs):
-        built.append(built_env(order, made, index, inline=inline))
-        built[-1].renewal = renewal
-        check_distinct(built)
-        yield built[-1]
+        runner = built_env(order, made, index, inline=inline)
+        runner.renewal = renewal
+        check_distinct(runner.env, simulations)
+        yield runner
 
 
-def check_distinct(runners: Sequence[EnvRunner]) -> None:
-    """Check that the last of the envs of a host is an object of its own.
+def check_distinct(env: BaseEnv, simulations: dict[int, str]) -> None:
+    """Check that an env of a host is an object of its own, and add it to those of the others.
+
+    Args:
+        env: of the host.
+        simulations: whose each object is, by its `id`.
 
     Raises:
         ConfigError: its callable has returned what another one has; both would step one simulation.
     """
-    env = runners[-1].env
     if env.config.backend != CALLABLE:
         return
-    for other in runners[:-1]:
-        if _simulation_of(other.env) is _simulation_of(env):
-            raise ConfigError(
-                f"the callables of envs {other.env.env_id!r} and {env.env_id!r} returned the same "
-                "env object; make an env in the callable, and return that: lambda: MyEnv()"
-            )
+    other = simulations.setdefault(id(_simulation_of(env)), env.env_id)
+    if other != env.env_id:
+        raise ConfigError(
+            f"the callables of envs {other!r} and {env.env_id!r} returned the same env object; "
+            "make an env in the callable, and return that: lambda: MyEnv()"
+        )
 
 
 def _simulation_of(env: BaseEnv) -> object:
