@@ -328,10 +328,13 @@ def test_an_actor_of_ray_gets_no_arm(arm: Any) -> None:
         sync.build_env_group(arm("ray"))
 
 
+@pytest.mark.parametrize("placement", PLACEMENTS)
 @pytest.mark.parametrize("columns", [None, np.zeros((0, 2)), np.zeros((2, 2))])
-def test_an_arm_stops_when_a_column_is_refused(arm: Any, log: Path, columns: Any) -> None:
+def test_an_arm_stops_when_a_column_is_refused(
+    arm: Any, log: Path, placement: str, columns: Any
+) -> None:
     """One without rows, or with a row too many."""
-    with sync.build_env_group(arm("process")) as group:
+    with sync.build_env_group(arm(placement)) as group:
         batch, _ = group.reset()
         with pytest.raises((RLightningError, ValueError)):
             group.step(batch.respond(action=columns))

@@ -324,6 +324,25 @@ def test_a_client_with_other_actions_than_the_local_envs_is_refused() -> None:
             other.join()
 
 
+def test_a_client_that_ended_in_its_first_reset_is_named() -> None:
+    """The error says that one came, and why it is gone."""
+
+    class Ending(CountingEnv):
+        def reset(self, **arguments: Any) -> Any:
+            raise SystemExit("no power at the arm")
+
+    with sync.build_env_group(entry(connect_timeout=0.2)) as group:
+        ending = ClientThread(group["robots-0"].address, "c0", Ending())
+        while ending.error is None:
+            with pytest.raises(EnvAway):
+                group.reset()
+        with pytest.raises(EnvAway, match=r"c0.*no power at the arm"):
+            group.reset()
+        group.close()
+        with pytest.raises(SystemExit):
+            ending.join()
+
+
 def test_calls_of_clients_are_refused() -> None:
     """Before anything is sent; offloading skips them."""
     with (

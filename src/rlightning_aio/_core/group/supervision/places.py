@@ -104,6 +104,7 @@ class Places:
             here = [f"{client} ({env_id})" for env_id, client in server.clients().items()]
             texts.append(f"{server.address()} has {', '.join(here) or 'no client'}")
             texts += [f"refused {name!r}: {why}" for name, why in server.refused().items()]
+        texts += [one.last_loss.what for one in empty if one.last_loss is not None]
         seconds = max(server.connect_timeout for server in servers)
         away = EnvAway(
             f"no client has dialled in for {', '.join(names)} within {seconds:g} s "
