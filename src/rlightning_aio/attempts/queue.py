@@ -8,7 +8,7 @@ for all envs at once. Every attempt ends once: after its last try, or by withdra
 from __future__ import annotations
 
 import time
-from collections import OrderedDict, deque
+from collections import deque
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
@@ -105,9 +105,7 @@ class AttemptQueue:
         self._rules, self._results = rules, results
         self.flush()  # Else a line may be missing that was added just before.
         self.players = Players(group)
-        present = self.players.present
-        # A dict would search for its first key behind the places of all that were removed.
-        self.free = OrderedDict.fromkeys(id_ for id_ in self.players.entry_of if id_ in present)
+        self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
         self.fault: WorkerDied | None = None
         self.may_play: Callable[[str], bool] = lambda _: True
         self._waiting: dict[str, deque[Job]] = {}
