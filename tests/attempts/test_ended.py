@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import signal
 import subprocess
@@ -87,6 +88,29 @@ def test_envs_in_threads_do_not_wait_for_one_another() -> None:
         await asyncio.gather(*(asyncio.to_thread(together.wait, 60) for _ in range(100)))
 
     rl.run(main())
+
+
+def test_a_loop_that_is_left_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    """By `break`, without `aclosing`, while attempts play and fail."""
+
+    class Away:
+        async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            if seed:
+                raise OSError("the service is away")
+            return "", {}
+
+        async def step(self, action: Any) -> Any:
+            return "", 1.0, True, False, {}
+
+    async def main() -> None:
+        async with rl.build_env_group(Away, num_workers=8, placement="loop") as group:
+            async for attempts in play(group, [EpisodeSpec("", k) for k in range(99)], agent, 2):
+                assert attempts.spec.seed == 0
+                break
+
+    rl.run(main())
+    gc.collect()
+    assert not [one.getMessage() for one in caplog.records if one.name == "asyncio"]
 
 
 if __name__ == "__main__":

@@ -37,8 +37,8 @@ class Group:
 
 def test_clients_may_come_whatever_other_envs_are_gone() -> None:
     players = Players(Group())
-    assert players.can_play(["robots"])
-    assert not players.can_play(["robots", "a"])
+    assert players.can_play(["robots"], players.out)
+    assert not players.can_play(["robots", "a"], players.out)
 
 
 def until_it_is(state: str, group: Any) -> None:

@@ -117,14 +117,10 @@ class Players:
             return {"task": spec.task, **(spec.options or {})}
         return None if spec.options is None else {**spec.options}
 
-    def can_play(self, entries: Iterable[str], *, alone: bool = False) -> bool:
-        """Return True unless all envs of one of these entries are gone, or left alone."""
-        out = self.out if alone else self.gone
-        if not out:
-            return True
+    def can_play(self, entries: Iterable[str], out: set[str]) -> bool:
+        """Return True unless all envs of one of these entries are among those that are `out`."""
         left = {entry for env_id, entry in self.entry_of.items() if env_id not in out}
-        lost = {self.entry_of[env_id] for env_id in out} - left
-        return lost.isdisjoint(entries)
+        return not out or left.issuperset(entries)
 
     def is_nobody_left(self) -> bool:
         """Return True if all envs are gone, or left alone."""

@@ -373,7 +373,7 @@ class _Engine:
         queue.check_players()
         if self._playing:
             return
-        queue.check_left_alone()
+        queue.check_players(alone=True)
         if queue.free or self._source.is_at_end:
             return
         if queue.players.left_alone and queue.players.is_nobody_left():

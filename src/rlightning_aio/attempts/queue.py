@@ -344,24 +344,20 @@ class AttemptQueue:
             if env_id in present:
                 self.free.setdefault(env_id)
 
-    def check_players(self) -> None:
-        """Raise the last fault if attempts wait that no env is left for.
+    def check_players(self, *, alone: bool = False) -> None:
+        """Raise an error if attempts wait that no env is left for.
+
+        Args:
+            alone: those count as well that only their user resets.
 
         Raises:
             WorkerDied: its worker is not replaced.
-            RLightningError: that was known before.
-        """
-        gone = not self.players.gone.isdisjoint(self._pinned_to())
-        if gone or not self.players.can_play(self._entries()):
-            raise self.fault or RLightningError("no env of this group is left that could play")
-
-    def check_left_alone(self) -> None:
-        """Raise an error if attempts wait for envs that only their user resets.
-
-        Raises:
-            RLightningError: that is so.
+            RLightningError: that was known before; or such an env is left alone.
         """
         players = self.players
-        is_pinned = not players.left_alone.isdisjoint(self._pinned_to())
-        if is_pinned or not players.can_play(self._entries(), alone=True):
+        out = players.out if alone else players.gone
+        if players.can_play(self._entries(), out) and out.isdisjoint(self._pinned_to()):
+            return
+        if alone and players.left_alone:
             raise players.refusal(min(players.left_alone))
+        raise self.fault or RLightningError("no env of this group is left that could play")
