@@ -331,8 +331,10 @@ class Attempts(InContext):
         excused = self.excused.get((attempt.spec.key, attempt.index), 0)
         counted = sum(not is_bystanders(one) for one in attempt.failures[excused:])
         require(counted <= rules.retries, "tried too often", counted)
-        is_excused = outcome.attempt < excused and not self.has_file  # Or by the run before.
-        may_go_on = is_bystanders(outcome) or counted < rules.retries or is_excused
+        if self.has_file and excused:  # Perhaps in the run before, which this one doesn't know.
+            excused, counted = 0, sum(not is_bystanders(one) for one in attempt.failures)
+        is_excused = is_bystanders(outcome) or outcome.attempt < excused
+        may_go_on = is_excused or counted < rules.retries
         require(not (is_retried(outcome) and may_go_on), "not tried again")
         if outcome.kind == "cancelled":
             require(rules.first is not None and is_full, "cancelled, and no surplus")
