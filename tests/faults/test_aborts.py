@@ -16,7 +16,7 @@ from kit.tokens import Tokens, entry, marked, two_workers
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio._core.group.supervision import hang_detector
+from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import EpisodeLost
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def test_a_step_that_ends_soon_costs_no_worker(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its result is dropped, and its episode is over."""
-    monkeypatch.setattr(hang_detector, "_ABORT_SECONDS", HANG)
+    monkeypatch.setattr(times, "ABORT", HANG)
     group, tokens = start(two_workers()), Tokens()
     ids = group.group.env_ids
     before = [pid_of(group, env_id) for env_id in ids]

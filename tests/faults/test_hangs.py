@@ -18,7 +18,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import registry
-from rlightning_aio._core.group.supervision import hang_detector
+from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The fork server can't kill the worker, so it is killed with all of its workers."""
-    monkeypatch.setattr(hang_detector, "_OBEY_SECONDS", LIMIT)
+    monkeypatch.setattr(times, "OBEY", LIMIT)
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     stop(pid_of(group, "faulty-0"))
     stop(fork_server_pid(group.group))

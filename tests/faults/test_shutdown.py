@@ -26,9 +26,7 @@ from kit.tokens import Tokens, two_workers
 from patience import HANG
 
 import rlightning_aio
-from rlightning_aio._core.group.supervision import shutdown
-from rlightning_aio._core.hosts import limits
-from rlightning_aio._core.hosts.process import fork_server
+from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import GroupClosed
 from rlightning_aio.protocol.entries import Operation, op_of
 
@@ -43,8 +41,8 @@ SECONDS = 2.0
 
 def test_all_waits_in_the_library_take_less_than_two_seconds() -> None:
     """For envs that close, for the report of a kill, and for workers whose trainer is gone."""
-    assert limits._CLOSE_SECONDS + shutdown._KILL_SECONDS < SECONDS
-    assert max(shutdown._END_SECONDS, fork_server._CLOSE_SECONDS) < SECONDS
+    assert times.CLOSE + times.GRACE < SECONDS
+    assert times.CLOSE_ALONE < SECONDS
 
 
 SCRIPT = """

@@ -12,7 +12,7 @@ from group.fake_host import ACTION_SPACE, PLAIN, FakeGroup, Running
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.host_record import HostLoss
-from rlightning_aio._core.group.supervision import hang_detector
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.messages import Attached, Died, ErrorText, NotBuilt
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed
@@ -152,7 +152,7 @@ def test_all_are_started_before_any_is_waited_for(fleet: Callable[..., Fleet]) -
 
 @pytest.mark.parametrize("dies", [True, False])
 def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], dies: bool) -> None:
-    """It has a second to write its stacks; then the start fails, dead or not."""
+    """It has some time to write its stacks; then the start fails, dead or not."""
     ours = fleet(up=False)
     ours.hosts[1].builds = ours.hosts[1].closes = False
     ours.hosts[1].dies = dies
@@ -163,8 +163,8 @@ def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], d
     assert ours.log[2] == "dump and kill 1"
     if not dies:
         assert ours.log[3:] == []
-        assert start.until == ours.now + 1
-        ours.pass_time(1)
+        assert start.until == ours.now + times.DUMP
+        ours.pass_time(times.DUMP)
         assert ours.log[3:] == ["close 0", "close 1"]
         ours.pass_time(1.5)
         assert ours.log[5:] == ["kill 1"]
@@ -223,7 +223,7 @@ def test_a_host_that_survives_a_kill_is_destroyed_with_its_fork_server(
     ours.check()
     for destroyed in range(1, 3):
         ours.check()
-        ours.let(hang_detector._OBEY_SECONDS - 0.1)
+        ours.let(times.OBEY - 0.1)
         assert len(ours.log) == destroyed
         ours.let(0.1)
         assert ours.log == ["dump and kill 0"] + destroyed * ["destroy 0"]
@@ -248,7 +248,7 @@ def test_a_killed_host_has_its_time_if_the_trainer_was_stopped(fleet: Callable[.
     ours.check()
     ours.check()
     assert ours.log == ["dump and kill 0"]
-    ours.let(hang_detector._OBEY_SECONDS - 0.1)
+    ours.let(times.OBEY - 0.1)
     assert ours.log == ["dump and kill 0"]
     ours.let(0.1)
     assert ours.log == ["dump and kill 0", "destroy 0"]

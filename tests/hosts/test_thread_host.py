@@ -27,8 +27,7 @@ from kit.driven import Place
 
 import rlightning_aio.sync
 from rlightning_aio import ENVS, PolicyResponse
-from rlightning_aio._core.group.supervision import shutdown
-from rlightning_aio._core.hosts import limits
+from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.registry import PLACEMENTS, Placement
 
@@ -254,8 +253,8 @@ async def test_a_step_that_hangs_does_not_keep_a_group_from_closing(
     facade: Place, closing: type[Closing], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its thread continues, and releases its resources when it ends."""
-    monkeypatch.setattr(limits, "_CLOSE_SECONDS", 0.05)
-    monkeypatch.setattr(shutdown, "_KILL_SECONDS", 0.05)
+    monkeypatch.setattr(times, "CLOSE", 0.05)
+    monkeypatch.setattr(times, "GRACE", 0.05)
     monkeypatch.setattr(thread_host, "JOIN_SECONDS", 0.05)
     async with facade.build(entry("one", "closing")) as group:
         await group.reset()

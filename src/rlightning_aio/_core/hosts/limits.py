@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal
 
+from rlightning_aio._core.hosts import times
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
-
-AWAITED_CLOSE_SECONDS: Final = 10.0
-"""How long awaitable envs may take to close, where their entry doesn't say."""
-_CLOSE_SECONDS: Final = 1.5
-_CANCEL_SECONDS: Final = 0.9
-"""What awaitable envs may take in addition: requests are cancelled before envs are closed, and
-their tasks after that."""
 
 _FIRST_SECONDS: Final = 0.1
 _LONGEST_SECONDS: Final = 5.0
@@ -31,8 +25,8 @@ def close_seconds(config: EnvConfig, *, awaits: bool) -> float:
     """Return how long a host may take to close its envs, which are awaitable or not, and to end."""
     seconds = config.close_timeout
     if awaits:
-        return (AWAITED_CLOSE_SECONDS if seconds is None else seconds) + _CANCEL_SECONDS
-    return _CLOSE_SECONDS if seconds is None else seconds
+        return (times.AWAITED_CLOSE if seconds is None else seconds) + times.AWAITED_CANCEL
+    return times.CLOSE if seconds is None else seconds
 
 
 def restart_pause(losses: int) -> float:

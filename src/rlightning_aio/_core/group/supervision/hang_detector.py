@@ -14,10 +14,11 @@ quarter of the limit, the time between two looks, until a hang is found.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rlightning_aio._core.group.state.host_record import Stage
 from rlightning_aio._core.group.supervision.fault_messages import culprit_of
+from rlightning_aio._core.hosts import times
 from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
@@ -26,17 +27,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
-
-_ABORT_SECONDS: Final = 0.2
-"""Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
-_LOOKS: Final = 4
-"""Looks within the shortest limit."""
-_PAUSE_SECONDS: Final = 0.02
-"""The shortest time between two looks."""
-_OBEY_SECONDS: Final = 5.0
-"""Limit for the exit of a killed worker to be reported. After that, the process that should have
-killed it hangs, too. Only an overloaded machine needs a tenth of it.
-"""
 
 
 class HangDetector:
@@ -60,7 +50,7 @@ class HangDetector:
     def add(self, record: HostRecord) -> None:
         """Watch a host whose requests have limits; of another it does nothing."""
         if record.timed:
-            pause = max(_PAUSE_SECONDS, min(record.limits.values()) / _LOOKS)
+            pause = times.between_looks(record.limits.values())
             self.due, self._pause = 0.0, min(self._pause, pause)
 
     def abort(self, slots: NDArray[np.intp], now: float) -> list[tuple[int, int]]:
@@ -81,7 +71,7 @@ class HangDetector:
                 continue
             record.host.abort(own)
             if record.killable is not None:
-                record.abort_by |= dict.fromkeys(slots[is_own].tolist(), now + _ABORT_SECONDS)
+                record.abort_by |= dict.fromkeys(slots[is_own].tolist(), now + times.ABORT)
                 self.any_ending = True
         return no_longer_held
 
@@ -173,7 +163,7 @@ class HangDetector:
                 continue
             if record.die_by is None:
                 # The trainer may have been stopped until it was killed.
-                record.die_by = self._tables.clock() + _OBEY_SECONDS
+                record.die_by = self._tables.clock() + times.OBEY
             elif self._now >= record.die_by and not read_news(record):
                 assert record.killable is not None
                 record.die_by = None

@@ -7,21 +7,17 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rlightning_aio._core.group.drivers.wait import Procedure, Wait
 from rlightning_aio._core.group.state.host_record import Stage
+from rlightning_aio._core.hosts import times
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
-
-_KILL_SECONDS: Final = 0.3
-"""Limit for a kill to be reported."""
-_END_SECONDS: Final = 1.5
-"""Limit for a released fork server to end its workers and pass on their output."""
 
 
 class Shutdown:
@@ -53,7 +49,7 @@ class Shutdown:
             yield from self._until_closed(alive, now)
         finally:
             stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._tables.records)
-            self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
+            self._let_go(times.GRACE if stuck else times.CLOSE)
         if interrupt is not None:
             raise interrupt
 
@@ -72,7 +68,7 @@ class Shutdown:
                 else:
                     record.kill(dump=False)
                     killed.add(host_id)
-                    by[host_id] = now + _KILL_SECONDS
+                    by[host_id] = now + times.GRACE
             until = min(by[r.host.host_id] for r in still_open)
             if until == math.inf:
                 return
@@ -102,7 +98,7 @@ class Shutdown:
         self._tables.lifetime.end()
         started = any(r.stage is not Stage.NEW for r in self._tables.records)
         seconds = max((record.close_seconds for record in self._tables.records), default=0.0)
-        self._let_go(seconds + _KILL_SECONDS)
+        self._let_go(seconds + times.GRACE)
         if started:
             # The garbage collector calls this, so no caller's line would help.
             warnings.warn(

@@ -38,6 +38,7 @@ from rlightning_aio._core.group.supervision.places import Places
 from rlightning_aio._core.group.supervision.renewals import Renewals
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.limits import restart_pause
 from rlightning_aio._core.hosts.messages import (
     Attached,
@@ -66,8 +67,6 @@ if TYPE_CHECKING:
 
 LOOK_SECONDS: Final = 0.02
 """Interval of checks in a trainer that never has to wait."""
-_DUMP_SECONDS: Final = 1.0
-"""Limit for a late worker to write its stacks and exit."""
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -211,7 +210,7 @@ class Supervisor:
             elif not record.late:
                 record.late = True
                 self.detector.kill(record, dump=True)
-                record.start_by = self.clock() + _DUMP_SECONDS  # The death brings its stacks.
+                record.start_by = self.clock() + times.DUMP  # The death brings its stacks.
             else:
                 record.start_by = None  # A host that can't be killed gets no second limit.
                 if not self._lifetime.open:

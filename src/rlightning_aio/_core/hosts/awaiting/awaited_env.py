@@ -8,8 +8,9 @@ Left out: which request comes when, and what takes the place of an env (see `Awa
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.messages import ErrorText
 
@@ -19,9 +20,6 @@ if TYPE_CHECKING:
     from typing import NoReturn
 
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
-
-CANCEL_SECONDS: Final = 0.4
-"""How long a task may go on after it was cancelled."""
 
 Then: TypeAlias = "Callable[[AwaitedEnv, int, Any, BaseException | None], None]"
 """Gets the env, the entry of a request, its outcome, and the error that it raised instead."""
@@ -214,13 +212,13 @@ async def end_all(envs: Collection[AwaitedEnv], seconds: float) -> None:
 
     Args:
         envs: of one event loop.
-        seconds: how long they may take to close, after `CANCEL_SECONDS` at most.
+        seconds: how long they may take to close, after `times.CANCEL` at most.
     """
     for env in envs:
         env.leave()
     stopping = [env.stopped for env in envs if not env.stopped.done()]
     if stopping:
-        await asyncio.wait(stopping, timeout=CANCEL_SECONDS)
+        await asyncio.wait(stopping, timeout=times.CANCEL)
     by_task = {env.closing(): env for env in envs}
     late = {task for task in by_task if not task.done()}
     if late:
@@ -228,4 +226,4 @@ async def end_all(envs: Collection[AwaitedEnv], seconds: float) -> None:
     for task in late:
         by_task[task].cut_short(seconds)
     if late:
-        await asyncio.wait(late, timeout=CANCEL_SECONDS / 4)
+        await asyncio.wait(late, timeout=times.LATE_CANCEL)

@@ -16,10 +16,10 @@ import time
 from collections import deque
 from contextvars import copy_context
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.awaiting.awaited_env import (
-    CANCEL_SECONDS,
     AwaitedEnv,
     end_all,
     reraise,
@@ -33,7 +33,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     time_collector,
     watched,
 )
-from rlightning_aio._core.hosts.limits import AWAITED_CLOSE_SECONDS, hung, limits_of
+from rlightning_aio._core.hosts.limits import hung, limits_of
 from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raised
 from rlightning_aio._core.hosts.running.build_env import built_env, check_distinct
 from rlightning_aio._core.hosts.running.execution import completion_of
@@ -53,10 +53,6 @@ if TYPE_CHECKING:
 
 _LINES, _EVERY = 3, 100
 """Turns that hold the event loop for long: the first ones are logged, then each of this number."""
-_LOOKS: Final = 4
-"""Looks at the time of requests within the shortest limit, as of a worker's."""
-_PAUSE_SECONDS: Final = 0.02
-"""The shortest time between two looks."""
 
 
 class _EnvRecord:
@@ -144,10 +140,10 @@ class AwaitedEnvs:
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
         config = order.config
-        self._close_seconds = config.close_timeout or AWAITED_CLOSE_SECONDS
+        self._close_seconds = config.close_timeout or times.AWAITED_CLOSE
         self._renews = config.on_env_error == "restart"
         self._limits = limits_of(config)
-        self._pause = max(_PAUSE_SECONDS, min(self._limits.values(), default=0.0) / _LOOKS)
+        self._pause = times.between_looks(self._limits.values())
         self._look: asyncio.TimerHandle | None = None
         # All envs whose tasks run, and the tasks that replace envs or put them away.
         self._envs: set[AwaitedEnv] = set()
@@ -219,7 +215,7 @@ class AwaitedEnvs:
         Returns what was wrong, with the env's index.
         """
         self._end()
-        await cancel(self._tasks, CANCEL_SECONDS)
+        await cancel(self._tasks, times.CANCEL)
         # Others that still run were closed, and reported, when they were put away.
         open_ = [env for env in self._envs if not env.has_closed]
         envs = sorted(open_, key=lambda env: env.index)
@@ -477,7 +473,7 @@ class AwaitedEnvs:
     async def _rebuild(self, record: _EnvRecord) -> None:
         """Make another env once the one before has closed, and give it the request."""
         if record.leaving is not None:
-            seconds = self._close_seconds + 2 * CANCEL_SECONDS
+            seconds = self._close_seconds + 2 * times.CANCEL
             await asyncio.wait({record.leaving}, timeout=seconds)
         error, env = await self._build(record), record.env
         if env is not None:

@@ -30,6 +30,7 @@ import weakref
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
 from rlightning_aio._core.hosts.process.descendants import adopt_orphans, children, kill_below
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -84,10 +85,6 @@ If that fails, the only packet is `REFUSED` and the reason.
 DUMP_SIGNAL: Final = getattr(signal, "SIGRTMIN", 0) + 7  # `bench` imports this on macOS, too.
 _TAIL_BYTES: Final = 8192
 _CHUNK_BYTES: Final = 1 << 16
-_CLOSE_SECONDS: Final = 1.2
-"""Time for workers to close when the trainer is gone, where the trainer has said nothing yet."""
-_DUMP_SECONDS: Final = 0.3
-"""Time for a worker to write its stacks."""
 _ERROR_CHARACTERS: Final = 60_000
 _STDOUT: Final = 1
 _STDERR: Final = 2
@@ -109,7 +106,7 @@ class _Child:
     outputs: list[_Output]
     channel: int
     kill_at: float | None = None
-    close_seconds: float = _CLOSE_SECONDS
+    close_seconds: float = times.CLOSE_ALONE
 
     def tail(self) -> str:
         """The end of what it wrote to stdout, and of what it wrote to stderr."""
@@ -282,7 +279,7 @@ class _ForkServer:
             if child.host_id == order.host_id:
                 if order.dump:
                     os.kill(child.pid, DUMP_SIGNAL)
-                child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
+                child.kill_at = time.monotonic() + (times.GRACE if order.dump else 0.0)
 
     def _kill_due(self) -> None:
         now = time.monotonic()

@@ -16,6 +16,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.process.descendants import kill_below
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 Key: TypeAlias = tuple[object, ...]
 
 _MOST: Final = 3
-_END_SECONDS: Final = 1.0
 
 
 class RunningForkServer(NamedTuple):
@@ -83,11 +83,11 @@ def _file(descriptor: int) -> tuple[int, ...]:
 def keep(key: Key, spare: RunningForkServer) -> None:
     """Keep a fork server that was started in the surroundings `key`; it belongs to this module."""
     if key in _spares:
-        spare.end(_END_SECONDS)
+        spare.end(times.CLOSE)
         return
     _spares[key] = spare
     while len(_spares) > _MOST:
-        _spares.pop(next(iter(_spares))).end(_END_SECONDS)
+        _spares.pop(next(iter(_spares))).end(times.CLOSE)
 
 
 def take(key: Key) -> RunningForkServer | None:
@@ -95,7 +95,7 @@ def take(key: Key) -> RunningForkServer | None:
     spare = _spares.pop(key, None)
     if spare is None or spare.process.poll() is None:
         return spare
-    spare.end(_END_SECONDS)
+    spare.end(times.CLOSE)
     return None
 
 
@@ -107,7 +107,7 @@ def kept() -> list[RunningForkServer]:
 def end_all() -> None:
     """End all spares."""
     while _spares:
-        _spares.popitem()[1].end(_END_SECONDS)
+        _spares.popitem()[1].end(times.CLOSE)
 
 
 def _disown_all() -> None:
