@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,13 +47,17 @@ def make_config(num_clients: int) -> dict[str, Any]:
     }
 
 
-def check(ends: dict[str, int], folder: Path, proxy: FaultyProxy, faults: Faults) -> None:
-    """Compare what the trainer has got with what the clients have done."""
-    executed = [int(number) for file in folder.iterdir() for number in file.read_text().split()]
-    assert len(executed) == len(set(executed)), "a request was executed twice"
-    assert ends["answered"] <= len(executed) <= sum(ends.values())
-    fates = [name for name in ("cut", "silence") if getattr(faults, name)]
+def check(ends: dict[int, tuple[str, str]], folder: Path, proxy: FaultyProxy) -> dict[str, int]:
+    """Compare what the trainer has got, number by number, with what each client has executed."""
+    ledgers = {file.name: list(map(int, file.read_text().split())) for file in folder.iterdir()}
+    for client, executed in ledgers.items():
+        assert len(executed) == len(set(executed)), "a request was executed twice"
+        assert {ends[number][0] for number in executed} <= {client}, "by another client"
+        answered = {n for n, (one, fate) in ends.items() if one == client and fate == "answered"}
+        assert answered <= set(executed), "a result that no client has made"
+    fates = [name for name in ("cut", "silence") if getattr(proxy.faults, name)]
     assert all(proxy.tally[name] for name in fates), "the network had too few faults"
+    return dict(Counter(fate for _, fate in ends.values()))
 
 
 @pytest.mark.timeout(600)
@@ -76,22 +81,22 @@ def test_no_request_is_executed_twice_and_each_ends_once(
         for thread in threads:
             thread.join()
     record_property("network", proxy.tally)
-    record_property("requests", ends)
-    check(ends, tmp_path, proxy, NETWORKS[network])
+    record_property("requests", check(ends, tmp_path, proxy))
 
 
 @pytest.mark.timeout(1500)
 def test_a_fleet_of_which_robots_are_killed_and_stopped(tmp_path: Path) -> None:
-    """Four of them; twenty, for some minutes, with RLIGHTNING_AIO_FLEET=20,200000 and -s."""
-    count, requests = map(int, os.environ.get("RLIGHTNING_AIO_FLEET", "4,800").split(","))
-    faults, began = Faults(cut=0.004, silence=0.002), time.monotonic()
+    """Four of them; twenty, for some minutes, with RLIGHTNING_AIO_FLEET=20,600000,SEED and -s."""
+    given = os.environ.get("RLIGHTNING_AIO_FLEET", "4,800,1")
+    count, requests, seed = map(int, given.split(","))
+    began = time.monotonic()
     program = [sys.executable, "-m", "remote.unlucky_clients"]
     with (
         sync.build_env_group(make_config(count)) as group,
-        FaultyProxy(group["robots-0"].address, faults, seed=1) as proxy,
+        FaultyProxy(group["robots-0"].address, Faults(0.004, 0.002), seed) as proxy,
     ):
         clients = subprocess.Popen(
-            [*program, proxy.address, str(count), str(tmp_path), "1"],
+            [*program, proxy.address, str(count), str(tmp_path), str(seed)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -101,36 +106,50 @@ def test_a_fleet_of_which_robots_are_killed_and_stopped(tmp_path: Path) -> None:
             ends = exchange(group, requests)
         finally:
             unlucky, _ = clients.communicate("")
+    assert clients.returncode == 0, "a client has failed"
+    found = check(ends, tmp_path, proxy)
     sys.stdout.write(
-        f"{time.monotonic() - began:.0f} s, {count} clients: {ends}; the network: {proxy.tally}; "
+        f"{time.monotonic() - began:.0f} s, {count} clients: {found}; the network: {proxy.tally}; "
         f"clients: {unlucky}\n"
     )
-    assert clients.returncode == 0
-    check(ends, tmp_path, proxy, faults)
 
 
-def exchange(group: Any, requests: int) -> dict[str, int]:
-    """Step clients that have answered until `requests` have ended; count how they ended."""
-    ends = {"answered": 0, "marked": 0}
+def check_first(batch: BatchedData, row: int) -> None:
+    """Check a result that begins an episode."""
+    _, number, steps = batch.observation[row]
+    assert (number, steps, batch.reward[row]) == (-1, 0, 0), "an episode that did not begin"
+    assert batch.is_reset[row]
+
+
+def exchange(group: Any, requests: int) -> dict[int, tuple[str, str]]:
+    """Step clients that have answered until `requests` have ended.
+
+    Returns of each number whom it was sent to, and how it has ended.
+    """
+    ends: dict[int, tuple[str, str]] = {}
     asked: dict[str, int] = {}
+    steps: dict[str, int] = {}
     sent = 0
     batch, _ = group.reset()
     while True:
-        for ret, action in zip(batch.values(), batch.sent.action, strict=True):
-            number = asked.pop(ret.env_id, None)
-            if number is None:
-                assert np.isnan(action).all(), "a result that answers nothing"
+        for row, ret in enumerate(batch.values()):
+            client, number = ret.env_id.removeprefix("robots-0/"), asked.pop(ret.env_id, None)
+            assert client == f"c{int(ret.observation[0])}", "the result of another client"
+            action = batch.sent.action[row]
+            assert np.isnan(action).all() if number is None else action[0] == number / 2**20
+            is_lost = "client_lost" in ret.info
+            if number is None or is_lost:
+                check_first(batch, row)
             else:
-                assert action[0] == number / 2**20, "the answer to another request"
-            if "client_lost" in ret.info:
-                assert ret.last_truncated
-                assert number is not None, "a loss without a request"
-                ends["marked"] += 1
-            elif number is not None:
                 assert ret.observation[1] == number, "the result of another request"
-                assert ret.env_id == f"robots-0/c{int(ret.observation[0])}"
-                ends["answered"] += 1
-        if sum(ends.values()) == requests:
+                assert ret.last_reward == ret.observation[2] == steps[client] + 1, "a gap"
+            assert batch.restarted is None or batch.restarted[row] == is_lost
+            if number is not None:
+                ends[number] = client, "marked" if is_lost else "answered"
+            else:
+                assert not is_lost, "a loss without a request"
+            steps[client] = int(ret.observation[2])
+        if len(ends) == requests:
             return ends
         responses = []
         for env_id in dict.fromkeys(batch.env_ids()):
