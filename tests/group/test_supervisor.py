@@ -254,6 +254,24 @@ def test_a_killed_host_has_its_time_if_the_trainer_was_stopped(fleet: Callable[.
     assert ours.log == ["dump and kill 0", "destroy 0"]
 
 
+def test_a_death_that_was_read_with_another_one_destroys_nothing(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """The fork server tells of the deaths of all its workers, and the trainer reads that late."""
+    ours = fleet((1, 1), step_timeout=5.0)
+    for host, entry in zip(ours.hosts, ours.ask(0, 1), strict=True):
+        host.current, host.dies = (entry, int(ours.now * 1e9)), False
+    ours.now += 5
+    ours.check()
+    ours.check()
+    ours.hosts[0].unread = [host.die for host in ours.hosts]
+    ours.now += 60
+    ours.check()
+    assert len(ours.losses) == 2
+    assert ours.log[:2] == ["dump and kill 0", "dump and kill 1"]
+    assert not [line for line in ours.log if line.startswith("destroy")]
+
+
 def ended_as_hung(ours: Fleet) -> HostLoss:
     """Return the outcome for host 0, whose time is almost over, or is by the next look."""
     ours.let(0.1 + 5.0 / 4)

@@ -100,7 +100,7 @@ class HangDetector:
         outstanding = set[int]() if record.dying else self._requests.unwanted
         record.abort_by = {k: by for k, by in record.abort_by.items() if k in outstanding}
         slot = min(record.abort_by, key=record.abort_by.__getitem__, default=None)
-        if slot is not None and self._now >= record.abort_by[slot] and not read_news(record):
+        if slot is not None and self._now >= record.abort_by[slot] and not self.read_news(record):
             self._kill_aborted(record, slot)
 
     def _kill_aborted(self, record: HostRecord, slot: int) -> None:
@@ -123,7 +123,7 @@ class HangDetector:
         assert record.killable is not None
         entry, _ = current = record.killable.current_request()
         expiry = self._expiry(record, current)
-        if self._now < expiry or read_news(record):
+        if self._now < expiry or self.read_news(record):
             return max(expiry, self._now)
         if entry and slot_of(entry) in record.abort_by:  # It counts as aborted.
             self._kill_aborted(record, slot_of(entry))
@@ -164,12 +164,14 @@ class HangDetector:
             if record.die_by is None:
                 # The trainer may have been stopped until it was killed.
                 record.die_by = self._tables.clock() + times.OBEY
-            elif self._now >= record.die_by and not read_news(record):
+            elif self._now >= record.die_by and not self.read_news(record):
                 assert record.killable is not None
                 record.die_by = None
                 record.killable.destroy()
 
-
-def read_news(record: HostRecord) -> bool:
-    """Read what a host has sent, and return True if there was anything."""
-    return record.killable is not None and record.killable.catch_up()
+    def read_news(self, record: HostRecord) -> bool:
+        """Read what a host has sent; return True if there was anything, or if anything waits to be
+        applied: what it shares with others may have been read for one of them.
+        """
+        has_news = record.killable is not None and record.killable.catch_up()
+        return has_news or bool(self._tables.completions)

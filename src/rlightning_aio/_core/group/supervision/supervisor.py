@@ -31,7 +31,7 @@ from rlightning_aio._core.group.supervision.fault_messages import (
     start_fault,
     without_terminal,
 )
-from rlightning_aio._core.group.supervision.hang_detector import HangDetector, read_news
+from rlightning_aio._core.group.supervision.hang_detector import HangDetector
 from rlightning_aio._core.group.supervision.hint import Hint
 from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.places import Places
@@ -204,7 +204,7 @@ class Supervisor:
         for record in self.records:
             if record.start_by is None or self._now < record.start_by:
                 continue
-            if read_news(record) or record.note_traffic():
+            if self.detector.read_news(record) or record.note_traffic():
                 if not record.late:
                     record.give_time(self.clock())
             elif not record.late:
