@@ -51,16 +51,12 @@ class Health:
         since that was so before.
         """
         self.note_env(outcome, now)
-        was_slow = self.is_slow
         if is_final(outcome):
             self._has_succeeded = True
-            self._note_recent("", num_playing, now)
-        elif is_retried(outcome) and not (is_bystanders(outcome) or is_unnamed(outcome)):
-            self._note_recent(outcome.kind, num_playing, now)
-        if was_slow or not self.is_slow:
+            return self._note_recent("", num_playing, now)
+        if not is_retried(outcome) or is_bystanders(outcome) or is_unnamed(outcome):
             return False
-        had_succeeded, self._has_succeeded = self._has_succeeded, False
-        return had_succeeded
+        return self._note_recent(outcome.kind, num_playing, now)
 
     def note_env(self, outcome: Outcome, now: float) -> None:
         """Note the end of a try for its env alone, which rests if it has failed too often."""
@@ -73,28 +69,31 @@ class Health:
                 rest = min(_REST * 2.0 ** min(more - 1, 10), _LONGEST_REST)
                 self._rests[outcome.env_id] = now + rest
 
-    def _note_recent(self, kind: str, num_playing: int, now: float) -> None:
+    def _note_recent(self, kind: str, num_playing: int, now: float) -> bool:
         if self.is_slow:
             if not kind:
                 self.recover(now)
-            return
+            return False
         self._recent.append(kind)
         most = max(num_playing, _FEWEST)
         while len(self._recent) > most:
             self._recent.popleft()
         failed = Counter(filter(None, self._recent))
-        if 2 * failed.total() > most:
-            self.is_slow, self._since, self._pause = True, now, _PAUSE
-            self._next = now + _PAUSE
-            self._recent.clear()
-            env_id = next(iter(self._in_a_row), "")
-            _log.warning(
-                "most attempts fail (%s%s): others begin one at a time, after "
-                "pauses of up to %g s, until one succeeds",
-                ", ".join(f"{count} {kind}" for kind, count in failed.items()),
-                f", such as on env {env_id!r}" if env_id else "",
-                _LONGEST_PAUSE,
-            )
+        if 2 * failed.total() <= most:
+            return False
+        self.is_slow, self._since, self._pause = True, now, _PAUSE
+        self._next = now + _PAUSE
+        self._recent.clear()
+        env_id = next(iter(self._in_a_row), "")
+        _log.warning(
+            "most attempts fail (%s%s): others begin one at a time, after "
+            "pauses of up to %g s, until one succeeds",
+            ", ".join(f"{count} {kind}" for kind, count in failed.items()),
+            f", such as on env {env_id!r}" if env_id else "",
+            _LONGEST_PAUSE,
+        )
+        had_succeeded, self._has_succeeded = self._has_succeeded, False
+        return had_succeeded
 
     def recover(self, now: float) -> None:
         """An attempt goes well: have others begin as fast as envs are free."""
