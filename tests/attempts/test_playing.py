@@ -227,7 +227,10 @@ async def test_an_agent_that_takes_too_long(place: dict[str, Any], on_timeout: A
     assert attempt.outcome.seconds.agent > began + limit - thinking[0]
 
 
-async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward() -> None:
+@pytest.mark.parametrize("on_timeout", ["fail", "end"])
+async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward(
+    on_timeout: Any,
+) -> None:
     """What it had earned before counts as little as after any other failure."""
 
     async def agent(episode: AttemptEpisode) -> None:
@@ -241,7 +244,7 @@ async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward(
     async with rooms(PLACES["loop"]) as group:
         limits = iter(LIMITS)
         while not thinking:
-            rules = Rules(attempt_timeout=next(limits), on_timeout="end", retries=0)
+            rules = Rules(attempt_timeout=next(limits), on_timeout=on_timeout, retries=0)
             ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
     assert (attempt.outcome.kind, attempt.reward) == ("env_raised", None)
     assert attempt.rewards == [3.0]

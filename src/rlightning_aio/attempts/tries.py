@@ -131,7 +131,7 @@ class Try:
             playing.cancel()
             await surely({playing}, _PATIENCE_SECONDS)
             self._abandon(playing)
-            if not ended.is_failure:  # Its time was over, but its env was lost before that.
+            if self._stopped is None:  # Its time was over, but its env was lost before that.
                 ended = self._view.fault or ended
         self._turns.release()
         return ended, None if is_cut or ended.is_failure else playing.result()
