@@ -343,6 +343,36 @@ def test_an_env_that_cannot_be_restored_is_lost_and_the_others_are_restored() ->
         group.snapshot()
 
 
+class Unloadable:
+    """Awaitable; each step ends its episode, and it shows the seed."""
+
+    seed: Any = None
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.seed = seed
+        return seed, {}
+
+    async def step(self, action: Any) -> Any:
+        return self.seed, 0.0, True, False, {}
+
+    def load_state(self, state: Any) -> None:
+        raise OSError("the disk is gone")
+
+    def save_state(self) -> Any:
+        return None
+
+
+async def test_an_episode_that_had_ended_is_not_begun_again_after_a_failed_restore() -> None:
+    async with rl.build_env_group(Unloadable, placement="loop") as group, group.auto_reset(9):
+        batch, _ = await group.reset(seed=3)
+        snapshot = await group.snapshot()
+        await group.step(batch.respond(action=[0]))
+        with pytest.raises(EnvRaised, match="the disk is gone"):
+            await group.restore(snapshot)
+        batch, _ = await group.step(batch.respond(action=[0]))
+    assert (batch.restarted.tolist(), batch.observation) == ([True], [None])
+
+
 def test_an_env_that_was_never_reset_has_no_state() -> None:
     entry = {"name": "e", "task": Fragile, "placement": "inline"}
     no_state = pytest.raises(SnapshotError, match="env 'e-0' has no state yet")

@@ -305,8 +305,9 @@ class Steps:
         resets = self._episodes.due[slots]
         if self._episodes.exceptional:
             reports = self._episodes.report_losses(slots)
-            # A place remembers its last reset itself, and may have no row yet.
-            lost = slots[reports & (slots < self._envs.num_local)]
+            # A place remembers its last reset itself, and may have no row yet. An episode that had
+            # ended is not begun again.
+            lost = slots[reports & ~resets & (slots < self._envs.num_local)]
             self._layout.write_seeds(lost, np.full(len(lost), AS_BEFORE))
             resets = resets | reports
         entries = requests.issue(slots, _STEP, owner, now)
