@@ -382,7 +382,8 @@ class Attempts(InContext):
         elif played.end in _ENDS:
             own = [_ENDS[played.end], *cut_short]
             require(outcome.kind in own, "another end", own)
-        elif played.end == "cancelled":
+        elif played.end == "cancelled" or (not played.end and self.program.faults.lags):
+            # A trainer that is late gives an agent up that has not seen its cancellation yet.
             require(outcome.kind in cut_short, "another end", cut_short)
         elif played.end == "agent_raised":
             require(outcome.kind in (played.end, *cut_short), "another failure", played.end)
