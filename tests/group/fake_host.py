@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio.protocol.exchange import Ring
 
-PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO = range(5)
+PLAIN, TERMINATES, RAISES = range(3)
 """Effects of an action: nothing special, end the episode, raise, send an info by frame."""
 
 REFUSAL = "no more processes"
@@ -223,11 +223,10 @@ class FakeHost(Host):
             self._raise(entry)
             return
         self.envs[index].step()
-        info = {"steps": [self.envs[index].steps]} if action == SENDS_INFO else {}
-        self._write(index, float(action), action == TERMINATES, action == TRUNCATES, info)
+        self._write(index, float(action), action == TERMINATES, False, {})
         self.slab.is_reset[at] = False
-        self.slab.over[at] |= action in (TERMINATES, TRUNCATES)
-        self._reply(entry, info, out_of_band=given is not None)
+        self.slab.over[at] |= action == TERMINATES
+        self._reply(entry, {}, out_of_band=given is not None)
 
     def _reset(self, entry: int, given: Any) -> None:
         index = slot_of(entry) - self.first_slot
@@ -550,7 +549,7 @@ class FakeGroup:
         self.turn()
         return running
 
-    def turn(self, *, newest_first: bool = False) -> None:
+    def turn(self) -> None:
         """Act as the driver until nothing is readable and no time has come."""
         for _ in range(200):
             for host in self.hosts:
@@ -562,7 +561,7 @@ class FakeGroup:
             if not woken:
                 self.running = [running for running in self.running if not running.done]
                 return
-            for running in reversed(woken) if newest_first else woken:
+            for running in woken:
                 self.core.apply_completions()
                 running.resume(self.now)
         raise AssertionError("the core loops instead of waiting")
@@ -593,12 +592,12 @@ class FakeGroup:
     def host_of(self, slot: int) -> FakeHost:
         return next(h for h in self.hosts if h.first_slot <= slot < h.first_slot + h.num_envs)
 
-    def finish(self, slot: int, *, newest_first: bool = False) -> None:
+    def finish(self, slot: int) -> None:
         """Execute the request of `slot`, then let the driver act."""
         host = self.host_of(slot)
         rows = [row for row, _ in host.waiting]
         host.finish(rows.index(slot - host.first_slot))
-        self.turn(newest_first=newest_first)
+        self.turn()
 
     def close(self) -> None:
         while self.running:

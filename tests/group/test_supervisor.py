@@ -49,10 +49,10 @@ class Fleet(FakeGroup):
         self.supervisor.handle_exit = noted
         self.supervisor.overdue.begin = lambda now: None  # Its times would come between others.
 
-    def turn(self, *, newest_first: bool = False) -> None:
+    def turn(self) -> None:
         while True:
             self.drain()
-            super().turn(newest_first=newest_first)
+            super().turn()
             if not self.shared.completions:
                 return
 
