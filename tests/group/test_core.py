@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
 import pytest
-from group.fake_host import PLAIN, RAISES, TERMINATES, FakeGroup
+from group.fake_host import PLAIN, TERMINATES, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
@@ -130,22 +130,6 @@ def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup
     assert ids_of(collect(group)) == ["fake-0", "fake-1"]
 
 
-def test_an_error_of_a_cancelled_step_reaches_the_collector(new_group: NewGroup) -> None:
-    """An error answers a request, too."""
-    group = new_group(2)
-    running = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
-    group.finish(1)
-    group.cancel(running)
-    with pytest.raises(EnvRaised, match="fake-1"):
-        collect(group).result()
-    waiting = collect(group)
-    group.finish(0)
-    with pytest.raises(EnvRaised, match="fake-0"):
-        waiting.result()
-    with pytest.raises(NothingPending):
-        collect(group).result()
-
-
 @pytest.mark.parametrize("name", ["who", "raise"])
 def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str) -> None:
     """The env can be stepped once it has replied."""
@@ -208,39 +192,6 @@ def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
     assert ids_of(running) == ["fake-0", "fake-1"]
     assert group.hosts[0].extras == {}
     assert group.hosts[1].extras == {1: {"value": 1}}
-
-
-def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> None:
-    """Its caller still waits for other envs; a request in between would be mixed up with them."""
-    group = new_group(2)
-    running = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
-    group.finish(0)
-    with pytest.raises(EnvBusy, match="the call that asked it has not returned yet"):
-        group.steps.step_async(steps(0), group.now)
-    group.finish(1)
-    with pytest.raises(EnvRaised):
-        running.result()
-    group.steps.step_async(steps(0, 1), group.now)
-
-
-def test_an_error_of_a_cancelled_call_keeps_its_env_busy(new_group: NewGroup) -> None:
-    """It came before the call was cancelled, or after that; a collect raises it."""
-    group = new_group(2)
-    stepping = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
-    group.finish(0)
-    group.cancel(stepping)
-    group.finish(1)
-    left = {"fake-0", "fake-1"}
-    while left:
-        assert {*group.core.pending()} == left
-        for env_id in left:
-            with pytest.raises(EnvBusy, match="collect it first"):
-                group.steps.step_async(steps(int(env_id[-1])), group.now)
-        with pytest.raises(EnvRaised) as caught:
-            collect(group).result()
-        left.remove(caught.value.env_id)
-    assert group.core.pending() == []
-    group.steps.step_async(steps(0, 1), group.now)
 
 
 def test_an_unreadable_info_raises_only_when_it_is_read(

@@ -57,7 +57,7 @@ ROWS: Final[dict[str, str]] = {
 _OTHERS: Final = ELSEWHERE + "tests/group/test_aborting.py; programs abort no call of another task"
 OTHERS: Final[dict[str, str]] = {
     "BUSY TICKET ABORTED": _OTHERS,
-    "GroupClosed": ELSEWHERE + "tests/group/test_core.py; programs use no closed group",
+    "GroupClosed": ELSEWHERE + "tests/group/test_life.py; programs use no closed group",
     "INTACT GIVEN_UP": ELSEWHERE + "nowhere: what is intact is not in the table of losses",
 }
 """The same for transitions and errors that no program reaches."""
