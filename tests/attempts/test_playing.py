@@ -250,6 +250,23 @@ async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward(
     assert attempt.rewards == [3.0]
 
 
+async def test_an_agent_has_its_time_to_end_after_the_event_loop_was_blocked(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            time.sleep(1.0)  # noqa: ASYNC251  # It blocks the loop.
+            for _ in range(9):
+                await asyncio.sleep(0)
+
+    async with rooms(PLACES["loop"]) as group:
+        ((attempt,),) = await played(group, tasks(1), agent, 1, Rules(attempt_timeout=0.1))
+    assert attempt.outcome.kind == "timed_out"
+    assert "continues although it was cancelled" not in caplog.text
+
+
 @pytest.mark.parametrize("what", ["a step", "a step that was not sent", "a call"])
 async def test_what_an_agent_leaves_to_a_task_of_its_own_ends_with_the_attempt(what: str) -> None:
     """As by `asyncio.wait` with a time limit, or `asyncio.shield`; the next attempt has the env."""

@@ -382,9 +382,9 @@ class Attempts(InContext):
         elif played.end in _ENDS:
             own = [_ENDS[played.end], *cut_short]
             require(outcome.kind in own, "another end", own)
-        elif played.end == "cancelled" or (not played.end and self.program.faults.lags):
-            # A trainer that is late gives an agent up that has not seen its cancellation yet.
-            require(outcome.kind in cut_short, "another end", cut_short)
+        elif played.end == "cancelled":
+            own = [*cut_short, *self._late_ends(played)]
+            require(outcome.kind in own, "another end", own)
         elif played.end == "agent_raised":
             require(outcome.kind in (played.end, *cut_short), "another failure", played.end)
         else:
@@ -395,6 +395,11 @@ class Attempts(InContext):
             require(attempt.reward == sum(rewards), "another reward", sum(rewards))
             success = info["success"] > 0.5 if "success" in info else None
             require(attempt.success == success, "another success", success)
+
+    def _late_ends(self, played: Played) -> list[str]:
+        """The end of an agent that goes on, and steps before a late trainer gives it up."""
+        fault = played.episode.fault
+        return [fault.kind] if self.program.faults.lags and fault is not None else []
 
     def _script(self, played: Played, steps: int | None = None) -> Script:
         """The script of an env, where some steps of an attempt lead to."""

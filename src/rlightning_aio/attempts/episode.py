@@ -198,6 +198,10 @@ class AttemptInPlay(AttemptEpisode):
             queued += max(self._clock.now() - self._asked_at - inside, 0.0)
         return self._clock.now() - self._began - queued
 
+    def now(self) -> float:
+        """Seconds since any moment, without those for which the loop was blocked."""
+        return self._clock.now()
+
     def note_wait(self, seconds: float) -> None:
         """Don't count seconds for which others kept its agent waiting."""
         self._queued += seconds

@@ -129,7 +129,7 @@ class Try:
         is_cut = not playing.done()
         if is_cut:
             playing.cancel()
-            await surely({playing}, _PATIENCE_SECONDS)
+            await surely({playing}, _PATIENCE_SECONDS, self._view.now)
             self._abandon(playing)
             if self._stopped is None:  # Its time was over, but its env was lost before that.
                 ended = self._view.fault or ended
@@ -289,11 +289,15 @@ async def _awaited(agent: Agent, view: AttemptEpisode) -> Any:
     return await answer
 
 
-async def surely(tasks: set[asyncio.Task[Any]], seconds: float | None = None) -> None:
-    """Wait for tasks, also if the caller is cancelled meanwhile."""
-    deadline = None if seconds is None else time.monotonic() + seconds
+async def surely(
+    tasks: set[asyncio.Task[Any]],
+    seconds: float | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> None:
+    """Wait for tasks, for `seconds` of a clock at most, also if the caller is cancelled."""
+    deadline = None if seconds is None else clock() + seconds
     while left := {task for task in tasks if not task.done()}:
-        limit = None if deadline is None else deadline - time.monotonic()
+        limit = None if deadline is None else deadline - clock()
         if limit is not None and limit <= 0:
             return
         try:
