@@ -535,7 +535,7 @@ class Model:
         is_reset = request.kind == "reset"
         states = env.possible() if is_reset else [env.state, *env.loose]
         marks = {state.scripts.subs[0].mark for state in states}
-        if is_reset and env.host.renewed and UNLOADABLE in marks:
+        if request.resets and env.host.renewed and UNLOADABLE in marks:
             states.append(env.fresh())  # Its next worker can't take its generators over.
         limit = self.limit_of(env)
         now = [state.copy() for state in states]
