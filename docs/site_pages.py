@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 import posixpath
 import re
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mkdocs.structure.files import File
+
+import rlightning_aio
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
@@ -36,8 +37,7 @@ LINK = re.compile(r"(?<=\])\(([^)\s#:]+)(#[^)\s]*)?\)|(?<=src=)\"([^\"#:]+)\"")
 SHOWN = {".py", ".ipynb", ".yaml", ".toml", ".txt", ".cff"}
 
 
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-HOME_WORDS = {"VERSION": PROJECT["version"]}
+HOME_WORDS = {"VERSION": rlightning_aio.__version__}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
