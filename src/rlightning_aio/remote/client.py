@@ -199,7 +199,8 @@ class RemoteEnvClient:
         if self._closed:
             raise RuntimeError("this client is closed")
         end = None if timeout is None else time.monotonic() + timeout
-        while self._session.phase is not Phase.SERVING:
+        num_sessions = self.num_sessions  # A session may end in the wait in which it began.
+        while self._session.phase is not Phase.SERVING and self.num_sessions == num_sessions:
             if end is not None and time.monotonic() >= end:
                 raise TimeoutError(
                     f"{self._address} did not let {self.name!r} in within {timeout} s: {self.state}"
