@@ -14,6 +14,7 @@ import threading
 import time
 import tracemalloc
 from collections import Counter
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -979,7 +980,6 @@ class Poisoned(AwaitedRoom):
         await super().pause("hang" if action == "poison" else {"seconds": 0.01})
 
 
-@pytest.mark.skip(reason="play waits for idle workers without end, once in a few runs")
 async def test_poison_tasks_cost_only_themselves() -> None:
     """Those that were executed with one are played again where nobody else plays."""
     poison = (3, 11, 12)
@@ -1042,6 +1042,22 @@ async def test_what_fails_when_an_outage_begins_costs_no_try(
     failures = {attempts.spec.seed: len(attempts[0].failures) for attempts in found}
     assert all(attempts.is_complete for attempts in found)
     assert {seed: failures[seed] >= 2 for seed in range(16)} == {k: k >= 8 for k in range(16)}
+
+
+async def test_the_end_of_a_pause_is_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes between two looks at a clock, which has moved on at each."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if next(tries) < 3:
+            raise ConnectionError("the model is away")
+        await once(episode)
+
+    tries, looks, now = itertools.count(), itertools.count(), time.monotonic()
+    clock = SimpleNamespace(monotonic=lambda: now + next(looks) / 4)
+    monkeypatch.setattr("rlightning_aio.attempts.playing.time", clock)
+    async with sandboxes(1) as group, asyncio.timeout(HANG):
+        found = await played(group, tasks(4), agent, 1, Rules(retries=3))
+    assert all(attempts.is_complete for attempts in found)
 
 
 async def test_an_attempt_that_goes_well_ends_the_pause(monkeypatch: pytest.MonkeyPatch) -> None:

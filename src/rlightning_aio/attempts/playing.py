@@ -160,10 +160,12 @@ class _Engine:
         self._ended = deque[asyncio.Task[Attempt]]()
         self._logged = set[type[BaseException]]()
         self._turns = asyncio.Semaphore(rules.max_concurrency or sys.maxsize)
-        self._health = health = Health()
+        self._health = Health()
         self._clock = Clock()
         self._numbers = Numbers(group)
-        self._queue.may_play = lambda env_id: not health.rests(env_id, time.monotonic())
+        # Of a turn: what may begin now, and when more may, are asked of one moment, as nobody would
+        # wait for what comes between two.
+        self._now = 0.0
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)
         self._has_played = False
@@ -190,6 +192,7 @@ class _Engine:
                 self._wake.clear()
                 while self._ended:
                     self._end(self._ended.popleft())
+                self._now = time.monotonic()
                 if self._begin():
                     await asyncio.sleep(0)
                     continue
@@ -198,7 +201,7 @@ class _Engine:
                 waiting = len(self._queue)  # Some may wait until an env has rested.
                 if not (self._playing or waiting) and self._source.is_at_end:
                     return
-                seconds = self._health.seconds_left(time.monotonic()) if waiting else None
+                seconds = self._health.seconds_left(self._now) if waiting else None
                 if self._has_clients:
                     seconds = min(seconds or LOOK_SECONDS, LOOK_SECONDS)
                 with contextlib.suppress(TimeoutError):
@@ -245,7 +248,7 @@ class _Engine:
         """
         queue, begun = self._queue, 0
         while True:
-            while self._may_begin() and (env_id := queue.next_env()):
+            while self._may_begin() and (env_id := queue.next_env(self._rests)):
                 if begun == _BURST:
                     return True
                 self._start(env_id)
@@ -263,12 +266,15 @@ class _Engine:
                 self._settle(task)
 
     def _may_begin(self) -> bool:
-        now, health = time.monotonic(), self._health
+        now, health = self._now, self._health
         if health.is_slow and any(probe.goes_well for probe in self._probes):
             health.recover(now)
         if not health.is_slow:
             self._probes.clear()
         return len(self._playing) < self._most and health.may_begin(now)
+
+    def _rests(self, env_id: str) -> bool:
+        return self._health.rests(env_id, self._now)
 
     def _start(self, env_id: str) -> None:
         (job,) = self._queue.take(env_id)

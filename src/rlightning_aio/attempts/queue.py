@@ -98,7 +98,6 @@ class AttemptQueue:
         players: the envs.
         free: idle envs, the one that has been idle for longest first.
         fault: the last error of a worker that ended.
-        may_play: says of an idle env whether it may begin an attempt now.
     """
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
@@ -107,7 +106,6 @@ class AttemptQueue:
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
         self.fault: WorkerDied | None = None
-        self.may_play: Callable[[str], bool] = lambda _: True
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
@@ -198,11 +196,11 @@ class AttemptQueue:
 
     # -- what is played next ----------------------------------------------------------
 
-    def next_env(self) -> str | None:
-        """The next idle env that an attempt waits for, and may play it; None if there is none."""
+    def next_env(self, rests: Callable[[str], bool]) -> str | None:
+        """The next idle env that doesn't rest and that an attempt waits for; None without one."""
         if not len(self):
             return None
-        return next((id_ for id_ in self.free if self.may_play(id_) and self._has_job(id_)), None)
+        return next((id_ for id_ in self.free if not rests(id_) and self._has_job(id_)), None)
 
     def _has_job(self, env_id: str) -> bool:
         for queue in self._pinned.get(env_id, {}).values():

@@ -97,7 +97,6 @@ class PolicyPlay:
         self._has_warned = False
         self._films = options.films
         self._health = Health()
-        queue.may_play = lambda env_id: not self._health.rests(env_id, time.monotonic())
 
     # -- the loop ---------------------------------------------------------------------
 
@@ -142,7 +141,7 @@ class PolicyPlay:
         while True:
             while self._ended:
                 self._keep(*self._ended.popleft())
-            env_id = self._queue.next_env()
+            env_id = self._queue.next_env(self._rests)
             if env_id is None:
                 return
             jobs = self._queue.take(env_id)
@@ -157,11 +156,14 @@ class PolicyPlay:
         pending, plays = self._pending, self._plays
         return (env_id for env_id in self._places if env_id in pending or plays(env_id))
 
+    def _rests(self, env_id: str) -> bool:
+        return self._health.rests(env_id, time.monotonic())
+
     def _end_waiting(self) -> None:
         """End what waits while no env plays: only envs that are not there could play it."""
         self._queue.look(self._busy(), at_once=True)
         self._health = Health()  # Envs rest only while others play.
-        if self._queue.next_env() is not None:
+        if self._queue.next_env(self._rests) is not None:
             return
         players = self._queue.players
         for job in self._queue.withdraw_all():
