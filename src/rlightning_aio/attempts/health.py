@@ -2,8 +2,8 @@
 
 Rule: a broken env fails in milliseconds, so without a rest it would be free for every attempt. And
 a service that is away fails attempts at many times the normal pace, so they begin one at a time,
-after growing pauses, until one succeeds. A worker's death says little of its other envs, so it is
-one failure at most. It reads no clock.
+after growing pauses, until one succeeds. A worker's death is no sign of that, but of the task that
+was executed in it. It reads no clock.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ import logging
 from collections import Counter, deque
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.attempts.rules import is_final, is_of_env, is_retried, is_unnamed
-from rlightning_aio.outcomes import is_bystanders
+from rlightning_aio.attempts.rules import is_final, is_of_env, is_retried
 
 if TYPE_CHECKING:
     from rlightning_aio.outcomes import Outcome
@@ -54,7 +53,7 @@ class Health:
         if is_final(outcome):
             self._has_succeeded = True
             return self._note_recent("", num_playing, now)
-        if not is_retried(outcome) or is_bystanders(outcome) or is_unnamed(outcome):
+        if not is_retried(outcome) or outcome.kind == "env_died":
             return False
         return self._note_recent(outcome.kind, num_playing, now)
 
