@@ -17,13 +17,16 @@ HEADER: Final = struct.Struct("<IIq")
 
 
 class FrameKind(IntEnum):
-    """The kind of a frame. The comments name sender, number and payload."""
+    """The kind of a frame; `completion_frames` has the completion of each that a worker sends.
+
+    The comments name sender, number and payload.
+    """
 
     BELL = 0  # both
     START = 1  # trainer: what to build
     STARTED = 2  # worker: metadata of each env
     START_ERROR = 3  # worker; index of the env: the error of building it
-    ATTACH = 4  # trainer: layouts of the slabs, and the rows of the envs
+    ATTACH = 4  # trainer: offsets and sizes of the slabs, and the rows of the envs
     ATTACHED = 5  # worker
     REQUEST = 6  # trainer; the entry: arguments out of band
     RESULT = 7  # worker; the request's entry: the part out of band

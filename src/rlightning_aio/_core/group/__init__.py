@@ -2,8 +2,8 @@
 
 Imports run down: `api` (the two public groups), `setup` (what is started), `timeline`, `engine`
 (send, wait, apply, hand out; snapshots are taken and restored there), `supervision` (deaths, hangs,
-restarts), `tables` (what all parts share), `episodes` (step limits, losses, seeds, the format of
-snapshots), `state`, `drivers` (how a procedure waits).
+restarts), `tables` (what all parts share), `state` (the single tables: requests, episodes, hosts),
+`drivers` (how a procedure waits).
 Decisions get the time as an argument, or from `Tables.clock`; only drivers, `api` and what measures
 (`sums`, `timeline`) read a clock, and none knows where an env runs.
 """

@@ -1,7 +1,8 @@
 """`InlineHost`: envs in the process of the trainer, with the same rows and rules.
 
-Requests wait in a queue, so sending never blocks; while a driver waits, it executes the next one
-(`Poller.execute`). An env blocks the process while it steps, and one that crashes ends the trainer.
+Requests wait in a queue, so sending never blocks. A call that waits for results has them executed
+(`Poller.execute`): several, one after another, if no other host is busy and no other task shares
+the thread. An env blocks the process while it steps, and one that crashes ends the trainer.
 """
 
 from __future__ import annotations

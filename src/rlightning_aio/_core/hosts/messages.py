@@ -124,7 +124,7 @@ class AttachOrder:
 
 @dataclass(frozen=True)
 class WorkerPlace:
-    """The part of the shared memory that belongs to a worker.
+    """The part of the shared memory that belongs to a worker; no place of an env_server.
 
     Attributes:
         host_id: of its host, one of `num_hosts`.
@@ -175,7 +175,7 @@ class Death:
             answered already, or be 0. Where envs are awaitable, the first is the one whose code
             ran, or 0 if all envs waited.
         refused: the system did not let it start.
-        in_order: it has left, as it may.
+        in_order: it was a client that said goodbye, which is no fault.
     """
 
     cause: str

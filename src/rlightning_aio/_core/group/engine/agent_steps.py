@@ -151,7 +151,7 @@ class AgentSteps:
         return False
 
     def leave(self, step: AgentStep) -> None:
-        """Leave the result of a step or a reset to the collector, as its caller was cancelled."""
+        """Leave a result to the collector, as its caller was cancelled; a value is dropped."""
         slot = self._tables.envs.find_one(step.env_id)
         is_own = self._requests.owner.item(slot) > 0  # It was not aborted.
         if is_own and self._sent.get(slot) is step:

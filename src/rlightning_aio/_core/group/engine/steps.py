@@ -3,8 +3,8 @@
 In reading order: check a batch, write its actions, send its requests; wait; hand results out.
 `Conditions.unusual` says whether anything rare must be looked at. A batch is *ordinary* where it is
 0, if the batch answers the group's own results: its actions are written with one copy, and its
-requests go into the rings of all workers with one call. For any other batch `actions` checks and
-writes, and finds the words for what it refuses, and `Dispatch` sends.
+requests go into the rings of all workers with one call, or to the one inline host. For any other
+batch `actions` checks and writes, and finds the words for what it refuses, and `Dispatch` sends.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Waiting:
         self.intake = intake
         self._completions = tables.completions
         self._driver = tables.driver
-        # Then inline envs are executed in one turn each.
+        # Then each request to an inline env is executed in its own turn.
         self._shares_thread = tables.shares_thread
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None

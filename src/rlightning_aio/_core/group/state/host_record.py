@@ -61,7 +61,7 @@ class HostLoss:
         host_id, slots: of the host, and of the envs that it had.
         owed: its slots with a request in flight.
         death: of its worker, with the cause as the group knows it.
-        replaced: a replacement is started; else the host is given up.
+        replaced: a replacement is started, or a client awaited; else the host is given up.
         resets: the replacement may reset envs on its own; False of hardware, which only the user
             sets in motion.
         kind: of its errors.
@@ -145,13 +145,14 @@ class HostRecord:
         is_next: its worker takes over the envs of the one in the peer, which goes on meanwhile.
         recycled: its workers that were replaced so; resident_mb: the most that one is known to
             have had; waits: resets that waited for the start of the next one.
-        killable: the host, if it can be killed; place: if its worker starts itself.
+        killable: the host, if it can be killed; place: the host, if its worker starts itself.
         was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
             user may set it in motion again; lost_client: its client was, not its episode alone.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
-        is_local: its envs use this machine's cores; is_hardware: they move in the real world.
+        is_local: its envs use this machine's cores; is_hardware: they move something real
+            (of a place, the client that takes it says so).
         slots: of its envs; some may be in the peer's worker (`Tables.slots_of`).
     """
 

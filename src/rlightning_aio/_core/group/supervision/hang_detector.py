@@ -77,8 +77,8 @@ class HangDetector:
 
     def expiries(self) -> list[float | None]:
         """Return the times, besides `due`, when `check` must be called."""
-        times: list[float | None] = [r.die_by or self._now for r in self._records if r.dying]
-        return times + [by for r in self._records for by in r.abort_by.values()]
+        dying: list[float | None] = [r.die_by or self._now for r in self._records if r.dying]
+        return dying + [by for r in self._records for by in r.abort_by.values()]
 
     def check(self, now: float) -> None:
         """Kill workers that have exceeded a limit, and destroy those that survive a kill."""

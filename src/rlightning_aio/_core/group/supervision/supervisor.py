@@ -339,12 +339,12 @@ class Supervisor:
 
     def next_check(self, until: float | None = None) -> float | None:
         """Return the time by which `check` must be called, or `until` if that is earlier."""
-        times = [until, self.patient.until]
+        moments = [until, self.patient.until]
         if self.detector.any_ending:
-            times += self.detector.expiries()
+            moments += self.detector.expiries()
         if self.any_deaths:
-            times += [due for r in self.records for due in (r.start_by, r.restart_at)]
-        return min((time for time in times if time is not None), default=None)
+            moments += [due for r in self.records for due in (r.start_by, r.restart_at)]
+        return min((moment for moment in moments if moment is not None), default=None)
 
     def watch(self, now: float) -> None:
         """Begin to look for envs that exceed a limit, or that owe a result for too long."""
@@ -452,6 +452,8 @@ class Supervisor:
     def replace(self, host_id: int) -> int:
         """Start the replacement of a host at once, if it needn't pause: `check` starts others.
 
+        A place stays empty, until a client takes it.
+
         Returns the host that has its envs now: the next worker may have been started already.
         """
         record = self.records[host_id]
@@ -482,7 +484,7 @@ class Supervisor:
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
             record.culprit = culprit_of(record, death.requests, requests, owed)
-        # Else the caller's wish, or the client's right, which counts for nothing.
+        # A worker killed for an abort, or a client that said goodbye, did nothing wrong.
         is_fault = record.aborted_slot is None and not death.in_order
         deaths = record.deaths.get(record.culprit, 0) + is_fault
         record.deaths[record.culprit] = deaths
