@@ -282,7 +282,7 @@ class EnvAway(EnvFault):
     """No client lends a remote env, or not any more; another may dial in.
 
     An awaitable env whose step raises it has lost what it talks to, and so its episode: the env is
-    made anew, as a worker that has died is.
+    made again, as a worker that has died is.
     """
 
     _outcome = "env_away", "infrastructure"

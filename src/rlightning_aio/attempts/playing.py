@@ -163,8 +163,8 @@ class _Engine:
         self._health = Health()
         self._clock = Clock()
         self._numbers = Numbers(group)
-        # Of a turn: what may begin now, and when more may, are asked of one moment, as nobody would
-        # wait for what comes between two.
+        # Of a turn: what may begin now, and when more may, are asked of one moment, as a wait
+        # would miss what comes between two.
         self._now = 0.0
         # Of the last attempts; whether a group has been played; and what began while most failed.
         self._last = deque[Outcome](maxlen=_LAST)

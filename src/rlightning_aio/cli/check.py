@@ -264,7 +264,7 @@ async def _renew(config: EnvConfig, found: _Finding) -> None:
         played.append([_contents(batch) for batch in batches])
     if played[0] != played[1]:
         found.problems.append(
-            "its random numbers begin anew when its worker is replaced (recycle): keep generators "
+            "its random numbers begin again when its worker is replaced (recycle): keep generators "
             "in attributes of the env or its wrappers, or define save_state() and load_state()"
         )
 

@@ -188,7 +188,7 @@ class Collector(Generic[G, R]):
         self._was_raised: set[str] = set()
 
     def restart(self, seed: Any = None, *, batch: BatchedData | None = None) -> None:
-        """Begin the episodes of all envs anew in the next `collect`.
+        """Begin the episodes of all envs again in the next `collect`.
 
         What the envs owe then is awaited and dropped. Transitions that are in no rollout yet are
         lost. Columns and spaces may be others.
@@ -255,7 +255,7 @@ class Collector(Generic[G, R]):
         if self._state is not _State.WHOLE:
             raise ResetNeeded(
                 "a collect was interrupted by Ctrl-C, and its results are lost; call "
-                "restart(seed=…) to begin all episodes anew, or restart(batch=…) with the results "
+                "restart(seed=…) to begin all episodes again, or restart(batch=…) with the results "
                 "of group.reset()"
             )
         with ensure_auto_reset(self._group):

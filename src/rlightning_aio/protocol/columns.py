@@ -212,7 +212,7 @@ def row_writer(tree: Tree, row: int, what: str, path: Path = ()) -> Callable[[An
     """Make a function that copies a value of a space into `row` of `tree`, its columns.
 
     Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments. Each step
-    calls it, so it knows its parts in advance, where `placed` finds them anew.
+    calls it, so it knows its parts in advance, where `placed` finds them again.
 
     Raises (from the function):
         Misfit: the value has another shape, structure or kind of dtype, or numbers out of range;

@@ -160,7 +160,7 @@ class _AwaitableEnv(FastPath, BaseEnv):
         return self._step_made
 
     def _step_made(self, action: Any) -> Any:
-        # Looked up anew: a restore replaces an object that has slots only.
+        # Looked up again: a restore replaces an object that has slots only.
         return self.env.step(action)
 
     def call_wrapped(self, name: str, /, *args: object, **kwargs: object) -> Any:

@@ -101,7 +101,7 @@ class Results:
             self._conditions.note(BESIDE_ROWS, True)
 
     def begin_schemas(self, host_id: int, slots: Sequence[int]) -> None:
-        """A host, of `slots`, announces its ways of holding infos (anew, after a restart)."""
+        """A host, of `slots`, announces its ways of holding infos (again, after a restart)."""
         self._schemas_of[host_id] = {}
         self.use_schemas(host_id, slots)
 

@@ -358,7 +358,7 @@ class Requests:
     def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
         """Record results that are in their rows; return their slots.
 
-        Late replies, to requests that were asked anew, are dropped, and so are unwanted ones.
+        Late replies, to requests that were asked again, are dropped, and so are unwanted ones.
 
         Args:
             reports: a host, and the entries of what it has done; in the order of arrival.

@@ -413,7 +413,7 @@ class Supervisor:
     def _lose_client(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Decide what the loss of a client means: whoever takes the place next replaces it."""
         loss = self._judged(record, death, owed)
-        # After too many losses in a row the error is raised, and the next request waits anew.
+        # After too many losses in a row the error is raised, and the next request waits again.
         loss = record.last_loss = replace(loss, replaced=True, resets=loss.resets and loss.replaced)
         # What has shown nothing has lost nothing.
         record.lost_client |= record.was_shown and record.is_hardware
