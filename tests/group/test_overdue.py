@@ -38,7 +38,9 @@ def gate(tmp_path: Any) -> Any:
 def watch(group: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a group whose envs have been reset wait no more than a moment."""
     monkeypatch.setattr(overdue, "OWED_SECONDS", 0.3)
-    group._core.supervisor.watch(time.monotonic())
+    supervisor = group._core.supervisor
+    supervisor.overdue.begin(time.monotonic())
+    supervisor.plan()
     if isinstance(group, rl.EnvGroup):
         group._driver._end_nudge()  # It has a timer for a minute, if a reset has waited.
 

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
-    from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
 
 Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
@@ -25,11 +25,11 @@ Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
 class Calls:
     """Call methods, and wait for the returned values."""
 
-    def __init__(self, tables: Tables, dispatch: Dispatch, waiting: Waiting) -> None:
+    def __init__(self, tables: Tables, supervisor: Supervisor, waiting: Waiting) -> None:
         self._observed = tables.observed
         self._envs = tables.envs
         self._requests = tables.requests
-        self._dispatch = dispatch
+        self._supervisor = supervisor
         self._intake = waiting.intake
         self._waiting = waiting
 
@@ -41,10 +41,7 @@ class Calls:
     def call(self, now: float, env_ids: Sequence[str] | None, call: Call) -> Procedure[list[Any]]:
         """Call a method of envs, or of every local env, in parallel and return its values."""
         with self._observed.call("call", now):
-            return (yield from self._call(now, self._slots(env_ids), call))
-
-    def _slots(self, env_ids: Sequence[str] | None) -> NDArray[np.intp]:
-        return self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+            return (yield from self._call(now, self._envs.chosen(env_ids), call))
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
         send = self._prepared(now, slots, call[0], [call] * len(slots))
@@ -55,7 +52,7 @@ class Calls:
         self, now: float, env_ids: Sequence[str], calls: Sequence[Call]
     ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
         """Check a call of one method for each env; return the slots, and what sends the calls."""
-        slots = self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         return slots, self._prepared(now, slots, calls[0][0], calls)
 
     def _prepared(
@@ -83,17 +80,17 @@ class Calls:
             what: describes the arguments in messages.
         """
         self._intake.apply_completions()
-        self._dispatch.check_local(slots, f"call {name} of")
-        self._dispatch.check_sendable(now, slots, f"call {name} of")
+        self._envs.check_local(slots, f"call {name} of")
+        self._waiting.check_sendable(now, slots, f"call {name} of")
         packed = [
-            self._dispatch.packed(slot, own, what)
+            self._supervisor.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
 
         def send(ticket: Ticket) -> None:
             entries = self._requests.issue(slots, op, ticket.owner, now)
             self._requests.methods.update(dict.fromkeys(slots.tolist(), name))
-            self._dispatch.hand_over(slots, entries, packed)
+            self._supervisor.hand_over(slots, entries, packed)
 
         return send
 

@@ -16,7 +16,6 @@ import numpy as np
 from rlightning_aio._core.group.engine.aborts import Aborts
 from rlightning_aio._core.group.engine.agent_steps import AgentSteps
 from rlightning_aio._core.group.engine.calls import Calls
-from rlightning_aio._core.group.engine.dispatch import Dispatch
 from rlightning_aio._core.group.engine.intake import Intake
 from rlightning_aio._core.group.engine.resets import Resets
 from rlightning_aio._core.group.engine.results import Results
@@ -29,8 +28,6 @@ from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.steps import Flags
@@ -69,11 +66,10 @@ class Core:
         self.intake = intake = Intake(tables, supervisor, results)
         self.apply_completions = intake.apply_completions
         self.waiting = waiting = Waiting(tables, supervisor, poller, intake)
-        dispatch = Dispatch(tables, supervisor, poller, waiting)
-        self.steps = Steps(tables, supervisor, results, dispatch, waiting)
-        self.calls = Calls(tables, dispatch, waiting)
-        self._snapshots = Snapshots(tables, supervisor, dispatch, self.calls, results, waiting)
-        self._resets = Resets(tables, supervisor, dispatch, results, waiting)
+        self.steps = Steps(tables, supervisor, results, waiting)
+        self.calls = Calls(tables, supervisor, waiting)
+        self._snapshots = Snapshots(tables, supervisor, self.calls, results, waiting)
+        self._resets = Resets(tables, supervisor, results, waiting)
         self.agent_steps = AgentSteps(tables, self.steps, self._resets, self.calls, waiting)
         self._aborts = Aborts(tables, supervisor, results, waiting)
 
@@ -87,7 +83,6 @@ class Core:
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
         self.steps.begin()
-        self.supervisor.watch(self.tables.clock())
         return metas
 
     def close(self, now: float) -> Procedure[None]:
@@ -102,7 +97,7 @@ class Core:
 
     def interrupted(self, now: float) -> str:
         """Stop hardware, as Ctrl-C has ended a call, and say which envs the call waited for."""
-        self.tables.stop_hardware(self._all_slots.tolist())
+        self.tables.stop_hardware(self.envs.all.tolist())
         self.waiting.poll()
         return self.supervisor.workers.awaited(int(now * 1e9))
 
@@ -144,15 +139,10 @@ class Core:
         """End the requests of envs, and drop their results."""
         with self.observed.call("abort", now):
             self.lifetime.check_open()
-            slots = self._all_slots if env_ids is None else self.envs.find(env_ids)
+            slots = self.envs.all if env_ids is None else self.envs.find(env_ids)
             self.waiting.poll()
             self._aborts.drop(slots)
             yield from self._aborts.end(slots, now)
-
-    @property
-    def _all_slots(self) -> NDArray[np.intp]:
-        """The slots of all envs."""
-        return np.arange(len(self.envs))
 
     def drain_requests(
         self, now: float, deadline: float | None
@@ -171,7 +161,7 @@ class Core:
                 now, lambda: collector.num_awaited + len(unwanted), end
             )
             if deadline is not None:
-                yield from self._aborts.end(self._all_slots, now)
+                yield from self._aborts.end(self.envs.all, now)
         finally:
             self.waiting.collecting = False
         results: tuple[BatchedData, Flags] = BatchedData([], []), []

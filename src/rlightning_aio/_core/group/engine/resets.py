@@ -7,7 +7,8 @@ all envs waits until every place of an env_server has a client.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.episodes import Seeds
@@ -38,17 +38,16 @@ class Resets:
         self,
         tables: Tables,
         supervisor: Supervisor,
-        dispatch: Dispatch,
         results: Results,
         waiting: Waiting,
     ) -> None:
         self._envs = tables.envs
+        self._record_of = tables.record_of
         self._requests = tables.requests
         self._layout = tables.layout
         self._episodes = tables.episodes
         self._supervisor = supervisor
         self._places = supervisor.places
-        self._dispatch = dispatch
         self._results = results
         self._intake = waiting.intake
         self._waiting = waiting
@@ -63,14 +62,14 @@ class Resets:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
         if env_ids is None and self._places.servers:
             now = yield from self._await_clients(now)
-        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         return (yield from self._reset(now, seed, options, slots))
 
     def prepared(
         self, now: float, seed: Seeds, options: dict[str, Any] | None, env_ids: Sequence[str]
     ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
         """Check resets; return the slots, and what sends the resets for a ticket."""
-        slots = self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         return slots, self._prepared(now, seed, options, slots)
 
     def reset_async(
@@ -81,9 +80,9 @@ class Resets:
         env_ids: Sequence[str] | None,
     ) -> None:
         """Send resets, whose results the collector gets."""
-        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         seeds = self._seeds_for(slots, seed)
-        self._dispatch.check_sendable(now, slots, "reset")
+        self._waiting.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
         self._send(slots, seeds, options, packed, COLLECTOR, now)
 
@@ -109,7 +108,7 @@ class Resets:
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
     ) -> Callable[[Ticket], None]:
         seeds = self._seeds_for(slots, seed)
-        self._dispatch.check_sendable(now, slots, "reset")
+        self._waiting.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
 
         def send(ticket: Ticket) -> None:
@@ -125,12 +124,32 @@ class Resets:
     def _packed_resets(
         self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
     ) -> list[Any] | None:
-        if options is not None:
-            return self._dispatch.packed_resets(slots, seeds, options)
-        if slots.size and int(slots.max()) >= self._envs.num_local:
-            is_place = slots >= self._envs.num_local
-            self._dispatch.resets_of_places(slots[is_place], seeds[is_place], None)
-        return None
+        """Check resets; return for each what it is sent with, None if that is the seed in its row.
+
+        A place has its arguments with it: it may have no row yet.
+        """
+        num_local = self._envs.num_local
+        if options is None and not (slots.size and int(slots.max()) >= num_local):
+            return None
+        if options is not None and not isinstance(cast("object", options), Mapping):
+            raise TypeError(
+                f"options must be a dict, which each env gets, not a {type(options).__name__}; for "
+                "options of its own, reset an env by itself: reset(options={…}, env_ids=[env_id])"
+            )
+        packed: list[Any] = []
+        for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
+            given = (None if seed < 0 else seed, options)
+            place = self._record_of(slot).place
+            try:
+                if place is not None:
+                    place.check_reset(*given)
+            except ValueError as error:
+                raise TypeError(f"{error}; nothing was sent") from error
+            is_in_row = options is None and place is None
+            packed.append(
+                None if is_in_row else self._supervisor.packed(slot, given, "the options")
+            )
+        return packed
 
     def _send(
         self,
@@ -149,7 +168,8 @@ class Resets:
         if packed and "reset_mask" in (options or {}) and self._episodes.exceptional:
             lost = self._episodes.report_losses(slots)
             as_before = np.full(np.count_nonzero(lost), AS_BEFORE)
-            self._submit_resets(slots[lost], as_before, None, owner, now)
+            whole = self._packed_resets(slots[lost], as_before, None)
+            self._submit_resets(slots[lost], as_before, whole, owner, now)
             slots, seeds = slots[~lost], seeds[~lost]
             packed = [one for one, gone in zip(packed, lost.tolist(), strict=True) if not gone]
         self._submit_resets(slots, seeds, packed, owner, now)
@@ -164,14 +184,12 @@ class Resets:
     ) -> None:
         entries = self._requests.issue(slots, Operation.RESET, owner, now)
         self._results.note_unasked(slots)
-        num_local = self._envs.num_local
-        if packed is not None:
-            self._dispatch.hand_over(slots, entries, packed)
+        if packed is None:
+            self._layout.write_seeds(slots, seeds)
+            self._supervisor.hand_over(slots, entries)
             return
-        is_place = slots >= num_local
-        local = ~is_place
-        self._layout.write_seeds(slots[local], seeds[local])
-        self._dispatch.hand_over(slots[local], entries[local])
-        # A place has its arguments with it: it may have no row yet.
-        given = self._dispatch.resets_of_places(slots[is_place], seeds[is_place], None)
-        self._dispatch.hand_over(slots[is_place], entries[is_place], given)
+        in_row = np.array([one is None for one in packed], np.bool_)
+        self._layout.write_seeds(slots[in_row], seeds[in_row])
+        self._supervisor.hand_over(slots[in_row], entries[in_row])
+        given = [one for one in packed if one is not None]
+        self._supervisor.hand_over(slots[~in_row], entries[~in_row], given)

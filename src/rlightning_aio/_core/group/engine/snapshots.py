@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.calls import Calls
-    from rlightning_aio._core.group.engine.dispatch import Dispatch
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
@@ -45,7 +44,6 @@ class Snapshots:
         self,
         tables: Tables,
         supervisor: Supervisor,
-        dispatch: Dispatch,
         calls: Calls,
         results: Results,
         waiting: Waiting,
@@ -56,14 +54,13 @@ class Snapshots:
         self._requests = tables.requests
         self._episodes = tables.episodes
         self._supervisor = supervisor
-        self._dispatch = dispatch
         self._calls = calls
         self._results = results
         self._waiting = waiting
 
     def take(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
         """See `EnvGroup.snapshot`."""
-        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         self._check_restorable(slots)
         each: list[int] = slots.tolist()
         send = self._calls.request(
@@ -91,7 +88,7 @@ class Snapshots:
         return pack(snapshots)
 
     def _check_restorable(self, slots: NDArray[np.intp]) -> None:
-        self._dispatch.check_local(slots, "take a snapshot of, or restore,")
+        self._envs.check_local(slots, "take a snapshot of, or restore,")
         each: list[int] = slots.tolist()
         for slot in each:
             if self._record_of(slot).is_hardware:
@@ -117,10 +114,10 @@ class Snapshots:
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot])
             check_same(snapshot, identity, self._envs.describe(slot))
         self._waiting.intake.apply_completions()
-        self._dispatch.check_sendable(now, slots, "restore")
+        self._waiting.check_sendable(now, slots, "restore")
         states = [(snapshot.versions, snapshot.state) for snapshot in snapshots]
         packed = [
-            self._dispatch.packed(slot, state, "its snapshot")
+            self._supervisor.packed(slot, state, "its snapshot")
             for slot, state in zip(each, states, strict=True)
         ]
         positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
@@ -129,7 +126,7 @@ class Snapshots:
             self._episodes.note_restores(slots, positions)
             entries = self._requests.issue(slots, Operation.RESTORE, ticket.owner, now)
             self._results.note_unasked(slots)
-            self._dispatch.hand_over(slots, entries, packed)
+            self._supervisor.hand_over(slots, entries, packed)
 
         ticket, _ = yield from self._waiting.ask(now, slots, send)
         return ticket, slots
@@ -139,7 +136,7 @@ class Snapshots:
     ) -> NDArray[np.intp]:
         """Return the slots of `env_ids`, or else of all envs, if these are what was saved."""
         taken_of = [snapshot.env_id for snapshot in snapshots]
-        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._envs.chosen(env_ids)
         if (where := len(slots)) != len(snapshots):
             raise SnapshotError(
                 f"the snapshot is of {len(snapshots)} envs, but should go into {where}; "
@@ -150,12 +147,12 @@ class Snapshots:
                 f"the snapshot is of {min(missing)!r}, and this group has no such env; name in "
                 "env_ids where each should go, in order; nothing was changed"
             )
-        return self._dispatch.distinct(taken_of) if env_ids is None else slots
+        return self._envs.chosen(taken_of) if env_ids is None else slots
 
     def _slots_like(self, source: str, env_ids: Sequence[str] | None) -> NDArray[np.intp]:
         """Return the slots of `env_ids`, or else of all envs of the entry of env `source`."""
         if env_ids is not None:
-            return self._dispatch.distinct(env_ids)
+            return self._envs.chosen(env_ids)
         entries = self._envs.names.entries
         return np.flatnonzero(entries == entries[self._envs.find_one(source)])
 

@@ -4,14 +4,15 @@ In reading order: check a batch, write its actions, send its requests; wait; han
 `Conditions.unusual` says whether anything rare must be looked at. A batch is *ordinary* where it is
 0, if the batch answers the group's own results: its actions are written with one copy, and its
 requests go into the rings of all workers with one call, or to the one inline host. For any other
-batch `actions` checks and writes, and finds the words for what it refuses, and `Dispatch` sends.
+batch `actions` checks and writes, and finds the words for what it refuses, and
+`Supervisor.hand_over` sends.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final, NoReturn, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NoReturn, TypeAlias
 
 import msgspec
 import numpy as np
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.engine.dispatch import Dispatch, Packed
+    from rlightning_aio._core.group.engine.actions import OutOfBandSteps
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.state.requests import Ticket
@@ -56,6 +57,8 @@ if TYPE_CHECKING:
 
 _STEP: Final = int(Operation.STEP)
 Flags: TypeAlias = "list[bool]"
+Packed: TypeAlias = "tuple[NDArray[np.intp], list[Any]]"
+"""Positions in a batch of steps, and for each the packed arguments that go out of band."""
 
 
 class CollectRules(msgspec.Struct, frozen=True, kw_only=True, gc=False):
@@ -76,7 +79,7 @@ class Steps:
 
     Args:
         tables: of the group; batches of results say that they are from these.
-        supervisor, results, dispatch, waiting: of the group.
+        supervisor, results, waiting: of the group.
     """
 
     def __init__(
@@ -84,7 +87,6 @@ class Steps:
         tables: Tables,
         supervisor: Supervisor,
         results: Results,
-        dispatch: Dispatch,
         waiting: Waiting,
     ) -> None:
         self._tables = tables
@@ -100,7 +102,6 @@ class Steps:
         self._completions = tables.completions
         self._driver = tables.driver
         self._results = results
-        self._dispatch = dispatch
         self._waiting = waiting
         self._intake = waiting.intake
         self._sums = tables.sums
@@ -272,14 +273,29 @@ class Steps:
     def _write_any(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
         """Do the same for any batch."""
         slots = self._slots_of(batch)
-        self._dispatch.check_sendable(now, slots, "step")
+        self._waiting.check_sendable(now, slots, "step")
         self._supervisor.places.check_step(slots)
         if not len(slots):
             return slots, None
         out_of_band = write_actions(batch, slots, self._envs, self._layout)
-        packed = None if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
+        packed = None if out_of_band is None else self._packed(slots, out_of_band)
         self._results.note_sent(slots, response_columns(batch, slots, self._layout))
         return slots, packed
+
+    def _packed(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> Packed:
+        """Pack the arguments of steps that go out of band."""
+        chosen = slots[out_of_band.positions].tolist()
+        try:
+            for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
+                place = self._tables.record_of(slot).place
+                if place is not None:
+                    place.check_step(action, extras)
+            return out_of_band.positions, [
+                self._supervisor.packed(slot, content, "the response")
+                for slot, content in zip(chosen, out_of_band.contents, strict=True)
+            ]
+        except TypeError as error:
+            raise BadAction(str(error)) from error
 
     def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
         """Return the slots of a batch's envs; a batch that answers our results knows them."""
@@ -289,7 +305,7 @@ class Steps:
                 "results with batch.respond(action=...); nothing was sent"
             )
         slots = slots_of(batch, self._tables)
-        return self._dispatch.distinct(_answered(batch)) if slots is None else slots
+        return self._envs.chosen(_answered(batch)) if slots is None else slots
 
     def send(
         self, slots: NDArray[np.intp], packed: Packed | None, now: float, ticket: Ticket | None
@@ -314,9 +330,27 @@ class Steps:
         if b"\1" in resets.tobytes():
             requests.numbering.into_resets(slots, entries, resets)
         if packed is None:
-            self._dispatch.hand_over(slots, entries)
+            self._supervisor.hand_over(slots, entries)
         else:
-            self._dispatch.hand_over_steps(slots, entries, packed, resets)
+            self._hand_over(slots, entries, packed, resets)
+
+    def _hand_over(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        packed: Packed,
+        resets: NDArray[np.bool_],
+    ) -> None:
+        """Give issued steps to their hosts; without their arguments where they became resets."""
+        positions, arguments = packed
+        out_of_band = np.zeros(len(slots), np.bool_)
+        out_of_band[positions] = True
+        out_of_band &= ~resets
+        self._supervisor.hand_over(slots[~out_of_band], entries[~out_of_band])
+        kept = out_of_band[positions]
+        chosen = positions[kept]
+        arguments = [one for one, keep in zip(arguments, kept.tolist(), strict=True) if keep]
+        self._supervisor.hand_over(slots[chosen], entries[chosen], arguments)
 
     def _asks_a_place(self, slots: NDArray[np.intp]) -> bool:
         """Return True if any of `slots` belongs to a client, or will."""

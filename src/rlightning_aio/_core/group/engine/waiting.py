@@ -15,9 +15,11 @@ import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import TURN, Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import OF_HOSTS
+from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio._core.group.supervision.supervisor import LOOK_SECONDS
 from rlightning_aio._core.hosts.base import Executing, SelfStarting
 from rlightning_aio._core.hosts.spinner import Spinner
+from rlightning_aio.errors import EnvBusy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,7 +54,9 @@ class Waiting:
     def __init__(
         self, tables: Tables, supervisor: Supervisor, poller: Poller, intake: Intake
     ) -> None:
+        self._envs = tables.envs
         self._requests = tables.requests
+        self._lifetime = tables.lifetime
         self._conditions = tables.conditions
         self._supervisor = supervisor
         self._poller = poller
@@ -112,6 +116,54 @@ class Waiting:
             self.poll()  # An env that has replied is not hung, and owes nothing.
         self._supervisor.check(now)
         self.poll()
+
+    def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
+        """Raise an error if the group is closed, or an env of `slots` is busy or gone.
+
+        What was cancelled or aborted and still runs in an env is ended before, inline by executing
+        it.
+        """
+        self._lifetime.check_open()
+        while (slot := self._requests.first_not_idle(slots)) is not None:
+            if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
+                break
+        if slot is not None:
+            raise EnvBusy(
+                f"can't {what} {self._envs.describe(slot)}: {self._why_busy(slot)}; nothing was "
+                "sent"
+            )
+        # Last: the error of a worker that is gone may still have to be collected.
+        self._supervisor.check_usable(slots)
+
+    def _why_busy(self, slot: int) -> str:
+        state, owner = self._requests.state.item(slot), self._requests.owner.item(slot)
+        if owner == NOBODY:
+            return "what was cancelled or aborted still runs in it; try again when that has ended"
+        why = {
+            State.BUSY: "its last request has not replied yet",
+            State.READY: "the result of its last request was not collected",
+            State.SPENT: "its last request ended in an error that was not collected",
+        }[State(state)]
+        if owner == COLLECTOR:
+            others = self._driver.others()
+            return f"{why}{others}; collect it first, with collect_async(), or end it with drain()"
+        if state != State.BUSY:
+            why = "the call that asked it has not returned yet"
+        return f"{why}{self._driver.others()}; wait for that call first"
+
+    def _end_call(self, now: float, slot: int) -> bool:
+        """Note the end of a request of nobody that has ended since the group last waited.
+
+        In this process, it is executed now, after the requests that were sent before it. Returns
+        False if it has not ended.
+        """
+        self._driver.read()
+        self.intake.apply_completions()
+        while not self._requests.is_idle(slot) and self._poller.execute(1, None):
+            self.intake.apply_completions()
+        if not self._requests.is_idle(slot):  # Perhaps nobody waits who would replace its worker.
+            self.check(now)
+        return self._requests.is_idle(slot)
 
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
         """Wait once for `wanted` more replies, and return the time after it; the caller loops.

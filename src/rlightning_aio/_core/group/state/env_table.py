@@ -12,7 +12,7 @@ import numpy as np
 
 from rlightning_aio.batch.columns import EnvNames
 from rlightning_aio.config import makers_of
-from rlightning_aio.errors import UnknownEnv
+from rlightning_aio.errors import EnvBusy, UnknownEnv
 from rlightning_aio.registry import name_of
 
 if TYPE_CHECKING:
@@ -142,6 +142,14 @@ class EnvTable:
         except KeyError as missing:
             raise UnknownEnv(self._unknown(missing.args[0])) from None
 
+    def chosen(self, env_ids: Sequence[str] | None) -> NDArray[np.intp]:
+        """The slots of `env_ids`, or of all envs; `EnvBusy` if an id appears twice."""
+        slots = self.all if env_ids is None else self.find(env_ids)
+        if env_ids is not None and slots is not self.all and len(set(env_ids)) < len(slots):
+            double = next(id_ for k, id_ in enumerate(env_ids) if id_ in env_ids[:k])
+            raise EnvBusy(f"{double!r} appears twice in one call; nothing was sent")
+        return slots
+
     def find_one(self, env_id: str) -> int:
         """The slot of `env_id`; raises `UnknownEnv`."""
         try:
@@ -153,6 +161,14 @@ class EnvTable:
         ids = list(self._slot_of)
         known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")
         return f"no env of this group is called {env_id!r}; its envs are {known}"
+
+    def check_local(self, slots: NDArray[np.intp], what: str) -> None:
+        """Raise `NotImplementedError` if any of `slots` belongs to a client."""
+        if (remote := slots[slots >= self.num_local]).size:
+            raise NotImplementedError(
+                f"can't {what} {self.describe(int(remote[0]))}: clients answer resets and "
+                "steps only; nothing was sent"
+            )
 
     def describe(self, slot: int) -> str:
         """The name of an env in messages, with its entry, backend and task."""

@@ -169,6 +169,8 @@ class Supervisor:
             self._start_fault = None
             raise
         self._lifetime.begin()
+        self.overdue.begin(self.clock())
+        self.plan()
         _log.info("started within %.1f s: %s", self.clock() - now, self.workers.summary())
         return self.metas
 
@@ -322,6 +324,27 @@ class Supervisor:
                 if len(asked):
                     raise record.last_loss.refusal(asked)
 
+    def packed(self, slot: int, arguments: Any, what: str) -> Any:
+        """Return arguments as the host of `slot` sends them; `what` names them in an error."""
+        try:
+            return self._tables.record_of(slot).host.packed(arguments)
+        except Exception as error:
+            raise TypeError(
+                f"{what} for {self._envs.describe(slot)} can't be sent to its worker: {error}; "
+                "nothing was sent"
+            ) from error
+
+    def hand_over(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        arguments: Sequence[Any] | None = None,
+    ) -> None:
+        """Give issued requests to their hosts, one call per run of slots of the same host."""
+        for host_id, part in self._requests.put_in_flight(slots):
+            given = None if arguments is None else arguments[part]
+            self.submit(host_id, entries[part], given)
+
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
@@ -346,12 +369,7 @@ class Supervisor:
             moments += [due for r in self.records for due in (r.start_by, r.restart_at)]
         return min((moment for moment in moments if moment is not None), default=None)
 
-    def watch(self, now: float) -> None:
-        """Begin to look for envs that exceed a limit, or that owe a result for too long."""
-        self.overdue.begin(now)
-        self._plan()
-
-    def _plan(self) -> None:
+    def plan(self) -> None:
         """Set the time of the next look."""
         self.due = min(self.detector.due, self.overdue.due)
         self.patient.until = None if self.due == math.inf else self.due
@@ -371,7 +389,7 @@ class Supervisor:
         if now >= self.overdue.due:
             self.overdue.look(now)
         if now >= self.due:
-            self._plan()
+            self.plan()
 
     # -- deaths -------------------------------------------------------------------
 
