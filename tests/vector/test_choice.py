@@ -50,6 +50,10 @@ def own_task() -> Any:
         ("HalfCheetah-v5", 3, {}, MujocoVectorEnv),
         ("HalfCheetah-v5", 1, {}, MujocoVectorEnv),
         ("HalfCheetah-v5", 1, {"wrappers": CLIP}, SyncVectorEnv),
+        ("HalfCheetah-v5", 3, {"vectorization_mode": "async"}, VectorEnv),
+        ("HalfCheetah-v5", 3, {"wrappers": CLIP}, VectorEnv),
+        ("HalfCheetah-v5", 3, {"disable_env_checker": False}, VectorEnv),
+        ("HalfCheetah-v5", 3, INLINE, VectorEnv),
     ],
 )
 def test_each_task_comes_as_what_steps_it_fastest(

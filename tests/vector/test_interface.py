@@ -22,10 +22,8 @@ from gymnasium.error import (
     ResetNeeded,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import vector as wrappers
 from kit.scripted import Awaited
 from patience import HANG
-from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
 from rlightning_aio import sync
@@ -281,21 +279,6 @@ def test_attributes_of_the_vector_env() -> None:
     env.close()
 
 
-def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
-    """Also under wrappers: each step and reset of each env."""
-    env = wrappers.RecordEpisodeStatistics(
-        make_vec("CartPole-v1", 2, vector_kwargs={"placement": "inline"})
-    )
-    with env.unwrapped.group.trace(tmp_path / "run.json"):
-        env.reset(seed=0)
-        for _ in range(3):
-            env.step(np.zeros(2, np.int64))
-    env.close()
-    seen = Seen(tmp_path / "run.json")
-    for env_id in ("env-0", "env-1"):
-        assert [one.name for one in seen.of(env_id)] == ["reset", "step", "step", "step"]
-
-
 def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:
     """Wrappers, arguments of the task and of the vector env; the spec has those of the task."""
     kwargs = {"max_episode_steps": 9, "wrappers": [gym.wrappers.RecordEpisodeStatistics]}
@@ -478,37 +461,3 @@ def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
         env.close()
     finally:
         del gym.registry["served/Pendulum-v1"]
-
-
-@pytest.mark.parametrize(
-    "wrap",
-    [
-        wrappers.RecordEpisodeStatistics,
-        wrappers.NormalizeObservation,
-        wrappers.NormalizeReward,
-        wrappers.DictInfoToList,
-        lambda env: wrappers.RescaleObservation(env, -1.0, 1.0),
-        lambda env: wrappers.ClipReward(env, 0.2, 0.8),
-        wrappers.FlattenObservation,
-    ],
-)
-def test_vector_wrappers_have_the_same_effect_as_on_gymnasiums(wrap: Any) -> None:
-    """Over the ends of episodes."""
-
-    def make() -> Any:
-        return Sized(10, 3)
-
-    ours, theirs = (
-        wrap(VectorEnv([make] * 2, placement="inline")), wrap(SyncVectorEnv([make] * 2))
-    )  # fmt: skip
-    found, expected = [ours.reset(seed=2)], [theirs.reset(seed=2)]
-    for _ in range(20):
-        actions = theirs.action_space.sample()
-        found.append(ours.step(actions))
-        expected.append(theirs.step(actions))
-    for told in (*found, *expected):
-        if isinstance(told[-1], dict) and "episode" in told[-1]:
-            told[-1]["episode"].pop("t")
-    assert_alike(found, expected)
-    ours.close()
-    theirs.close()

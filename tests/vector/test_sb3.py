@@ -448,24 +448,6 @@ def test_has_attr_does_not_transfer_the_value() -> None:
     env.close()
 
 
-def test_sac_learns_identically_on_it() -> None:
-    """The same weights for the same seed, through `VecNormalize`."""
-    from stable_baselines3 import SAC
-    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
-
-    from rlightning_aio.sb3 import VecEnv
-
-    weights: list[Any] = []
-    for kind in (VecEnv, DummyVecEnv):
-        env = VecNormalize(
-            kind([pendulum] * 2), norm_reward=False
-        )  # Stable-Baselines3's are float32.
-        model = SAC("MlpPolicy", env, learning_starts=40, seed=1, device="cpu").learn(120)
-        weights.append(model.policy.state_dict())
-        env.close()
-    assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
-
-
 @pytest.mark.parametrize("task", ["CartPole-v1", "Hopper-v5"])  # Separate, and stepped together.
 def test_make_vec_env_takes_the_arguments_of_stable_baselines3s(task: str) -> None:
     """Other classes than its own and unknown arguments raise."""

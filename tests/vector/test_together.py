@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from gymnasium.error import (
     AlreadyPendingCallError,
-    ClosedEnvironmentError,
     ResetNeeded,
 )
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -29,31 +28,6 @@ INLINE: dict[str, Any] = {"placement": "inline"}
 PENDULUM = "InvertedPendulum-v5"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"vectorization_mode": "async"},
-        {"wrappers": [gym.wrappers.ClipAction]},
-        {"disable_env_checker": False},
-        INLINE,
-        {"placement": "process", "envs_per_process": 2},
-        {"max_concurrency": 2, "placement": "process"},
-    ],
-)
-def test_arguments_that_need_a_group_make_separate_envs(arguments: dict[str, Any]) -> None:
-    ours, theirs = make_vec(PENDULUM, 4, **arguments), make_vec(PENDULUM, 4)
-    assert isinstance(ours, VectorEnv)
-    assert isinstance(theirs, MujocoVectorEnv)
-    assert len(ours.group.env_ids) == ours.num_envs == 4
-    assert_alike(ours.reset(seed=[*range(0, 8, 2)]), theirs.reset(seed=[*range(0, 8, 2)]))
-    assert ours.get_attr("np_random_seed") == (0, 2, 4, 6)
-    for _ in range(9):
-        actions = theirs.action_space.sample()
-        assert_alike(ours.step(actions), theirs.step(actions))
-    ours.close()
-    theirs.close()
-
-
 def test_envs_that_are_stepped_together_need_no_group(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are one batch in this process, unless MuJoCo has no batches."""
     alone = make_vec(
@@ -69,18 +43,6 @@ def test_envs_that_are_stepped_together_need_no_group(monkeypatch: pytest.Monkey
     assert steps_together(gym.spec(PENDULUM), {})
     monkeypatch.setattr(mujoco_tasks, "version", lambda _: "3.12.0")
     assert not steps_together(gym.spec(PENDULUM), {})
-
-
-def test_a_batch_that_was_never_reset_or_is_closed_raises() -> None:
-    """With Gymnasium's errors."""
-    env: Any = make_vec(PENDULUM, 3)
-    actions = env.action_space.sample()
-    with pytest.raises(ResetNeeded):
-        env.step(actions)
-    env.close()
-    for use in (lambda: env.step(actions), env.snapshot, lambda: env.render_one(0)):
-        with pytest.raises(ClosedEnvironmentError, match="this MujocoVectorEnv is closed"):
-            use()
 
 
 @pytest.mark.parametrize("fields", [{}, INLINE], ids=["a batch", "separate"])

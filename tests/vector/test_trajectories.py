@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from contextlib import closing
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
@@ -190,69 +189,3 @@ def test_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
 def test_together_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
     """A thousand steps of each MuJoCo task, and of one in each mode."""
     compare_together(task, mode, 1000, "async", 150)
-
-
-@pytest.mark.simulators
-@pytest.mark.parametrize("task", TASKS)
-def test_beside_stable_baselines3s_processes(task: str) -> None:
-    """A thousand steps of each task: observations, rewards, dones, infos, and infos of resets."""
-    vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
-    if task.startswith("ALE/"):
-        pytest.importorskip("ale_py")
-    from rlightning_aio.sb3 import VecEnv
-
-    makers = makers_of(task)
-    # Forking leaves no fork server behind.
-    theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
-    with closing(theirs), closing(VecEnv(makers)) as ours:
-        compare_with_stable_baselines3(ours, theirs, task, makers)
-
-
-@pytest.mark.simulators
-@pytest.mark.parametrize("task", TOGETHER)
-def test_together_beside_stable_baselines3s_processes(task: str) -> None:
-    vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
-    from rlightning_aio.sb3 import make_vec_env
-
-    makers = [functools.partial(gym.make, task, max_episode_steps=150, render_mode="rgb_array")] * 4
-    theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
-    # Monitors round their infos differently, so compare the envs without them.
-    ours = make_vec_env(task, 4, env_kwargs={"max_episode_steps": 150}).venv
-    with closing(theirs), closing(ours):
-        compare_with_stable_baselines3(ours, theirs, task, makers)
-
-
-def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Convert numbers of infos to NumPy's, as in infos of simulations that are stepped together."""
-    kinds = {int: np.int64, float: np.float64}
-    return [{key: kinds.get(type(v), lambda v: v)(v) for key, v in info.items()} for info in infos]
-
-
-def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: list[Any]) -> None:
-    """A thousand steps of both, and of a plain loop."""
-    together = not isinstance(ours.envs, VectorEnv)  # A batch.
-    actions = actions_for(theirs.action_space, 1000, len(makers))
-    for env in (ours, theirs):
-        env.seed(SEED)
-    plain = looped(makers, AutoresetMode.SAME_STEP, actions)
-    found = ours.reset()
-    assert_alike(found, theirs.reset())
-    assert_alike(found, next(plain)[0])
-    ends = 0
-    for turn, (each, of_loop) in enumerate(zip(actions, plain, strict=True)):
-        *found, lazy = ours.step(each)
-        found = (*found, list(lazy))
-        *expected, infos = theirs.step(each)
-        expected[1] = expected[1].astype(np.float64)  # Rewards of some tasks are ints.
-        infos, reset_infos = list(infos), list(theirs.reset_infos)
-        if together:
-            infos, reset_infos = (as_numpys(told) for told in (infos, reset_infos))
-        assert_alike(found, (*expected, infos), f"{task}, {turn}")
-        assert_alike(ours.reset_infos, reset_infos, f"{task}, {turn}")
-        observations, rewards, terminated, truncated, last = of_loop
-        assert_alike(found[:3], (observations, rewards, terminated | truncated), f"{task}, {turn}")
-        for info, observation, done in zip(found[3], last, found[2], strict=True):
-            if done:
-                assert_alike(info["terminal_observation"], observation, f"{task}, {turn}")
-                ends += 1
-    assert ends > 2

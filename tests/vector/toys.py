@@ -51,7 +51,7 @@ class Toy(gym.Env[Any, Any]):
 
 
 class Mortal(gym.Env[Any, Any]):
-    """Counts steps; some actions end its episode, or the life of its worker, or raise.
+    """Counts steps; some actions end its episode, or the life of its worker.
 
     Without `dies`, it is what a program is to see of that: an episode that is cut short.
     """
@@ -60,8 +60,8 @@ class Mortal(gym.Env[Any, Any]):
     action_space = spaces.Discrete(8)
     observation_space = spaces.Box(-1, 100, (3,), np.float64)
 
-    def __init__(self, index: int, *, dies: bool, raises: bool = False) -> None:
-        self.index, self.dies, self.raises = index, dies, raises
+    def __init__(self, index: int, *, dies: bool) -> None:
+        self.index, self.dies = index, dies
 
     def _observed(self) -> Any:
         return np.array([self.index, self.count, self.sum], np.float64)
@@ -72,8 +72,6 @@ class Mortal(gym.Env[Any, Any]):
 
     def step(self, action: Any) -> Any:
         if action in (self.DIE, self.HANG):
-            if self.raises:
-                raise ValueError("as asked")
             if self.dies:
                 while True:  # The signal that requests stacks doesn't end a hang.
                     os.kill(os.getpid(), signal.SIGKILL) if action == self.DIE else signal.pause()
