@@ -12,14 +12,12 @@ import time
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-from gymnasium import spaces
-from kit.scripted import Awaitable, Counts
+from kit.scripted import Awaitable
 
 from rlightning_aio.errors import EnvError
 from rlightning_aio.spaces import Anything
 
-__all__ = ["AwaitedRoom", "CountedRoom", "Room"]
+__all__ = ["AwaitedRoom", "Room"]
 
 
 class Room(gym.Env[Any, Any]):
@@ -95,13 +93,3 @@ class AwaitedRoom(Awaitable):
     async def stall(self) -> None:
         """Something that does not return."""
         await asyncio.sleep(3600)
-
-
-class CountedRoom(Counts):
-    """Its observation is the seed, and the number of steps; three steps end it."""
-
-    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    length = 3
-
-    def observed(self) -> Any:
-        return np.array([self.seed, self.steps], np.float64)

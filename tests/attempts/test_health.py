@@ -21,17 +21,6 @@ def in_an_outage(env_id: str = "") -> Health:
     return health
 
 
-def test_nothing_is_waited_for_once_the_pause_is_over() -> None:
-    """Then an attempt begins as soon as an env is free."""
-    health = in_an_outage()
-    assert health.seconds_left(10.25) == 0.25
-    assert not health.may_begin(10.25)
-    assert health.may_begin(10.5)
-    assert health.seconds_left(10.5) is None
-    health.note_begin(10.5)
-    assert health.seconds_left(10.5) == 1.0
-
-
 def test_an_outage_names_an_env_only_if_envs_fail(caplog: pytest.LogCaptureFixture) -> None:
     in_an_outage()
     in_an_outage("box-1")

@@ -6,10 +6,8 @@ import asyncio
 import contextlib
 import gc
 import itertools
-import json
 import math
 import os
-import signal
 import threading
 import time
 import tracemalloc
@@ -19,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from attempts.room import AwaitedRoom, CountedRoom
+from attempts.room import AwaitedRoom
 from attempts.rooms import PLACES, rooms
 from kit.counting import ClientThread, CountingEnv
 from patience import HANG
@@ -31,7 +29,7 @@ from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.attempts.rules import is_unnamed
-from rlightning_aio.errors import EnvBusy, EpisodeLost, WorkerDied
+from rlightning_aio.errors import EnvBusy, EpisodeLost
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -117,26 +115,6 @@ async def test_a_failed_attempt_is_tried_again(
         bystanders = {*attempts[0].failures, *attempts[1].failures} - {*failed}
         assert all(one.blame == "infrastructure" for one in bystanders)
         assert attempts[0].outcome.attempt == len(attempts[0].failures)
-
-
-async def test_a_failure_has_no_reward(place: dict[str, Any]) -> None:
-    """However much it has earned, and whatever its agent returns."""
-
-    async def agent(episode: AttemptEpisode) -> str:
-        await episode.step(7)
-        with contextlib.suppress(rl.EnvRaised):
-            await episode.step("raise")
-        return "I have won"
-
-    async with rooms(place) as group:
-        (attempts,) = await played(group, tasks(1), agent, 2, Rules(retries=1))
-    assert not attempts.is_complete
-    for attempt in attempts:
-        assert (attempt.reward, attempt.result) == (None, None)
-        assert attempt.rewards == [7.0]
-        assert attempt.outcome.kind == "env_raised"
-        assert [one.kind for one in attempt.failures] == ["env_raised"]
-    assert attempts.rewards == []
 
 
 async def test_what_the_policy_is_to_blame_for_is_not_tried_again(place: dict[str, Any]) -> None:
@@ -290,32 +268,6 @@ async def test_what_an_agent_leaves_to_a_task_of_its_own_ends_with_the_attempt(w
         assert task.cancelled() or isinstance(task.exception(), EpisodeLost)
 
 
-async def test_an_agent_that_ignores_its_end_does_not_keep_its_env() -> None:
-    """It can't step it any more; the next attempt has it."""
-    go_on, refused = asyncio.Event(), asyncio.Event()
-
-    async def agent(episode: AttemptEpisode) -> None:
-        waiting.append(episode)
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.Event().wait()
-        await go_on.wait()
-        with pytest.raises(rl.RLightningError, match="is over"):
-            await episode.step(1)
-        refused.set()
-
-    waiting: list[AttemptEpisode] = []
-    async with rooms(PLACES["loop"], num_workers=1) as group:
-        limits = iter(LIMITS)
-        while not waiting:
-            rules = Rules(attempt_timeout=next(limits), retries=0)
-            ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
-        assert attempt.outcome.kind == "timed_out"
-        ((attempt,),) = await played(group, tasks(1), earner)
-        assert attempt.outcome.kind == "terminated"
-        go_on.set()
-        await refused.wait()
-
-
 async def test_the_surplus_is_cancelled_into_the_env(place: dict[str, Any]) -> None:
     """The first two of four make a group; the others' steps end with it."""
     if place is PLACES["inline"] or place is PLACES["shared workers"]:
@@ -356,44 +308,6 @@ async def test_tasks_are_read_as_envs_become_free() -> None:
     assert len(asyncio.all_tasks()) == 1
 
 
-async def test_no_more_play_at_once_than_allowed() -> None:
-    playing = most = 0
-
-    async def agent(episode: AttemptEpisode) -> None:
-        nonlocal playing, most
-        playing += 1
-        most = max(most, playing)
-        await earner(episode)
-        playing -= 1
-
-    async with rooms(PLACES["loop"], num_workers=8) as group:
-        await played(group, tasks(5), agent, 4, Rules(max_concurrency=3))
-    assert most == 3
-
-
-@pytest.mark.parametrize("how", ["close", "cancel"])
-async def test_nothing_is_left_of_an_iterator_that_is_left(place: dict[str, Any], how: str) -> None:
-    if place.get("placement") == "inline":
-        pytest.skip("a step that hangs here is the end of the test")
-    hanging = asyncio.Event()
-
-    async def agent(episode: AttemptEpisode) -> None:
-        asyncio.get_running_loop().call_later(0.05, hanging.set)
-        await episode.step("hang")
-
-    async with rooms(place) as group:
-        groups = play(group, tasks(9), agent, size=2)
-        waiting = asyncio.ensure_future(anext(groups))
-        await hanging.wait()
-        waiting.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await waiting
-        if how == "close":
-            await groups.aclose()
-        assert group.pending == []
-        assert len(await played(group, tasks(3), earner)) == 3
-
-
 @pytest.mark.parametrize("retries", [0, 2])
 async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
     async def agent(episode: AttemptEpisode) -> None:
@@ -403,40 +317,6 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
         with pytest.raises(rl.WorkerDied) as caught:
             await played(group, tasks(9), agent, 2, Rules(retries=retries))
     assert any("it played attempt" in note and "seed=" in note for note in caught.value.__notes__)
-
-
-async def test_the_envs_methods_can_be_called(place: dict[str, Any]) -> None:
-
-    async def agent(episode: AttemptEpisode) -> int:
-        answer = await episode.call("tool", 21)
-        episode.finish()
-        return answer
-
-    async with rooms(place) as group:
-        ((attempt,),) = await played(group, tasks(1), agent)
-    assert attempt.result == 42
-    assert (attempt.outcome.kind, attempt.reward) == ("truncated", 0.0)
-    assert "finished" in attempt.outcome.cause
-
-
-@pytest.mark.parametrize("name", ["loop", "awaitable in workers", "workers"])
-async def test_a_call_that_is_cut_off_does_not_keep_its_env(name: str) -> None:
-    """The next attempt gets the env, although the method never returns."""
-    calls = [asyncio.Event() for _ in range(3)]
-
-    async def agent(episode: AttemptEpisode) -> None:
-        if episode.index == 0:
-            calls[episode.spec.seed].set()
-            await episode.call("stall")
-        await calls[episode.spec.seed].wait()
-        episode.finish()
-
-    async with rooms(PLACES[name], 2) as group:
-        playing = played(group, tasks(3), agent, 2, Rules(first=1))
-        found = await asyncio.wait_for(playing, HANG)
-        assert group.pending == []
-    kinds = [[attempt.outcome.kind for attempt in attempts] for attempts in found]
-    assert kinds == [["cancelled", "truncated"]] * 3
 
 
 @pytest.mark.parametrize("deed", ["reset", "step", "call"])
@@ -465,22 +345,6 @@ async def cut_off_and_play_on(group: rl.EnvGroup, deed: str) -> None:
     assert (attempt.outcome.kind, attempt.reward) == ("terminated", 5.0)
 
 
-async def test_a_call_is_not_answered_by_another_episode() -> None:
-    """The env's worker has died, and was replaced."""
-
-    async def agent(episode: AttemptEpisode) -> str:
-        os.kill(episode.last.observation["pid"], signal.SIGKILL)
-        with contextlib.suppress(WorkerDied):
-            await episode.call("tool", 1)
-        with pytest.raises(EpisodeLost, match="killed by SIGKILL"):
-            await episode.call("tool", 1)
-        return "done"
-
-    async with rooms(PLACES["workers"], 1) as group:
-        ((attempt,),) = await played(group, tasks(1), agent, 1, Rules(retries=0))
-    assert (attempt.outcome.kind, attempt.reward, attempt.result) == ("env_died", None, None)
-
-
 def served(*names: str) -> dict[str, Any]:
     kwargs = {"clients": list(names), "connect_timeout": HANG}
     return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
@@ -497,12 +361,7 @@ async def test_clients_of_an_env_server_play() -> None:
         return episode.env_id
 
     playing = set[str]()
-    server = {
-        "name": "robots",
-        "backend": "env_server",
-        "env_kwargs": {"clients": ["c0", "c1", "c2"], "connect_timeout": HANG},
-    }
-    async with rl.build_env_group(server) as group:
+    async with rl.build_env_group(served("c0", "c1", "c2")) as group:
         handle: Any = group["robots-0"]
         address: str = handle.address
         clients = [ClientThread(address, "c0", CountingEnv(0))]
@@ -520,32 +379,6 @@ async def test_clients_of_an_env_server_play() -> None:
         await asyncio.to_thread(client.join)
 
 
-async def test_a_task_waits_for_the_first_client_of_its_entry() -> None:
-    """It is read while an env of another entry is there."""
-
-    async def agent(episode: AttemptEpisode) -> str:
-        await episode.step([0.0, 0.0])
-        episode.finish()
-        return episode.env_id
-
-    server = {
-        "name": "robots",
-        "backend": "env_server",
-        "env_kwargs": {"clients": ["c0"], "connect_timeout": HANG},
-    }
-    local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
-    specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(["here", "robots"])]
-    found: list[str] = []
-    async with rl.build_env_group([local, server]) as group:
-        handle: Any = group["robots-0"]
-        async for (attempt,) in play(group, specs, agent):
-            found.append(attempt.result)
-            if len(found) == 1:
-                client = ClientThread(handle.address, "c0", CountingEnv(0))
-    assert found == ["here-0", "robots-0/c0"]
-    client.join()
-
-
 async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() -> None:
     """However many wait; all are played when it comes."""
 
@@ -554,16 +387,11 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
         episode.finish()
         return episode.env_id
 
-    server = {
-        "name": "robots",
-        "backend": "env_server",
-        "env_kwargs": {"clients": ["c0"], "connect_timeout": HANG},
-    }
     local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
     order = [*["robots"] * 4, *["here"] * 3]
     specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(order)]
     found: list[str] = []
-    async with rl.build_env_group([local, server]) as group:
+    async with rl.build_env_group([local, served("c0")]) as group:
         handle: Any = group["robots-0"]
         async with asyncio.timeout(HANG):
             async for attempts in play(group, specs, agent, size=2):
@@ -572,39 +400,6 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
                     client = ClientThread(handle.address, "c0", CountingEnv(0))
     assert found == ["here-0"] * 6 + ["robots-0/c0"] * 8
     client.join()
-
-
-async def test_it_continues_from_a_file(tmp_path: Path) -> None:
-    """Each attempt is in the file once, and is played once."""
-    path = tmp_path / "attempts.jsonl"
-    count = 0
-
-    async def agent(episode: AttemptEpisode) -> None:
-        nonlocal count
-        count += 1
-        await earner(episode)
-
-    async with rooms(PLACES["loop"], num_workers=2) as group:
-        with ResultsFile(path, {"model": "m"}) as results:
-            groups = play(group, tasks(6), agent, size=2, results=results)
-            async with contextlib.aclosing(groups):
-                async for _ in groups:
-                    if len(results) >= 5:
-                        break
-        before = count
-        with ResultsFile(path, {"model": "m"}) as results:
-            known = len(results)
-            left = await played(group, tasks(6), agent, 2, results=results)
-    assert before >= known >= 5
-    assert count - before == 12 - known
-    lines = [json.loads(line) for line in path.read_text().splitlines()][1:]
-    lines = [line for line in lines if "seed" in line]  # Others say what was handed out.
-    assert sorted((line["seed"], line["index"]) for line in lines) == [
-        (seed, index) for seed in range(6) for index in range(2)
-    ]
-    assert all(line["reward"] == 5.0 * line["seed"] for line in lines)
-    assert {attempts.spec.seed for attempts in left} <= {*range(6)}
-    assert all(attempts.is_complete and len(attempts) == 2 for attempts in left)
 
 
 async def test_a_file_has_each_task_once(tmp_path: Path) -> None:
@@ -657,38 +452,6 @@ def test_bad_rules(wrong: dict[str, Any]) -> None:
         Rules(**wrong)
 
 
-@pytest.mark.parametrize(
-    ("fields", "options"),
-    [
-        ({"envs_per_process": 1}, {"zero_copy": True}),
-        ({"envs_per_process": 2}, {"zero_copy": True}),
-        ({"placement": "inline"}, {"zero_copy": True}),
-        ({"max_episode_steps": 3}, {}),
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("traced", [False, True])
-async def test_with_other_options(
-    fields: dict[str, Any], options: dict[str, Any], traced: bool, tmp_path: Path
-) -> None:
-    """Observations are those of the attempt, also after others have played on its env."""
-
-    async def agent(episode: AttemptEpisode) -> None:
-        while not episode.is_over:
-            await episode.step(1)
-
-    group = rl.build_env_group(CountedRoom, name="c", num_workers=2, **fields, **options)
-    async with group:
-        trace = group.trace(tmp_path / "t.json") if traced else contextlib.nullcontext()
-        with trace, group.auto_reset(fields.get("max_episode_steps", math.inf)):
-            found = await played(group, tasks(6), agent, size=2)
-    for attempts in found:
-        for attempt in attempts:
-            assert attempt.outcome.kind == "terminated"
-            assert attempt.first.tolist() == [attempts.spec.seed, 0]
-            assert attempt.last.tolist() == [attempts.spec.seed, 3]
-
-
 def test_a_last_info_without_a_verdict_has_none() -> None:
     """The first info of the next episode has none about the last one."""
     both = {"success": False, "final_info": {"reward": 1.0}}
@@ -720,21 +483,6 @@ async def test_no_reward_is_a_failure_of_the_env(place: dict[str, Any], reward: 
         assert failed.cause.startswith("returned")
 
 
-@pytest.mark.parametrize("limit", [None, math.inf])
-async def test_a_step_after_the_end_raises(place: dict[str, Any], limit: float | None) -> None:
-    """Also inside `auto_reset`, where it would begin another episode."""
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await earner(episode)
-        with pytest.raises(rl.RLightningError, match="has ended after 5 steps"):
-            await episode.step(7)
-
-    async with rooms(place) as group:
-        with contextlib.nullcontext() if limit is None else group.auto_reset(limit):
-            (attempts,) = await played(group, tasks(3)[2:], agent, size=2)
-    assert attempts.rewards == [10.0] * 2
-
-
 async def test_columns_and_actions_are_copied() -> None:
     """An agent may go on with the list that it has given away."""
 
@@ -752,18 +500,6 @@ async def test_columns_and_actions_are_copied() -> None:
     assert [one["reward"] for one in attempt.columns["action"]] == attempt.rewards
     assert attempt.columns["tokens"] == [[*range(k + 1)] for k in range(5)]
     assert [one["ids"][0][0] for one in attempt.columns["nested"]] == [0, 1, 2, 3, 4]
-
-
-@pytest.mark.parametrize("steps", [0, 2])
-async def test_an_agent_that_returns_early_has_no_reward(place: dict[str, Any], steps: int) -> None:
-    async def agent(episode: AttemptEpisode) -> None:
-        for _ in range(steps):
-            await episode.step(1)
-
-    async with rooms(place) as group:
-        ((attempt,),) = await played(group, tasks(1), agent)
-    assert (attempt.outcome.kind, attempt.outcome.blame) == ("agent_stopped", "caller")
-    assert (attempt.reward, attempt.length, attempt.failures) == (None, steps, ())
 
 
 @pytest.mark.parametrize(("reward", "steps"), [(None, 2), (7, 2), (-1.0, 5)])
@@ -1296,7 +1032,7 @@ async def test_what_is_not_asynchronous_is_refused() -> None:
 
     wrong: Any = agent
     refused = pytest.raises(TypeError, match=r"needs an asynchronous group.*not EnvGroup of .*sync")
-    with sync.build_env_group(CountedRoom, num_workers=1, placement="inline") as group, refused:
+    with sync.build_env_group("CartPole-v1", placement="inline") as group, refused:
         await played(group, tasks(1), earner)
     async with rooms(PLACES["loop"]) as group:
         with pytest.raises(TypeError, match="returned 7; it must be a coroutine function"):
