@@ -1,24 +1,20 @@
-"""`auto_reset`: the step limit, the ends of episodes, and resets in place of steps."""
+"""`auto_reset`: what it does, and refuses; that it does that always, random programs show."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from kit.scripted import Counts
 
-from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
+from rlightning_aio import BatchedData, PolicyResponse, sync
 
 # Resets depend on results only, not on the driver.
 pytestmark = pytest.mark.one_driver_for_each_place
 
-DO_NOTHING, END, TRUNCATE, RAISE = range(4)
+DO_NOTHING, END, TRUNCATE = range(3)
 ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}
 IDS = [f"probe-{k}" for k in range(3)]
 
@@ -49,57 +45,6 @@ async def test_a_limit_of_three_has_a_period_of_four_calls(start: Any) -> None:
                 assert (batch.observation[:, 3] == -1).all() == (period > 0 or call == 4)
 
 
-async def test_collected_results_follow_the_same_limit(start: Any) -> None:
-    """Each env has its own count, in any order of results."""
-    group = await start(ENTRY)
-    batch, _ = await group.reset()
-    calls = dict.fromkeys(IDS, 0)
-    with group.auto_reset(max_episode_steps=2):
-        group.step_async(responses(*IDS))
-        while sum(calls.values()) < 40:
-            batch, flags = await group.collect_async(min_results=2)
-            for env_id, flag, steps in zip(batch.ids(), flags, steps_of(batch), strict=True):
-                calls[env_id] += 1
-                assert (flag, steps) == (calls[env_id] % 3 == 2, calls[env_id] % 3)
-            group.step_async(responses(*batch.ids()))
-        batch, _ = await group.collect_async(wait_all=True)
-    assert len(batch) == 3
-
-
-async def test_only_envs_of_the_batch_advance(start: Any) -> None:
-    """The counters of other envs don't change, and a reset sets a counter to 0."""
-    group = await start(ENTRY)
-    await group.reset()
-    with group.auto_reset(max_episode_steps=2):
-        assert (await group.step(responses("probe-0", "probe-1")))[1] == [False, False]
-        assert (await group.step(responses("probe-2", "probe-0")))[1] == [False, True]
-        await group.reset(env_ids=["probe-1"])
-        batch, flags = await group.step(responses(*IDS))
-        assert flags == [False, False, True]
-        assert steps_of(batch) == [0, 1, 2]
-        await group["probe-2"].reset()
-        batch, flags = await group.step(responses("probe-2"))
-        assert (steps_of(batch), flags) == ([1], [False])
-
-
-async def test_counters_also_run_outside_the_context(start: Any) -> None:
-    """A limit that was passed takes effect at once; nothing is reset after the context."""
-    group = await start(ENTRY)
-    await group.reset()
-    for _ in range(3):
-        _, flags = await group.step(responses(*IDS))
-        assert flags is None
-    with group.auto_reset(max_episode_steps=4):
-        assert (await group.step(responses("probe-0")))[1] == [True]
-    batch, flags = await group.step(responses("probe-0"))
-    assert (steps_of(batch), flags) == ([5], None)
-    with group.auto_reset(max_episode_steps=2):
-        batch, flags = await group.step(responses("probe-1"))
-        assert (steps_of(batch), flags) == ([4], [True])
-        batch, flags = await group.step(responses("probe-1"))
-        assert (steps_of(batch), flags) == ([0], [False])
-
-
 @pytest.mark.parametrize("what", [END, TRUNCATE])
 async def test_an_env_whose_episode_ended_is_reset(start: Any, what: int) -> None:
     """The next call resets it, without a flag; `on_done=False` leaves it to the caller."""
@@ -117,34 +62,6 @@ async def test_an_env_whose_episode_ended_is_reset(start: Any, what: int) -> Non
         for steps, flag in ((1, False), (2, False), (3, True), (0, False)):
             batch, flags = await group.step(responses("probe-0", what=what))
             assert (steps_of(batch), flags) == ([steps], [flag])
-
-
-@pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_a_context_begins_with_the_last_results_and_forgets_what_was_due(
-    start: Any, what: int
-) -> None:
-    """An end that was seen before the context counts, one that an earlier context saw doesn't."""
-    group = await start(ENTRY)
-    await group.reset()
-    await group.step(responses("probe-0", what=what))  # These end before the first context.
-    with group.auto_reset(max_episode_steps=3):
-        batch, flags = await group.step(responses(*IDS, what=what))
-        assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
-        batch, flags = await group.step(responses(*IDS, what=what))
-        assert (steps_of(batch), flags) == ([1, 0, 0], [False] * 3)
-    with group.auto_reset(max_episode_steps=9, on_done=False):
-        batch, _ = await group.step(responses("probe-0"))
-        assert steps_of(batch) == [2], "outside a context, the caller handles ends"
-    with group.auto_reset(max_episode_steps=2):
-        batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([3, 1, 1], [True, False, False])
-        batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([0, 2, 2], [False, True, True])
-    batch, _ = await group.step(responses("probe-2"))
-    assert steps_of(batch) == [3], "steps outside a context have no flags"
-    with group.auto_reset(max_episode_steps=4, on_done=False):
-        batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([1, 3, 4], [False, False, True])
 
 
 async def test_each_entry_has_its_own_limit(start: Any) -> None:
@@ -178,48 +95,6 @@ async def test_envs_that_reset_themselves_keep_to_their_limit(start: Any) -> Non
             before = batch.done
             at_different_times |= bool(before.any() and not before.all())
     assert at_different_times
-
-
-@pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_without_a_limit_episodes_end_by_themselves(start: Any, what: int) -> None:
-    """An env without a limit is allowed, and no result is flagged."""
-    group = await start(ENTRY)
-    await group.reset()
-    with group.auto_reset(math.inf):
-        for steps in range(1, 30):
-            batch, flags = await group.step(responses(*IDS))
-            assert (steps_of(batch), flags) == ([steps] * 3, [False] * 3)
-        await group.step(responses("probe-1", what=what))
-        batch, flags = await group.step(responses(*IDS))
-        assert (steps_of(batch), flags) == ([30, 0, 30], [False] * 3)
-    with group.auto_reset(max_episode_steps=31):
-        assert (await group.step(responses(*IDS)))[1] == [True, False, True]
-
-
-class Brief(Counts):
-    """Every episode ends with the third step."""
-
-    observation_space, length = gym.spaces.Box(0, 9, (), np.int64), 3
-
-    def observed(self) -> Any:
-        return np.array(self.steps)
-
-
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-@pytest.mark.parametrize("limit", [3, 5])
-async def test_a_limit_counts_the_steps_of_one_episode(
-    start: Any, limit: int, mode: AutoresetMode
-) -> None:
-    """Steps of the previous episode don't count, even if the env resets itself in between."""
-    make = partial(SyncVectorEnv, [Brief] * 2, autoreset_mode=mode)
-    group = await start({"name": "v", "task": make})
-    with group.auto_reset(limit):
-        batch, _ = await group.reset()
-        for turn in range(1, 14):
-            batch, flags = await group.step(batch.respond(action=0 * batch.observation))
-            assert flags == [False]
-            in_turn = turn % (3 if mode == AutoresetMode.SAME_STEP else 4)
-            assert batch.observation.reshape(-1).tolist() == [in_turn] * 2
 
 
 def test_a_limit_is_a_positive_int_or_infinite() -> None:
@@ -271,16 +146,3 @@ async def test_contexts_do_not_nest_and_an_exception_leaves(start: Any) -> None:
     async with group.auto_reset(3):
         assert (await group.step(responses("probe-0")))[1] == [True]
     assert (await group.step(responses("probe-0")))[1] is None
-
-
-async def test_a_step_that_raises_does_not_count(start: Any) -> None:
-    """The step was not completed."""
-    group = await start(ENTRY)
-    await group.reset()
-    with group.auto_reset(2):
-        await group.step(responses("probe-0"))
-        with pytest.raises(EnvRaised):
-            await group.step(responses("probe-0", what=RAISE))
-        assert (await group.step(responses("probe-0")))[1] == [True]
-        batch, _ = await group.step(responses("probe-0", what=RAISE))
-        assert steps_of(batch) == [0], "the action of a reset is ignored"

@@ -19,18 +19,15 @@ import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio import (
     BatchedData,
-    EnvBusy,
-    NothingPending,
     PolicyResponse,
 )
-from rlightning_aio.errors import GroupClosed, RLightningError
+from rlightning_aio.errors import GroupClosed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
     from pathlib import Path
 
 IDS = [f"gated-{k}" for k in range(4)]
-RAISE = 3
 
 
 def responses(*indices: int) -> BatchedData:
@@ -87,18 +84,6 @@ async def open_gates(*gates: Gate) -> None:
 
 
 # -- the rules, synchronously
-
-
-def test_the_first_ready_result_is_enough(sync_group: Any, gates: list[Gate]) -> None:
-    """The others stay pending; later calls return them."""
-    sync_group.step_async(responses(2, 0))
-    with opened(gates[2]):
-        batch, flags = sync_group.collect_async()
-    assert (batch.ids(), flags) == (["gated-2"], [False])
-    with opened(gates[0]):
-        assert sync_group.collect_async()[0].ids() == ["gated-0"]
-    with pytest.raises(NothingPending):
-        sync_group.collect_async()
 
 
 def test_a_collect_respects_its_minimum_and_maximum(sync_group: Any, gates: list[Gate]) -> None:
@@ -194,16 +179,6 @@ def test_invalid_arguments_are_refused(rules: dict[str, Any], said: str) -> None
 # -- awaited
 
 
-async def test_results_are_ordered_by_readiness(group: Any, gates: list[Gate]) -> None:
-    """Independent of the order of the requests."""
-    group.step_async(responses(0, 1, 2, 3))
-    for k in (2, 0, 3, 1):
-        waiting = asyncio.create_task(group.collect_async(timeout=0.01))
-        await open_gates(gates[k])
-        batch, _ = await waiting
-        assert batch.ids() == [IDS[k]]
-
-
 async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gate]) -> None:
     """In the order of the group. The window closes early when nothing more can come."""
     group.step_async(responses(0, 1, 2))
@@ -232,51 +207,6 @@ async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate
     assert sorted(batch.ids()) == IDS[:3]
 
 
-async def test_a_cancelled_step_is_collected(group: Any, gates: list[Gate]) -> None:
-    """The envs have their requests; the next collect returns the results."""
-    stepping = asyncio.create_task(group.step(responses(0, 1)))
-    await asyncio.sleep(0)
-    stepping.cancel()
-    await asyncio.wait([stepping])
-    await open_gates(gates[0], gates[1])
-    batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(batch.ids()) == IDS[:2]
-
-
-async def test_the_value_of_a_cancelled_call_is_dropped(group: Any, gates: list[Gate]) -> None:
-    """Nothing is pending; the env can be used once it has replied."""
-    stepping = asyncio.create_task(group.step(responses(0)))
-    await asyncio.sleep(0)
-    calling = asyncio.create_task(group["gated-1"].call("wait_at_gate"))
-    while "gated-1" not in group.pending:  # noqa: ASYNC110
-        await asyncio.sleep(0)
-    calling.cancel()
-    await asyncio.wait([calling])
-    with pytest.raises(NothingPending):
-        await group.collect_async()
-    with pytest.raises(EnvBusy):
-        await group["gated-1"].call("double", 1)
-    await open_gates(gates[1], gates[0])
-    assert (await stepping)[0].ids() == ["gated-0"]
-    while True:  # The env is free once its reply was read, and nothing reports that.
-        try:
-            assert await group["gated-1"].call("double", 1) == 2
-            break
-        except EnvBusy:
-            await group["gated-2"].call("double", 1)
-
-
-async def test_a_second_collect_at_the_same_time_is_refused(group: Any, gates: list[Gate]) -> None:
-    """The first one gets its result."""
-    group.step_async(responses(0))
-    first = asyncio.create_task(group.collect_async())
-    await asyncio.sleep(0)
-    with pytest.raises(RLightningError, match="one collector at a time"):
-        await group.collect_async()
-    await open_gates(gates[0])
-    assert (await first)[0].ids() == ["gated-0"]
-
-
 async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gate]) -> None:
     """A step, a reset, a method call and a collect at once each return with their own envs."""
     group.step_async(responses(0))
@@ -292,61 +222,6 @@ async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gat
     assert (await stepping)[0].ids() == ["gated-1"]
     await open_gates(gates[0])
     assert (await collecting)[0].ids() == ["gated-0"]
-
-
-async def test_a_collect_returns_results_of_requests_sent_while_it_waits(
-    group: Any, gates: list[Gate]
-) -> None:
-    """From a worker that was idle when the collect began."""
-    group.step_async(responses(0))
-    collecting = asyncio.create_task(group.collect_async())
-    await asyncio.sleep(0)
-    group.step_async(responses(3))
-    await open_gates(gates[3])
-    assert (await collecting)[0].ids() == ["gated-3"]
-    await open_gates(gates[0])
-    assert (await group.collect_async())[0].ids() == ["gated-0"]
-
-
-async def test_a_collect_returns_results_of_a_cancelled_call(group: Any, gates: list[Gate]) -> None:
-    """Including those that had arrived before the cancellation."""
-    group.step_async(responses(0))
-    stepping = asyncio.create_task(group.step(responses(1, 2)))
-    await asyncio.sleep(0)
-    collecting = asyncio.create_task(group.collect_async())
-    await open_gates(gates[1])
-    await group["gated-3"].call("double", 1)
-    stepping.cancel()
-    assert (await collecting)[0].ids() == ["gated-1"]
-    await open_gates(gates[0], gates[2])
-    batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(batch.ids()) == ["gated-0", "gated-2"]
-
-
-async def test_inline_envs_are_served_while_others_are_waited_for(
-    tmp_path: Path, gates: list[Gate]
-) -> None:
-    """A request to an inline env wakes a collect that waits for a worker."""
-    inline = {
-        "name": "here",
-        "backend": "probe",
-        "task": "x",
-        "placement": "inline",
-        "num_workers": 2,
-    }
-    async with rlightning_aio.build_env_group([entry(tmp_path, num_workers=1), inline]) as group:
-        await group.reset()
-        group.step_async(responses(0))
-        collecting = asyncio.create_task(group.collect_async())
-        await asyncio.sleep(0)
-        group.step_async(BatchedData(["here-1"], [PolicyResponse("here-1", [0, 5])]))
-        assert (await collecting)[0].ids() == ["here-1"]
-        collecting = asyncio.create_task(group.collect_async())
-        await asyncio.sleep(0)
-        assert (await group["here-0"].step([0, 6])).last_reward == 6
-        assert not collecting.done()
-        await open_gates(gates[0])
-        assert (await collecting)[0].ids() == ["gated-0"]
 
 
 async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:
