@@ -1,8 +1,4 @@
-"""Hosts without a process, and a driver without a clock, for tests of the core.
-
-The behaviour of a fake env is a function of its action, so a model can predict it. Its observations
-contain its identity and its history.
-"""
+"""Hosts without a process, and a driver without a clock, for tests of the core."""
 
 from __future__ import annotations
 
@@ -37,15 +33,13 @@ from rlightning_aio._core.hosts.messages import (
     Death,
     Died,
     EnvStarted,
-    ErrorText,
-    Raised,
     Reported,
     Result,
     Value,
 )
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
-from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.info import NO_INFO
 from rlightning_aio.protocol.rings import (
     TrainerBell,
     TrainerRings,
@@ -63,40 +57,12 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio.protocol.exchange import Ring
 
-PLAIN, TERMINATES, RAISES = range(3)
-"""Effects of an action: nothing special, end the episode, raise, send an info by frame."""
-
+PLAIN = 0
+"""An action."""
 REFUSAL = "no more processes"
 OBSERVATION_SPACE = spaces.Box(-np.inf, np.inf, (4,), np.float64)
 ACTION_SPACE = spaces.Discrete(5)
 LAYOUT = RowLayout(OBSERVATION_SPACE, ACTION_SPACE, (), ())
-
-
-@dataclass
-class FakeEnv:
-    """The state of one env; the model has one, too, and predicts results with it.
-
-    Attributes:
-        identity: its slot in the group.
-        life: number of starts of its worker.
-        requests: executed in this life; steps: since the reset, or -1 before the first.
-    """
-
-    identity: int
-    life: int = 1
-    requests: int = 0
-    steps: int = -1
-
-    def observation(self) -> np.ndarray:
-        return np.array([self.identity, self.life, self.requests, self.steps], np.float64)
-
-    def reset(self) -> None:
-        self.requests += 1
-        self.steps = 0
-
-    def step(self) -> None:
-        self.requests += 1
-        self.steps += 1
 
 
 @dataclass
@@ -117,32 +83,23 @@ class FakeHost(Host):
 
     Attributes:
         waiting: index and execution of requests that are not executed yet, oldest first.
-        extras: by slot, the extras of its last step.
-        life: number of starts.
         asked: entries of all requests that have reached it.
         builds, closes: at once; otherwise not before it is killed.
         awaits: its envs are awaitable.
-        close_errors: of its envs.
     """
 
     inline = False
     builds = closes = True
     awaits = built = closing = False
 
-    def __init__(
-        self, host_id: int, first_slot: int, num_envs: int, shared: Shared, *, reads_extras: bool
-    ) -> None:
+    def __init__(self, host_id: int, first_slot: int, num_envs: int, shared: Shared) -> None:
         self.host_id = host_id
         self.first_slot = first_slot
         self.num_envs = num_envs
         self.shared = shared
         self.post = shared.completions.append
-        self.reads_extras = reads_extras
-        self.extras: dict[int, dict[str, Any]] = {}
-        self.life = 0
         self.rung = False
         self.asked: list[int] = []
-        self.close_errors: list[tuple[int, ErrorText]] = []
         self.waiting: deque[tuple[int, Callable[[], None]]] = deque()
 
     def note(self, what: str) -> None:
@@ -150,10 +107,7 @@ class FakeHost(Host):
 
     def start(self) -> None:
         self.note("start")
-        self.life += 1
         self.waiting.clear()
-        slots = range(self.first_slot, self.first_slot + self.num_envs)
-        self.envs = [FakeEnv(slot, self.life) for slot in slots]
         if self.builds:
             self.build()
 
@@ -165,16 +119,16 @@ class FakeHost(Host):
                 [
                     EnvStarted(
                         EnvMeta(
-                            env_id=f"fake-{env.identity}",
+                            env_id=f"fake-{slot}",
                             observation_space=OBSERVATION_SPACE,
                             action_space=ACTION_SPACE,
                         ),
                         LAYOUT,
-                        reads_extras=self.reads_extras,
+                        reads_extras=False,
                         actions_beside_row=False,
                         is_awaitable=self.awaits,
                     )
-                    for env in self.envs
+                    for slot in range(self.first_slot, self.first_slot + self.num_envs)
                 ],
             )
         )
@@ -201,9 +155,7 @@ class FakeHost(Host):
             execute = {
                 Operation.STEP: self._step,
                 Operation.RESET: self._reset,
-                Operation.CALL: self._call,
                 Operation.SNAPSHOT: self._snapshot,
-                Operation.RESTORE: self._restore,
             }[Operation(op_of(entry))]
             index = slot_of(entry) - self.first_slot
             self.waiting.append((index, lambda e=execute, k=entry, g=given: e(k, g)))
@@ -211,73 +163,26 @@ class FakeHost(Host):
     # -- what an env does
 
     def _step(self, entry: int, given: Any) -> None:
-        index = slot_of(entry) - self.first_slot
-        at = self.row_of[index]
-        action = self.slab.action[at]
-        if given is not None:
-            self.extras[slot_of(entry)] = given[1]
-            if given[0] is not None:
-                action = given[0]
-        action = int(action)
-        if action == RAISES:
-            self._raise(entry)
-            return
-        self.envs[index].step()
-        self._write(index, float(action), action == TERMINATES, False, {})
-        self.slab.is_reset[at] = False
-        self.slab.over[at] |= action == TERMINATES
-        self._reply(entry, {}, out_of_band=given is not None)
+        self._write(entry, is_reset=False)
+        if given is None:
+            self.report(entry)
+        else:
+            self.answer(Result(self.host_id, entry, {}))
 
     def _reset(self, entry: int, given: Any) -> None:
-        index = slot_of(entry) - self.first_slot
-        at = self.row_of[index]
-        self.envs[index].reset()
-        seed = None if given is not None else self.slab.take_seed(at)
-        info = {} if seed is None else {"seed": [seed]}
-        self._write(index, 0.0, False, False, info)
-        self.slab.is_reset[at] = True
-        self.slab.over[at] = False
-        self._reply(entry, info, out_of_band=given is not None)
+        del given
+        self._write(entry, is_reset=True)
+        self.report(entry)
 
-    def _write(
-        self, index: int, reward: float, terminated: bool, truncated: bool, info: dict[str, Any]
-    ) -> None:
-        slab, at = self.slab, self.row_of[index]
-        slab.observation[at] = self.envs[index].observation()
-        slab.reward[at] = reward
-        slab.terminated[at], slab.truncated[at] = terminated, truncated
-        slab.info_mark[at] = PICKLED if info else NO_INFO
-
-    def _reply(self, entry: int, info: dict[str, Any], *, out_of_band: bool) -> None:
-        if info or out_of_band:
-            self.answer(Result(self.host_id, entry, {"info": info} if info else {}))
-        else:
-            self.report(entry)
-
-    def _raise(self, entry: int) -> None:
-        text = f"env {slot_of(entry)} raised"
-        error = ErrorText("ValueError", text, "Traceback: as asked for\n")
-        self.answer(Raised(self.host_id, entry, error))
-
-    def _call(self, entry: int, given: Any) -> None:
-        name, args, _ = given
-        if name == "raise":
-            self._raise(entry)
-        else:
-            self.answer(Value(self.host_id, entry, (slot_of(entry), name, args)))
+    def _write(self, entry: int, *, is_reset: bool) -> None:
+        slab, at = self.slab, self.row_of[slot_of(entry) - self.first_slot]
+        slab.observation[at], slab.reward[at], slab.info_mark[at] = 0.0, 0.0, NO_INFO
+        slab.terminated[at] = slab.truncated[at] = slab.over[at] = False
+        slab.is_reset[at] = is_reset
 
     def _snapshot(self, entry: int, given: Any) -> None:
         del given
-        steps = self.envs[slot_of(entry) - self.first_slot].steps
-        self.answer(Value(self.host_id, entry, ({}, bytes([steps]) if steps >= 0 else None)))
-
-    def _restore(self, entry: int, given: Any) -> None:
-        index = slot_of(entry) - self.first_slot
-        _, (self.envs[index].steps,) = given
-        self._write(index, 0.0, False, False, {})
-        self.slab.is_reset[self.row_of[index]] = True
-        self.slab.over[self.row_of[index]] = False
-        self._reply(entry, {}, out_of_band=False)
+        self.answer(Value(self.host_id, entry, ({}, b"saved")))
 
     def report(self, entry: int) -> None:
         """Report a result that is in the row."""
@@ -306,7 +211,7 @@ class FakeHost(Host):
 
     def end(self) -> None:
         self.waiting.clear()
-        self.post(Closed(self.host_id, self.close_errors))
+        self.post(Closed(self.host_id, []))
 
     def release(self) -> None:
         self.note("release")
@@ -320,14 +225,13 @@ class FakeWorker(FakeHost):
         rung: its descriptor is readable.
         alive: it was started, and has not died since.
         dies: a kill ends it.
-        refusals: number of further starts that fail; refused_later: by the fork server, not by
-            this process.
+        refusals: number of further starts that fail.
         current: the entry that it executes, and since when (ns).
         unread: completions that wait to be read, each as a call.
     """
 
     on_bell = True
-    alive = refused_later = False
+    alive = False
     dies = True
     refusals: float = 0
     traffic = 0
@@ -337,11 +241,7 @@ class FakeWorker(FakeHost):
         self.built = False
         if self.refusals:
             self.refusals -= 1
-            if not self.refused_later:
-                raise OSError(REFUSAL)
-            refused = Death(f"could not be forked: {REFUSAL}", refused=True)
-            self.post(Died(self.host_id, refused))
-            return
+            raise OSError(REFUSAL)
         self.alive = True
         self.frames: list[Any] = []
         self.unread: list[Callable[[], object]] = []
@@ -467,14 +367,13 @@ class FakeGroup:
     Args:
         rows: envs of each host.
         up: start it.
-        inline: for each host, True if it is inline; reads_extras likewise.
+        inline: for each host, True if it is inline.
     """
 
     def __init__(
         self,
         rows: Sequence[int],
         inline: Sequence[bool] = (),
-        reads_extras: Sequence[bool] = (),
         *,
         up: bool = True,
         awaits: bool = False,
@@ -527,8 +426,7 @@ class FakeGroup:
         self.hosts: list[Any] = []
         for host_id, count in enumerate(rows):
             kind = FakeInline if inline and inline[host_id] else FakeWorker
-            reads = bool(reads_extras[host_id]) if reads_extras else False
-            host = kind(host_id, sum(rows[:host_id]), count, shared, reads_extras=reads)
+            host = kind(host_id, sum(rows[:host_id]), count, shared)
             host.awaits = awaits
             self.hosts.append(host)
             supervisor.add(host, self.config)

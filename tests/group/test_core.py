@@ -6,18 +6,14 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
 import pytest
-from group.fake_host import PLAIN, TERMINATES, FakeGroup
+from group.fake_host import PLAIN, FakeGroup
 
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
-from rlightning_aio._core.hosts.messages import Lost, Result
+from rlightning_aio._core.hosts.messages import Lost
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
-    EnvBusy,
-    EnvHung,
-    EnvRaised,
     NothingPending,
-    WorkerDied,
 )
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.types import PolicyResponse
@@ -117,36 +113,6 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
     assert not host.waiting
 
 
-def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
-    """The next collect returns the results."""
-    group = new_group(2)
-    running = group.begin(group.steps.step(steps(0, 1), group.now))
-    host = group.hosts[0]
-    host.finish()
-    host.finish()
-    host.on_readable()
-    group.core.apply_completions()
-    group.cancel(running)
-    assert ids_of(collect(group)) == ["fake-0", "fake-1"]
-
-
-@pytest.mark.parametrize("name", ["who", "raise"])
-def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str) -> None:
-    """The env can be stepped once it has replied."""
-    group = new_group(1)
-    running = group.begin(group.core.calls.call_one(group.now, 0, (name, (), {})))
-    group.cancel(running)
-    with pytest.raises(NothingPending):
-        collect(group).result()
-    with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs"):
-        group.steps.step_async(steps(0), group.now)
-    group.hosts[0].finish()
-    group.hosts[0].on_readable()
-    stepped = group.begin(group.steps.step(steps(0), group.now))
-    group.finish(0)
-    assert ids_of(stepped) == ["fake-0"]
-
-
 def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
     """Only a collect of nothing is refused."""
     group = new_group(2)
@@ -176,125 +142,6 @@ def test_seeds_are_counted_for_each_env(new_group: NewGroup) -> None:
     group = new_group(2)
     with pytest.raises(ValueError, match="3 seeds for 2 envs"):
         group.begin(group.core.reset(group.now, [1, 2, 3], None, None)).result()
-
-
-def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
-    new_group: NewGroup,
-) -> None:
-    """Only extras that an env reads are sent out of band."""
-    group = new_group(1, 1, reads_extras=[False, True])
-    batch = BatchedData(
-        ["fake-0", "fake-1"], [PolicyResponse(f"fake-{k}", 0, value=k) for k in range(2)]
-    )
-    running = group.begin(group.steps.step(batch, group.now))
-    group.finish(1)
-    group.finish(0)
-    assert ids_of(running) == ["fake-0", "fake-1"]
-    assert group.hosts[0].extras == {}
-    assert group.hosts[1].extras == {1: {"value": 1}}
-
-
-def test_an_unreadable_info_raises_only_when_it_is_read(
-    new_group: NewGroup, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Sums read it where an episode ends; the result is handed out all the same."""
-    group = new_group(1)
-    (host,) = group.hosts
-
-    def reply(entry: int, *_: Any, **__: Any) -> None:
-        host.answer(Result(host.host_id, entry, b"no pickle"))
-
-    monkeypatch.setattr(host, "_reply", reply)
-    group.steps.step_async(steps(0, action=TERMINATES), group.now)
-    host.slab.episode_length[0] = 1
-    group.finish(0)
-    batch, _ = collect(group).result()
-    assert batch.done.tolist() == [True]
-    with pytest.raises(EnvRaised, match="'fake-0' returned what can't be read in this process"):
-        batch.info()
-
-
-@pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
-@pytest.mark.parametrize("moment", ["before its reply", "after its reply"])
-def test_an_env_whose_worker_dies_in_a_restore_is_lost_and_the_others_are_restored(
-    new_group: NewGroup, on_worker_death: str, moment: str
-) -> None:
-    """One that has replied before is restored, too, until its worker dies."""
-    group = new_group(1, 2, on_worker_death=on_worker_death)
-    core = group.core
-    run(group, core.reset(group.now, None, None, None))
-    snapshot = run(group, core.snapshot(group.now, None))
-    for _ in range(3):
-        run(group, group.steps.step(steps(0, 1, 2), group.now))
-    restoring = group.begin(core.restore(group.now, snapshot, None, None))
-    group.finish(0)
-    if moment == "after its reply":
-        group.finish(1)
-    die(group, 1)
-    with pytest.raises(WorkerDied) as caught:
-        restoring.result()
-    dead = [1, 2] if moment == "before its reply" else [2]
-    assert caught.value.env_ids == tuple(f"fake-{slot}" for slot in dead)
-    shown = caught.value.results
-    assert shown is not None
-    assert shown.observation[:, 3].tolist() == [0] * (3 - len(dead))
-    assert shown.is_reset.all()
-    (batch, _) = run(group, group.steps.step(steps(0), group.now))
-    assert (batch.restarted.tolist(), batch.observation[:, 3].tolist()) == ([False], [1])
-    for slot in (1, 2):
-        if on_worker_death == "raise":
-            with pytest.raises(WorkerDied, match="nothing was sent"):
-                group.steps.step_async(steps(slot), group.now)
-        else:
-            (batch, _) = run(group, group.steps.step(steps(slot), group.now))
-            assert (batch.restarted.tolist(), batch.observation[:, 3].tolist()) == ([True], [0])
-
-
-def test_a_restore_is_one_request(new_group: NewGroup) -> None:
-    group = new_group(2)
-    run(group, group.core.reset(group.now, None, None, None))
-    snapshot = run(group, group.core.snapshot(group.now, None))
-    num_asked = len(group.hosts[0].asked)
-    restoring = group.begin(group.core.restore(group.now, snapshot, None, None))
-    group.finish(0)
-    group.finish(1)
-    restoring.result()
-    assert len(group.hosts[0].asked) == num_asked + 2
-
-
-def test_one_env_of_a_host_can_be_lost(new_group: NewGroup) -> None:
-    """Its request is sent again as a reset that reports it; those of others go on."""
-    group = new_group(2, max_restarts=1)
-    run(group, group.core.reset(group.now, None, None, None))
-    why = Loss("hung", "env_hung", "env", "fake-0")
-    host = group.hosts[0]
-    for turn in range(2):
-        stepping = group.begin(group.steps.step(steps(0, 1), group.now))
-        entry = group.core.requests.numbering.entry.item(0)
-        del host.waiting[0]
-        host.answer(Lost(0, 0, why, entry, "it hangs"))
-        group.turn()
-        group.finish(1)
-        if turn:
-            with pytest.raises(EnvHung, match="it hangs; it is not replaced after 1 restarts"):
-                stepping.result()
-            continue
-        group.finish(0)
-        batch, _ = stepping.result()
-        assert batch.restarted.tolist() == batch.is_reset.tolist() == [True, False]
-    batch, _ = run(group, group.steps.step(steps(0, 1), group.now))
-    assert batch.restarted.tolist() == [True, False]
-    stepping = group.begin(group.core.calls.call_one(group.now, 0, ("get", (), {})))
-    entry = group.core.requests.numbering.entry.item(0)
-    host.waiting.clear()
-    host.answer(Lost(0, 0, why, entry, "it hangs"))
-    group.turn()
-    with pytest.raises(EnvHung):
-        stepping.result()
-    host.answer(Lost(0, 1, why))  # Idle.
-    group.turn()
-    batch, _ = run(group, group.steps.step(steps(0, 1), group.now))
-    assert batch.restarted.tolist() == [True, True]
 
 
 def test_a_loss_that_is_read_before_the_last_answer_comes_after_it(new_group: NewGroup) -> None:
@@ -358,27 +205,6 @@ def run(group: FakeGroup, procedure: Any) -> Any:
         host = next(host for host in group.hosts if host.waiting)
         group.finish(host.first_slot + host.waiting[0][0])
     return running.result()
-
-
-def test_requests_have_a_worker_replaced_in_which_only_a_cancelled_call_still_runs(
-    new_group: NewGroup,
-) -> None:
-    """Nobody waits, so there is nobody else who sees that its next attempt to start is due."""
-    group = new_group(1)
-    group.hosts[0].refusals = 1
-    die(group, 0)
-    group.cancel(group.begin(group.core.calls.call_one(group.now, 0, ("who", (), {}))))
-    group.now += 60.0
-    with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs"):
-        group.steps.step_async(steps(0), group.now)
-    assert group.hosts[0].alive
-
-
-def die(group: FakeGroup, slot: int) -> None:
-    group.host_of(slot).die()
-    group.core.apply_completions()
-    group.wake()
-    group.turn()
 
 
 def test_a_result_that_another_call_read_wakes_its_caller(new_group: NewGroup) -> None:

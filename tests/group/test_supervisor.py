@@ -11,16 +11,17 @@ import pytest
 from group.fake_host import ACTION_SPACE, PLAIN, FakeGroup, Running
 
 from rlightning_aio._core.group.engine.steps import CollectRules
-from rlightning_aio._core.group.state.host_record import HostLoss
 from rlightning_aio._core.hosts import times
-from rlightning_aio._core.hosts.messages import Attached, Died, ErrorText, NotBuilt
+from rlightning_aio._core.hosts.messages import Attached, Died
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed
+from rlightning_aio.errors import EnvHung, GroupClosed, StartFailed
 from rlightning_aio.protocol.slab import RowLayout
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+    from rlightning_aio._core.group.state.host_record import HostLoss
 
 
 def is_replaced(loss: HostLoss | None) -> TypeGuard[HostLoss]:
@@ -174,40 +175,6 @@ def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], d
         start.result()
 
 
-def test_a_host_that_cannot_be_started_fails_the_start(fleet: Callable[..., Fleet]) -> None:
-    """Hosts before it are closed, hosts after it are never started."""
-    ours = fleet((1, 1, 1), up=False)
-    ours.hosts[1].refusals = 1
-    with pytest.raises(
-        StartFailed, match="entry 'fake': no more processes; check its `interpreter`"
-    ):
-        ours.start().result()
-    assert "start 2" not in ours.log
-    assert "close 2" not in ours.log
-    assert ours.log[-3:] == ["release 0", "release 1", "release 2"]
-
-
-@pytest.mark.parametrize(
-    ("type_name", "kind"),
-    [("ValueError", StartFailed), ("rlightning_aio.errors.ConfigError", ConfigError)],
-)
-def test_an_env_that_cannot_be_built_fails_the_start(
-    fleet: Callable[..., Fleet], type_name: str, kind: type[Exception]
-) -> None:
-    """A config error keeps its type; any other error names the env."""
-    ours = fleet((1, 2), up=False)
-    ours.hosts[1].builds = False
-    start = ours.start()
-    ours.shared.completions.append(
-        NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n"))
-    )
-    ours.turn()
-    with pytest.raises(kind, match="no licence") as caught:
-        start.result()
-    assert kind is ConfigError or "env 'fake-2'" in str(caught.value)
-    assert "close 0" in ours.log
-
-
 # -- hangs
 
 
@@ -281,37 +248,6 @@ def ended_as_hung(ours: Fleet) -> HostLoss:
     return loss
 
 
-def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fleet]) -> None:
-    """It owes a reply and executes nothing; every reply restarts the time."""
-    ours = fleet((2, 1), step_timeout=5.0)
-    ours.ask(0, 1)
-    ours.check()
-    ours.now += 4
-    ours.reply(0)
-    ours.check()
-    ours.now += 4.9
-    ours.check()
-    assert ours.log == []
-    loss = ended_as_hung(ours)
-    assert loss.owed.tolist() == [1]
-    assert loss.error(loss.owed).env_id == "fake-1"
-
-
-def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
-    fleet: Callable[..., Fleet],
-) -> None:
-    """A host that stops halfway is found, and its env is named."""
-    ours = fleet((2,), step_timeout=5.0)
-    entries = ours.ask(0, 1)
-    ours.hosts[0].current = (entries[1], 0)
-    for part in range(3):
-        ours.hosts[0].traffic = part
-        ours.let(4.9)
-    assert ours.log == []
-    loss = ended_as_hung(ours)
-    assert loss.error(loss.owed).env_id == "fake-1"
-
-
 def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet]) -> None:
     """A worker was stopped between two requests: the one that it has not begun is named."""
     ours = fleet((2,), step_timeout=5.0)
@@ -341,37 +277,6 @@ def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -
     assert isinstance(error, EnvHung)
     assert error.env_id == "fake-0"
     assert "no env's code was running; envs that owed a reply: fake-0, fake-2" in str(error)
-
-
-def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Fleet]) -> None:
-    """Even if nobody waits for its request any more: only one env's code runs."""
-    ours = fleet((3,), awaits=True, step_timeout=5.0)
-    (over,) = ours.ask(2)
-    ours.reply(2)
-    ours.ask(0, 1)
-    ours.hosts[0].current = (over, int(ours.now * 1e9))
-    ours.now += 4.9
-    ours.check()
-    assert ours.log == []
-    loss = ended_as_hung(ours)
-    assert loss.why[3:] == ("fake-2",)
-    assert loss.death.cause == "hung in a step and was killed"
-
-
-def test_a_late_trainer_reads_pending_replies_before_it_kills(
-    fleet: Callable[..., Fleet],
-) -> None:
-    """For a host that seemed idle and one that seemed to execute; both have replied since."""
-    ours = fleet((1, 1), step_timeout=5.0)
-    entries = ours.ask(0, 1)
-    ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
-    ours.check()
-    ours.now += 60
-    for host in ours.hosts:
-        host.finish()
-    ours.check()
-    assert ours.requests.in_flight == [0, 0]
-    assert ours.log == []
 
 
 def test_an_unread_death_does_not_cost_the_fork_server(
@@ -506,14 +411,6 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
 # -- deaths
 
 
-def test_nobody_is_to_blame_where_several_envs_waited(fleet: Callable[..., Fleet]) -> None:
-    """The only env of a worker is, also while it waits."""
-    ours = fleet((1, 2), awaits=True)
-    losses = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
-    found = [v.why[2:] for v in losses if v]
-    assert found == [("env", "fake-0"), ("infrastructure", None)]
-
-
 def test_deaths_of_nobody_are_counted_until_any_env_completes_a_step(
     fleet: Callable[..., Fleet],
 ) -> None:
@@ -530,77 +427,6 @@ def test_deaths_of_nobody_are_counted_until_any_env_completes_a_step(
             ours.reply(1)
     ours.ask(0, 1)
     assert is_given_up(ours.die(0, 0))
-
-
-@pytest.mark.parametrize("later", [False, True])
-def test_a_start_that_the_system_refuses_is_one_more_death(
-    fleet: Callable[..., Fleet], later: bool
-) -> None:
-    """With the same pauses; of another worker, nothing is delayed."""
-    ours = fleet(max_restarts=3)
-    ours.hosts[0].refusals, ours.hosts[0].refused_later = math.inf, later
-    ours.ask(0, 1)
-    ours.die(0)
-    assert is_replaced(ours.losses[0])
-    pauses: list[float] = []
-    while not is_given_up(ours.losses[-1]):
-        ours.reply(1)
-        ours.ask(1)
-        ours.now += 1e-3
-        pauses.append(round(ours.wait() + 1e-3, 6))
-    assert pauses == [0.1, 0.2]
-    loss = ours.losses[-1]
-    assert loss is not None
-    assert loss.owed.tolist() == [0]
-    assert (loss.why.kind, loss.why.blame) == ("not_started", "infrastructure")
-    error = str(loss.error(loss.owed))
-    assert "no more processes" in error
-    assert "after 3 restarts in a row" in error
-    assert ours.requests.in_flight == [0, 1]
-
-
-def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
-    """As many as the config allows, one after the other."""
-    ours = fleet(max_restarts=5000)
-    ours.ask(0)
-    for _ in range(5000):
-        ours.die(0)
-        if ours.supervisor.records[0].restart_at is not None:
-            ours.wait()
-    ours.die(0)
-    assert is_given_up(ours.losses[-1])
-    assert ours.log.count("start 0") == 5000
-    assert "after 5000 restarts in a row" in str(ours.requests.collector.faults[0])
-
-
-def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
-    fleet: Callable[..., Fleet],
-) -> None:
-    """Failed attempts don't affect them; requests that the dead worker owed are sent again."""
-    ours = fleet((2, 1), max_restarts=9, step_timeout=1.0)
-    (entry,) = ours.ask(0)
-    ours.hosts[0].refusals = math.inf
-    ours.die(0, entry)
-    (later,) = ours.ask(1)
-    asked = [*ours.entries(0), later]
-    ours.let(0.15)
-    ours.hosts[0].refusals, ours.hosts[0].builds = 0, False
-    ours.let(0.2)
-    assert ours.log == ["start 0", "attach 0"]
-    ours.now += 5
-    ours.check()
-    ours.die(0)
-    ours.hosts[0].builds = True
-    ours.let(0.45)
-    assert ours.hosts[0].asked == [entry, *asked]
-    assert ours.requests.in_flight == [2, 0]
-    assert [type(loss) for loss in ours.losses] == [HostLoss, *[type(None)] * 3]
-    # The time begins when the replacement is up: until then it had nothing to execute.
-    assert ours.log[-2:] == ["start 0", "attach 0"]
-    ours.let(0.9)
-    assert ours.log[-2:] == ["start 0", "attach 0"]
-    ours.let(0.1 + 1.0 / 4)
-    assert "dump and kill 0" in ours.log
 
 
 def test_a_replacement_gets_no_requests_that_were_aborted(fleet: Callable[..., Fleet]) -> None:
@@ -716,26 +542,6 @@ def stopped_in(order: Callable[..., None], ours: Fleet) -> Callable[..., None]:
 
 
 # -- close
-
-
-def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
-    """After 1.5 seconds, without a dump; errors have ids."""
-    ours = fleet((2, 2))
-    stuck = ErrorText("ValueError", "stuck", "")
-    ours.hosts[0].close_errors = [(1, stuck)]
-    ours.hosts[1].closes, ours.hosts[1].close_errors = False, [(0, stuck)]
-    closing = ours.end()
-    assert ours.log == ["close 0", "close 1"]
-    with pytest.raises(GroupClosed):
-        ours.lifetime.check_open()
-    ours.pass_time(1.4)
-    assert not closing.done
-    ours.pass_time(0.1)
-    assert closing.done
-    assert ours.log[2:] == ["kill 1", "release 0", "release 1"]
-    assert ours.supervisor.close_errors == [("fake-1", stuck), ("fake-2", stuck)]
-    assert ours.end().done
-    assert len(ours.log) == 5
 
 
 def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
