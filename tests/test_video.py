@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,19 @@ def test_episodes_are_filmed_whole(placement: str, tmp_path: Path) -> None:
         play(group, [0] * 7)
     names = [f"env-{k}-episode-{episode}.mp4" for k in range(2) for episode in range(2)]
     assert films(tmp_path) == {name: [0, 1, 2, 3] for name in names}
+
+
+class Slow(Brighter):
+    """A long film takes seconds to write, in which its worker has to live."""
+
+    def close(self) -> None:
+        time.sleep(2.0)
+
+
+def test_an_episode_in_progress_is_filmed_up_to_the_end_of_the_group(tmp_path: Path) -> None:
+    with sync.build_env_group(entry(Slow, {"folder": str(tmp_path)})) as group:
+        play(group, [0])
+    assert films(tmp_path) == {"env-0-episode-0.mp4": [0, 1]}
 
 
 def test_every_nth_episode_is_filmed_and_nothing_is_written_over(tmp_path: Path) -> None:

@@ -85,8 +85,8 @@ class EnvConfig(_Fields):
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
     close_timeout: float | None = Field(default=None, gt=0)
-    """Seconds that all envs of the entry may take to close; None gives awaitable envs 10 seconds
-    and others 1.5."""
+    """Seconds that all envs of the entry may take to close; None gives awaitable envs 10 seconds,
+    filmed ones 60 (``record_video``), and others 1.5."""
     on_worker_death: Literal["restart", "raise"] = "restart"
     """Reaction to a worker that dies or hangs; ``raise`` by default for hardware."""
     on_env_error: Literal["raise", "restart"] = "raise"

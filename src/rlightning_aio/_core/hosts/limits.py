@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, Literal
 
 from rlightning_aio._core.hosts import times
+from rlightning_aio.envs.adapted.films import RECORD_VIDEO
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation
 
@@ -26,7 +27,8 @@ def close_seconds(config: EnvConfig, *, awaits: bool) -> float:
     seconds = config.close_timeout
     if awaits:
         return (times.AWAITED_CLOSE if seconds is None else seconds) + times.AWAITED_CANCEL
-    return times.CLOSE if seconds is None else seconds
+    usual = times.FILMED_CLOSE if RECORD_VIDEO in config.env_kwargs else times.CLOSE
+    return usual if seconds is None else seconds
 
 
 def restart_pause(losses: int) -> float:

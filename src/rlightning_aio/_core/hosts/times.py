@@ -28,6 +28,8 @@ CLOSE: Final = 1.5
 workers."""
 CLOSE_ALONE: Final = CLOSE - GRACE
 """For workers to close without a trainer that has said how long."""
+FILMED_CLOSE: Final = 60.0
+"""For filmed envs, which write the film of the episode in progress when they close."""
 CANCEL: Final = 0.4
 """For a task to end after it was cancelled."""
 LATE_CANCEL: Final = CANCEL / 4
