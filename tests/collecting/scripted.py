@@ -74,21 +74,15 @@ class Script(gym.Env[Any, Any]):
 
 
 class Tickets:
-    """A policy with a unique number as each action; it may raise before it answers."""
+    """A policy with a unique number as each action."""
 
-    def __init__(self, raises: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self) -> None:
         self.count = 0
-        self.version_of: dict[float, int] = {}
-        self.version: Callable[[], int] = lambda: 0
-        self._raises = raises
 
     def __call__(self, batch: BatchedData) -> dict[str, Any]:
-        if self._raises():
-            raise InterruptedError
         shape = batch.is_reset.shape
         numbers = self.count + np.arange(np.prod(shape), dtype=np.float64).reshape(shape)
         self.count += numbers.size
-        self.version_of.update(dict.fromkeys(numbers.reshape(-1).tolist(), self.version()))
         return {"action": numbers[..., None], "log_prob": numbers.astype(np.float32)}
 
 

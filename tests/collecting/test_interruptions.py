@@ -6,12 +6,9 @@ Nothing is lost or invented: each env's transitions are those that it must have 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import inspect
 import itertools
 import math
-import os
-import signal
 import types
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +17,6 @@ import numpy as np
 import pytest
 from kit.counting import ClientThread, CountingEnv
 from kit.driven import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
-from kit.processes import kill
 from kit.scripted import Awaitable, Counts
 from patience import HANG
 
@@ -28,7 +24,7 @@ import rlightning_aio as rl
 import rlightning_aio.sync
 from rlightning_aio.collecting import Collector, Rollout
 from rlightning_aio.collecting.rollout import Ends
-from rlightning_aio.errors import EnvRaised, NothingPending, RLightningError, WorkerDied
+from rlightning_aio.errors import EnvRaised, RLightningError
 from rlightning_aio.evaluation import evaluate
 from rlightning_aio.registry import ENVS
 
@@ -181,19 +177,6 @@ async def test_a_collect_goes_on_wherever_it_was_cancelled(way: str, slow: str) 
             break
 
 
-async def test_a_collect_of_workers_goes_on_wherever_it_was_cancelled() -> None:
-    entry = {"task": Uneven, "envs_per_process": 2, "num_workers": 2}
-    entries = [{**entry, "name": name} for name in PER_ENTRY]
-    async with rl.build_env_group(entries) as group:
-        for at in range(6):
-            with group.auto_reset(math.inf):
-                collector: Any = Collector(group, PER_ENTRY, num_transitions=3, seed=SEED)
-                check((await collected(collector, at, 4))[0])
-            with contextlib.suppress(NothingPending):
-                while True:
-                    await group.collect_async(wait_all=True)
-
-
 # -- envs that raise, and groups that others use between two calls
 
 
@@ -324,25 +307,6 @@ class Reluctant(Numbered):
         return super().reset(seed=seed, options=options)
 
 
-@pytest.mark.parametrize("go_on", GO_ON)
-@pytest.mark.parametrize("style", STYLES[::2])
-async def test_a_collector_begins_after_envs_have_raised_in_their_first_reset(
-    style: str, go_on: Any
-) -> None:
-    """The program may have reset them, and have sent that only."""
-    numbers = [lambda k=k: Reluctant(k) for k in range(4)]
-    entry = {"name": "a", "task": numbers, "num_workers": 4}
-    async with INLINE_SYNC.build([entry]) as group:
-        with group.auto_reset(math.inf):
-            collector = collector_of(group, style, failing())
-            with pytest.raises(EnvRaised) as raised:
-                await done(collector.collect())
-            for fault in (raised.value, *raised.value.others):
-                await go_on(group, fault)
-            found = parts_of(await done(collector.collect()))
-    assert all(steps_of(found).values())
-
-
 async def nothing(group: Any, collector: Any) -> None:
     collector.restart()
 
@@ -457,52 +421,6 @@ async def test_an_evaluation_between_two_blocks_ends_their_chains(style: str) ->
 async def until_it_raises(collector: Any) -> None:
     while True:
         await collector.collect()
-
-
-async def until_it_is_noticed(group: rl.EnvGroup, number: int) -> None:
-    while not group.get_workers()[number]["given_up"]:  # noqa: ASYNC110
-        await asyncio.sleep(0)
-
-
-@pytest.mark.parametrize("is_noticed", [False, True])
-async def test_envs_that_are_given_up_are_left_out(is_noticed: bool) -> None:
-    """Their error is raised once, whether they owe results or not; and again where none is left."""
-    async with numbered(SEVERAL, on_worker_death="raise") as group:
-        with group.auto_reset(math.inf):
-            collector: Any = Collector(group, failing(), num_transitions=4)
-            await collector.collect()
-            for number, left in enumerate(({2, 3}, set())):
-                kill(group.get_workers()[number]["pid"])
-                if is_noticed:
-                    await until_it_is_noticed(group, number)
-                with pytest.raises(WorkerDied, match="SIGKILL"):
-                    await until_it_raises(collector)
-                if left:
-                    rollouts = [await collector.collect() for _ in range(3)]
-                    assert {*rollouts[-1].index.tolist()} <= left
-            for _ in range(2):
-                with pytest.raises(WorkerDied, match=r"SIGKILL.*nothing was sent to a-0"):
-                    await collector.collect()
-
-
-async def test_envs_at_work_are_waited_for_after_others_were_given_up() -> None:
-    """The error came before the actions of the envs that were given up could be sent."""
-    async with numbered(SEVERAL, on_worker_death="raise") as group:
-        with group.auto_reset(math.inf):
-            collector: Any = Collector(group, failing(), num_transitions=2, min_results=2)
-            await collector.collect()
-            killed, stopped = [worker["pid"] for worker in group.get_workers()]
-            os.kill(stopped, signal.SIGSTOP)
-            while set(group.pending) != {"b-0", "b-1"}:
-                await collector.collect()
-            kill(killed)
-            await until_it_is_noticed(group, 0)
-            with pytest.raises(WorkerDied, match="SIGKILL"):
-                await collector.collect()
-            os.kill(stopped, signal.SIGCONT)
-            for _ in range(3):
-                rollout = await collector.collect()
-            assert {*rollout.index.tolist()} <= {2, 3}
 
 
 @pytest.fixture
