@@ -10,17 +10,15 @@ import signal
 import subprocess
 import sys
 import warnings
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
 from kit.processes import fork_server_pid, kill, pid_of
 from kit.tokens import Tokens, entry, marked, two_workers
 
-from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
+from rlightning_aio.errors import StartFailed, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,56 +59,6 @@ def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
         batch, _ = group.step(tokens.steps(group.group.env_ids))
         tokens.check(batch)
         assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
-
-
-@on_one_driver
-def test_a_marked_result_begins_an_ordinary_episode(start: Start) -> None:
-    """Later results of the episode are not marked."""
-    config = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
-    group = start({**config, "envs_per_process": 2})
-    pushes = BatchedData(["pole-0", "pole-1"], [PolicyResponse(f"pole-{k}", k) for k in range(2)])
-    kill(group.group.get_workers()[0]["pid"])
-    marks = []
-    for _ in range(4):
-        batch, _ = group.step(pushes)
-        marks.append((batch.restarted.all(), batch.is_reset.all(), batch.truncated.any()))
-        episodes = [info.get("episode") for info in batch.info()]
-        assert episodes == [None, None]
-    assert marks == [(True, True, True)] + 3 * [(False, False, False)]
-    (worker,) = group.group.get_workers()
-    assert (worker["state"], worker["restarts"]) == ("up", 1)
-
-
-@on_one_driver
-def test_result_that_was_ready_before_deaths_keeps_its_own_info(
-    start: Start, tmp_path: Path
-) -> None:
-    """However often its worker dies meanwhile or fails to start, and whatever other
-    workers report.
-    """
-    broken = tmp_path / "broken"
-    kwargs = {"faults": {"building": "raise"}, "while_exists": str(broken)}
-    group, tokens = start(entry(env_kwargs=kwargs, max_restarts=2)), Tokens()
-    group.step(tokens.steps(group.group.env_ids))
-    group.step_async(tokens.steps(["faulty-0"]))
-    batch, _ = group.collect_async()
-    before = batch.values()[0]
-    pid = pid_of(group, "faulty-1")
-    group.step_async(tokens.steps(["faulty-0"]))
-    group.step(tokens.steps(["faulty-1"]))  # The same worker executes this one after the other.
-    for _ in range(2):
-        kill(pid)
-        assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
-        pid = pid_of(group, "faulty-1")
-    # The row's info had its worker's second schema; the second schema of this worker differs.
-    group.call("faulty-1", "answer_with", info=partial(dict, other=7.0))
-    assert group.step(tokens.steps(["faulty-1"]))[0].info() == [{"other": 7.0}]
-    broken.touch()  # From now on, no replacement can be built.
-    with pytest.raises(WorkerDied, match="2 restarts in a row"):
-        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
-    batch, _ = group.collect_async()
-    assert batch.values()[0].info == {"steps": before.info["steps"] + 1, "name": 0}
-    tokens.check(batch)
 
 
 @kinds_on_both_drivers("deaths", ELSEWHERE)
@@ -255,48 +203,6 @@ def test_death_of_an_idle_worker_is_reported_at_the_next_step(start: Start) -> N
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
 
 
-@on_one_driver
-def test_reset_after_an_idle_death_is_a_plain_reset(start: Start) -> None:
-    """A new episode was requested anyway, so the reset is not marked, and it gets its seed."""
-    group, tokens = start(two_workers()), Tokens()
-    kill(pid_of(group, "faulty-0"))
-    group.step(tokens.steps(["faulty-2"]))
-    batch, _ = group.reset(seed=3)
-    again, _ = group.step(tokens.steps(group.group.env_ids))
-    marks = [marked(ret) for ret in (*batch.values(), *again.values())]
-    # The death may be noticed during the reset; then the reset is marked.
-    assert not any(marks[4:])
-    assert marks[:4] in ([False] * 4, [True, True, False, False])
-
-
-@on_one_driver
-def test_an_idle_env_reports_a_death_however_late_it_is_stepped(start: Start) -> None:
-    """Its neighbour has already reported the death and shown that the replacement works."""
-    group, tokens = start(two_workers()), Tokens()
-    group.step(tokens.steps(group.group.env_ids))
-    batch, _ = group.step(tokens.steps(["faulty-1"], {"faulty-1": "sigkill"}))
-    assert marked(batch.values()[0])
-    tokens.check(group.step(tokens.steps(["faulty-1"]))[0])
-    batch, _ = group.step(tokens.steps(["faulty-0"]))
-    assert marked(batch.values()[0])
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-
-
-def test_worker_dies_while_a_collect_waits_for_another(start: Start) -> None:
-    """The collect neither hangs nor raises, and returns each result exactly once."""
-    group, tokens = start(two_workers()), Tokens()
-    group.step_async(tokens.steps(group.group.env_ids, {"faulty-2": "segfault"}))
-    found: list[Any] = []
-    while len(found) < 4:
-        batch, _ = group.collect_async(min_results=1)
-        found += batch.values()
-    assert sorted(ret.env_id for ret in found) == group.group.env_ids
-    assert {ret.env_id for ret in found if marked(ret)} in (
-        {"faulty-2"},
-        {"faulty-2", "faulty-3"},
-    )
-
-
 def test_others_continue_while_a_worker_is_replaced(start: Start, tmp_path: Path) -> None:
     """A replacement that is slow to build delays no other worker."""
     gate = tmp_path / "gate"
@@ -351,43 +257,6 @@ def test_replacement_that_cannot_be_built_is_raised_with_its_error(
     with pytest.raises(WorkerDied, match="could not be rebuilt: ValueError: as asked for"):
         group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
-
-
-@on_one_driver
-def test_an_error_in_the_reset_of_a_replacement_is_raised(start: Start, tmp_path: Path) -> None:
-    """The request ends with one error; the next reset is a plain one."""
-    broken = tmp_path / "broken"
-    kwargs = {"faults": {"resetting": "raise"}, "while_exists": str(broken)}
-    group, tokens = start(entry(1, env_kwargs=kwargs)), Tokens()
-    broken.touch()
-    with pytest.raises(EnvRaised, match=r"as asked for.*worker.*exited with code 3"):
-        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
-    broken.unlink()
-    batch, _ = group.reset()
-    assert not marked(batch["faulty-0"])
-    tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
-
-
-@on_one_driver
-def test_a_replaced_env_reports_the_death_until_a_reset_succeeds(
-    start: Start, tmp_path: Path
-) -> None:
-    """A reset that raises, requested or not, begins no episode."""
-    broken = tmp_path / "broken"
-    kwargs = {"faults": {"resetting": "raise"}, "while_exists": str(broken)}
-    group, tokens = start(two_workers(env_kwargs=kwargs)), Tokens()
-    kill(pid_of(group, "faulty-0"))
-    # The death is known once its neighbour has reported it.
-    assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
-    broken.touch()
-    with pytest.raises(EnvRaised, match="raised in reset"):
-        group.reset(seed=3, env_ids=["faulty-0"])
-    with pytest.raises(EnvRaised, match=r"raised in reset.*was killed by SIGKILL"):
-        group.step(tokens.steps(["faulty-0"]))
-    broken.unlink()
-    assert marked(group.step(tokens.steps(["faulty-0"]))[0].values()[0])
-    for _ in range(2):
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:

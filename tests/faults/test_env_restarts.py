@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
@@ -15,7 +14,6 @@ from kit.scripted import Awaitable, Counts
 from kit.tokens import Tokens, entry, marked, two_workers
 
 from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised
-from rlightning_aio.evaluation import evaluate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -293,21 +291,6 @@ def test_an_env_is_not_rebuilt_after_ctrl_c(build: Start, task: type) -> None:
     assert group.call("e-0", "lives") == (1, [])
     batch, _ = group.step(batch.respond(action=np.array([0])))
     assert batch.observation.tolist() == [[1, 1]]
-
-
-@on_one_driver
-def test_an_evaluation_plays_the_lost_episode_again(build: Start) -> None:
-    class Fails(Lives):
-        def step(self, action: Any) -> Any:
-            return super().step(int(self.number == 1 and self.steps == 2))
-
-    Lives.made = 0
-    group = build({"name": "e", "task": Fails, "placement": "inline", "on_env_error": "restart"})
-    group.init()
-    with group.group.auto_reset(math.inf):
-        found = evaluate(group.group, lambda batch: np.zeros(len(batch), int), 3)
-    assert [episode.length for episode in found.played] == [4, 4, 4]
-    assert found.failures == {"env_raised": 1}
 
 
 @on_one_driver

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -10,13 +9,10 @@ import pytest
 from kit.driven import Driven, on_one_driver
 from kit.tokens import Tokens, two_workers
 
-import rlightning_aio
 from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from rlightning_aio import EnvGroup
 
     Start: TypeAlias = Callable[..., Driven]
 
@@ -50,25 +46,3 @@ def test_options_for_each_env_are_refused_with_the_way_to_give_them(build: Start
             reset(options=options)
     assert group.group.pending == []
     group.reset(options={"fault": "nothing"})
-
-
-async def test_many_calls_at_once_each_get_their_own_replies() -> None:
-    """Steps, calls and one collect in parallel; no reply is mixed up."""
-
-    async def drive(group: EnvGroup, env_id: str) -> None:
-        tokens = Tokens()
-        for _ in range(50):
-            batch, _ = await group.step(tokens.steps([env_id]))
-            tokens.check(batch)
-            assert await group[env_id].call("do", "nothing") == f"{env_id} did nothing"
-
-    async with rlightning_aio.build_env_group(two_workers()) as group:
-        await group.reset()
-        collected = Tokens()
-
-        async def collect() -> None:
-            for _ in range(50):
-                group.step_async(collected.steps(["faulty-3"]))
-                collected.check((await group.collect_async())[0])
-
-        await asyncio.gather(*(drive(group, f"faulty-{k}") for k in range(3)), collect())

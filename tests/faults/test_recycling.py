@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import asyncio
 import mmap
 import os
 import random
-import signal
 import sys
 import time
 from functools import partial
@@ -19,12 +17,8 @@ import pytest
 from gymnasium import spaces
 from kit.scripted import Awaitable
 
-import rlightning_aio as aio
 import rlightning_aio.sync as rl
-from rlightning_aio import BatchedData, ConfigError, EnvConfig, PolicyResponse
-from rlightning_aio.attempts import EpisodeSpec, play
-from rlightning_aio.collecting import Collector
-from rlightning_aio.evaluation import evaluate
+from rlightning_aio import ConfigError, EnvConfig
 from rlightning_aio.vector import VectorEnv
 
 
@@ -140,135 +134,12 @@ def test_worker_goes_on_if_the_next_one_cannot_be_started(tmp_path: Path) -> Non
         reset_until_recycled(group)
 
 
-@pytest.mark.parametrize("which", [0, -1])
-def test_death_while_envs_go_over_is_one_like_any_other(which: int) -> None:
-    with rl.build_env_group(
-        EnvConfig(task=Walk, num_workers=2, envs_per_process=2, recycle={"episodes": 2})
-    ) as group:
-        group.reset(seed=0)
-        group.reset(env_ids=["Walk-0"])
-        assert [worker["env_ids"] for worker in group.get_workers()] == [["Walk-1"], ["Walk-0"]]
-        os.kill(group.get_workers()[which]["pid"], signal.SIGKILL)
-        lost = []
-        while not any(lost):
-            batch, _ = stepped(group)
-            lost = [bool(batch.restarted is not None and batch.restarted[k]) for k in range(2)]
-        assert lost == ([False, True] if which == 0 else [True, False])
-        assert group.metrics()["envs/restarts"] == 1
-        stepped(group)
-
-
-def test_death_in_a_step_of_envs_that_are_reset_in_it() -> None:
-    """The episode that it ends is truncated, and the others end and begin as without it."""
-    envs = VectorEnv(
-        [Walk] * 2, envs_per_process=1, recycle={"episodes": 2}, autoreset_mode="SameStep"
-    )
-    first, _ = envs.reset(seed=3)
-    (worker,) = (one for one in envs.group.get_workers() if one["env_ids"] == ["env-0"])
-    os.kill(worker["pid"], signal.SIGKILL)
-    truncated = np.array([False])
-    while not truncated.any():
-        before = first
-        first, _, terminated, truncated, infos = envs.step(np.ones(2, int))
-    assert truncated.tolist() == [True, False]
-    assert not terminated[0]
-    assert np.array_equal(infos["final_obs"][0], before[0])
-    for _ in range(20):
-        first, _, terminated, _, infos = envs.step(np.ones(2, int))
-        assert np.array_equal(first[:, 3] == 0, terminated)
-        assert np.array_equal(infos.get("_final_obs", terminated), terminated)
-    envs.close()
-
-
 def reset_until_recycled(group: Any) -> None:
     """Reset until a worker was renewed: the one before may still close, or the next one pause."""
     deadline = time.monotonic() + 60
     while not group.metrics()["envs/recycled"]:
         group.reset()
         assert time.monotonic() < deadline
-
-
-def stepped(group: Any) -> Any:
-    batch = BatchedData.from_dict(
-        {env_id: PolicyResponse(env_id=env_id, action=1) for env_id in group.env_ids}
-    )
-    return group.step(batch)
-
-
-def make_config(recycle: dict[str, int]) -> EnvConfig:
-    """Four envs in two workers."""
-    return EnvConfig(task=Walk, num_workers=4, envs_per_process=2, recycle=recycle)
-
-
-def vectored(recycle: dict[str, int], autoreset_mode: str) -> Any:
-    return played(Walk, recycle=recycle, autoreset_mode=autoreset_mode)
-
-
-def stable_baselines(recycle: dict[str, int]) -> Any:
-    pytest.importorskip("stable_baselines3")
-    from rlightning_aio import sb3
-
-    envs = sb3.VecEnv([Walk] * 4, envs_per_process=2, recycle=recycle)
-    envs.seed(3)
-    shown = [envs.reset()]
-    for k in range(60):
-        *some, infos = envs.step(np.full(4, k % 3))
-        shown += [*some, *(info.get("terminal_observation", []) for info in infos)]
-    numbers = envs.group.metrics()
-    envs.close()
-    return shown, numbers
-
-
-def collected(recycle: dict[str, int]) -> Any:
-    with rl.build_env_group(make_config(recycle)) as group:
-        collector = Collector(group, _all_ones, num_transitions=160, wait_all=True, seed=0)
-        return [collector.collect().observation for _ in range(3)], group.metrics()
-
-
-def evaluated(recycle: dict[str, int]) -> Any:
-    with rl.build_env_group(make_config(recycle)) as group:
-        found = evaluate(group, _all_ones, [EpisodeSpec("", seed=k) for k in range(24)])
-        return sorted((one.spec.seed, one.length) for one in found.attempts), group.metrics()
-
-
-def attempted(recycle: dict[str, int]) -> Any:
-    return asyncio.run(_attempted(recycle))
-
-
-async def _attempted(recycle: dict[str, int]) -> Any:
-    async def agent(episode: Any) -> None:
-        while True:  # It is left at the end of the env's episode.
-            if (await episode.step(1)).last_terminated:
-                return
-
-    async with aio.build_env_group(make_config(recycle)) as group:
-        tasks = [EpisodeSpec("", seed=k) for k in range(8)]
-        found = [group async for group in play(group, tasks, agent, 3)]
-        rewards = sorted((one.spec.seed, one.reward) for own in found for one in own.attempts)
-        return rewards, group.metrics()
-
-
-def _all_ones(batch: Any) -> dict[str, Any]:
-    return {"action": np.ones(len(batch), int)}
-
-
-@pytest.mark.parametrize(
-    "use",
-    [
-        partial(vectored, autoreset_mode="NextStep"),
-        partial(vectored, autoreset_mode="SameStep"),
-        pytest.param(stable_baselines, marks=pytest.mark.simulators),
-        collected,
-        evaluated,
-        attempted,
-    ],
-)
-def test_behind_every_interface(use: Any) -> None:
-    (plain, _), (renewed, numbers) = [use(recycle) for recycle in ({}, {"episodes": 3})]
-    assert len(plain) == len(renewed)
-    assert all(map(np.array_equal, plain, renewed))
-    assert numbers["envs/recycled"] > 0
-    assert numbers["envs/restarts"] == 0
 
 
 @pytest.mark.parametrize(

@@ -544,19 +544,6 @@ def stopped_in(order: Callable[..., None], ours: Fleet) -> Callable[..., None]:
 # -- close
 
 
-def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
-    """Not even with a host that can't be killed."""
-    ours = fleet()
-    ours.hosts[0].closes = ours.hosts[0].dies = False
-    closing = ours.end()
-    ours.pass_time(1.5)
-    ours.pass_time(0.2)
-    assert not closing.done
-    ours.pass_time(0.1)
-    assert closing.done
-    assert ours.log[-3:] == ["kill 0", "release 0", "release 1"]
-
-
 def test_a_death_while_closing_closes_the_host(fleet: Callable[..., Fleet]) -> None:
     """Nothing is replaced, and no wait goes on; a host that was given up is closed already."""
     ours = fleet((1, 1), max_restarts=0)
