@@ -190,12 +190,13 @@ class Leaky(Walk):
 
 def test_a_leak_changes_neither_results_nor_the_rate() -> None:
     """The issue's numbers with RLIGHTNING_AIO_EPISODES=20000, in ten minutes; -s shows them."""
-    num_episodes, limit_mb = int(os.environ.get("RLIGHTNING_AIO_EPISODES", "64")), 1500
+    num_episodes = int(os.environ.get("RLIGHTNING_AIO_EPISODES", "64"))
+    limit_mb = 1500 if num_episodes > 1000 else 150
     kinds = {
         leaks: VectorEnv(
             [partial(Leaky, leaks=leaks)] * 32,
             envs_per_process=8,
-            recycle={"memory_mb": limit_mb if num_episodes > 1000 else 150} if leaks else {},
+            recycle={"memory_mb": limit_mb} if leaks else {},
         )
         for leaks in (True, False)
     }

@@ -37,7 +37,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
     logs = log_settings() if elsewhere else None
     orders = [
         StartOrder(
-            config=_own_makers(config, [index for index, _ in share]).model_copy(
+            config=(own := _own_makers(config, [index for index, _ in share])).model_copy(
                 update={"env_vars": variables[host_id]}
             ),
             env_class=ENVS.registered(config.backend),
@@ -45,7 +45,7 @@ def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
             preprocess_fns=tuple(fn for _, fn in share),
             spins=num_processes <= num_cores,
             tasks=tasks,
-            is_hardware=config.is_hardware,
+            is_hardware=own.is_hardware,
             logs=logs,
         )
         for host_id, (config, share) in enumerate(shares)
