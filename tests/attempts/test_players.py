@@ -78,15 +78,15 @@ def test_a_place_whose_client_has_left_while_it_was_idle_is_free_no_more(
     queue = AttemptQueue(group, Rules())
     assert [*queue.free] == ["robots-0/0"]
     leave(group, client, batch)
-    queue.look(())
+    queue.look()
     assert not queue.free
     client = dial(group, hardware=False)
     until_it_is("up", group)
-    queue.look(["robots-0/0"], at_once=True)
+    queue.busy.add("robots-0/0")
+    queue.look(at_once=True)
     assert not queue.free
-    queue.look(())
-    assert not queue.free
-    queue.look((), at_once=True)
+    queue.release("robots-0/0")
+    assert [*queue.free] == ["robots-0/0"]
     assert [*queue.free] == ["robots-0/0"]
     group.reset()  # A client that has not read its welcome has no session that could end.
     group.close()

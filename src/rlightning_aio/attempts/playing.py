@@ -31,7 +31,7 @@ from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, AsyncIterable, Iterable, Iterator
+    from collections.abc import AsyncGenerator, AsyncIterable, Iterable
 
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.attempts.queue import Job, TaskInPlay
@@ -208,7 +208,7 @@ class _Engine:
                     async with asyncio.timeout(seconds):
                         await self._wake.wait()
                 if self._has_clients:
-                    self._queue.look(self._busy())
+                    self._queue.look()
         finally:
             self._clock.stop()
             await self._end_all()
@@ -253,7 +253,7 @@ class _Engine:
                     return True
                 self._start(env_id)
                 begun += 1
-            room, lacking = max(self._most, 1), self._num_lacking()
+            room, lacking = max(self._most, 1), queue.lacking()
             is_full = len(self.done) * self._size >= room or len(queue) - lacking >= room
             if is_full or lacking >= _MOST_LACKING or len(self._playing) >= room or not queue.free:
                 return False
@@ -305,8 +305,9 @@ class _Engine:
             queue.fault = one.error
             one.error.add_note(f"it played attempt {job.index} at {job.spec}")
         queue.players.note(attempt.outcome)
-        if not attempt.outcome.is_failure or one.env_id in queue.players.refresh():
-            queue.free[one.env_id] = None
+        if attempt.outcome.is_failure:
+            queue.players.refresh()
+        queue.release(one.env_id)
         for env_id in queue.players.out:
             queue.free.pop(env_id, None)
         if self._health.note(attempt.outcome, self._most, time.monotonic()):
@@ -365,13 +366,6 @@ class _Engine:
         self.news.set()
 
     # -- envs that are not there ------------------------------------------------------
-
-    def _num_lacking(self) -> int:
-        """Number of attempts that wait for an entry without an env."""
-        return self._queue.lacking(self._busy())
-
-    def _busy(self) -> Iterator[str]:
-        return (one.env_id for _, one in self._playing.values())
 
     def _check_envs(self) -> None:
         """Raise the last fault if attempts wait for an env that won't come."""

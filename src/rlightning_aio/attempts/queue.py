@@ -97,6 +97,7 @@ class AttemptQueue:
     Attributes:
         players: the envs.
         free: idle envs, the one that has been idle for longest first.
+        busy: envs that play.
         fault: the last error of a worker that ended.
     """
 
@@ -105,6 +106,7 @@ class AttemptQueue:
         self.flush()  # Else a line may be missing that was added just before.
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
+        self.busy: set[str] = set()
         self.fault: WorkerDied | None = None
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
@@ -248,6 +250,7 @@ class AttemptQueue:
         pinned = [queue for queue in self._pinned.get(env_id, {}).values() if queue]
         position = None if pinned else self._shared_job(env_id)
         del self.free[env_id]
+        self.busy.add(env_id)
         if pinned:
             first = min(queue[0].index for queue in pinned)
             return [queue.popleft() for queue in pinned if queue[0].index == first]
@@ -268,6 +271,12 @@ class AttemptQueue:
         return queue.popleft()
 
     # -- what has ended ---------------------------------------------------------------
+
+    def release(self, env_id: str) -> None:
+        """Let an env that is idle now play something else, if it is there."""
+        self.busy.discard(env_id)
+        if env_id in self.players.present:
+            self.free[env_id] = None
 
     def end(self, job: Job, attempt: Attempt, *, is_last: bool = False) -> bool:
         """Queue an attempt again that has failed, or note it; True if it is noted.
@@ -307,11 +316,11 @@ class AttemptQueue:
 
     # -- envs that are gone -----------------------------------------------------------
 
-    def lacking(self, busy: Iterable[str]) -> int:
-        """The number of attempts that wait for envs of which none is free or `busy`."""
+    def lacking(self) -> int:
+        """The number of attempts that wait for envs of which none is free or busy."""
         entry_of = self.players.entry_of
         entries, pinned = dict.fromkeys(self._entries()), dict.fromkeys(self._pinned_to())
-        for env_id in chain(self.free, busy):  # Few are looked at: each entry has many.
+        for env_id in chain(self.free, self.busy):  # Few are looked at: each entry has many.
             if not entries and not pinned:
                 break
             entries.pop(entry_of[env_id], None)
@@ -326,8 +335,8 @@ class AttemptQueue:
     def _pinned_to(self) -> list[str]:
         return [env_id for env_id, queues in self._pinned.items() if any(queues.values())]
 
-    def look(self, busy: Iterable[str], *, at_once: bool = False) -> None:
-        """Look which envs are there, a few times in a second: those that are not `busy` are free.
+    def look(self, *, at_once: bool = False) -> None:
+        """Look which envs are there, a few times in a second: those that are not busy are free.
 
         Looking at all places of an env_server takes its time.
         """
@@ -335,7 +344,7 @@ class AttemptQueue:
         if now < self._look_at and not at_once:
             return
         self._look_at = now + LOOK_SECONDS
-        present = self.players.refresh().difference(busy)
+        present = self.players.refresh() - self.busy
         for env_id in self.free.keys() - present:
             del self.free[env_id]
         for env_id in self.players.entry_of:  # In their order.

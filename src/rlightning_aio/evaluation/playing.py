@@ -26,7 +26,7 @@ from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -137,7 +137,7 @@ class PolicyPlay:
     def _begin_episodes(self) -> None:
         """Note ended episodes, and begin others in idle envs."""
         if self._has_clients:
-            self._queue.look(self._busy())
+            self._queue.look()
         while True:
             while self._ended:
                 self._keep(*self._ended.popleft())
@@ -152,16 +152,12 @@ class PolicyPlay:
             except WorkerDied as fault:
                 self._note_fault(fault)
 
-    def _busy(self) -> Iterator[str]:
-        pending, plays = self._pending, self._plays
-        return (env_id for env_id in self._places if env_id in pending or plays(env_id))
-
     def _rests(self, env_id: str) -> bool:
         return self._health.rests(env_id, time.monotonic())
 
     def _end_waiting(self) -> None:
         """End what waits while no env plays: only envs that are not there could play it."""
-        self._queue.look(self._busy(), at_once=True)
+        self._queue.look(at_once=True)
         self._health = Health()  # Envs rest only while others play.
         if self._queue.next_env(self._rests) is not None:
             return
@@ -346,9 +342,8 @@ class PolicyPlay:
 
     def _release(self, env_id: str) -> None:
         """Let an env begin other episodes if it plays none."""
-        players = self._queue.players
-        if not self._plays(env_id) and env_id not in players.out:
-            self._queue.free[env_id] = None
+        if not self._plays(env_id):
+            self._queue.release(env_id)
 
     # -- faults -----------------------------------------------------------------------
 
