@@ -753,6 +753,15 @@ async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFix
     assert len([one for one in said if "succeed again" in one]) == 1
 
 
+async def test_it_is_said_once_if_all_resets_fail(caplog: pytest.LogCaptureFixture) -> None:
+    """With their number and an env; then attempts begin one at a time."""
+    async with rooms(PLACES["loop"]) as group:
+        found = await played(group, tasks(5, reset="raise"), once, 1, Rules(retries=0))
+    assert [attempts[0].outcome.kind for attempts in found] == ["not_started"] * 5
+    (said,) = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    assert "most attempts fail (3 not_started, such as on env 'room-" in said
+
+
 async def test_what_fails_when_an_outage_begins_costs_no_try(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -890,6 +899,29 @@ async def test_groups_that_were_not_handed_out_come_after_a_resume(tmp_path: Pat
                         if len(found) % 5 == most % 5:
                             break
     assert sorted(found) == [*range(10)]
+
+
+async def test_what_was_not_handed_out_comes_first_after_a_resume(tmp_path: Path) -> None:
+    """Before tasks that come earlier in the list."""
+    path, stands_still = tmp_path / "attempts.jsonl", {0, 1}
+
+    async def agent(episode: AttemptEpisode) -> None:
+        if episode.spec.seed in stands_still:
+            await asyncio.Event().wait()
+        await once(episode)
+
+    async with sandboxes(4) as group:
+        with ResultsFile(path) as results:
+            async with contextlib.aclosing(play(group, tasks(4), agent, results=results)) as groups:
+                (first,) = await anext(groups)
+                while len(results) < 2:  # noqa: ASYNC110  # It tells nobody.
+                    await asyncio.sleep(0)
+    stands_still.clear()
+    async with sandboxes(1) as group:
+        with ResultsFile(path) as results:
+            (second,), *others = await played(group, tasks(4), agent, results=results)
+    assert {first.spec.seed, second.spec.seed} == {2, 3}
+    assert sorted(attempts.spec.seed or 0 for attempts in others) == [0, 1]
 
 
 async def test_lines_are_written_beside_the_event_loop(

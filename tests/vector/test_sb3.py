@@ -458,7 +458,9 @@ def test_make_vec_env_takes_the_arguments_of_stable_baselines3s(task: str) -> No
     entry = {"placement": "inline", "start_method": "fork"}
     for kind in (SubprocVecEnv, None):
         make_vec_env(task, 1, 0, vec_env_cls=kind, vec_env_kwargs=entry).close()
-    with pytest.raises(ValueError, match="object, and these envs are in a VecEnv: leave it out, or"):
+    with pytest.raises(
+        ValueError, match="object, and these envs are in a VecEnv: leave it out, or"
+    ):
         make_vec_env(task, 1, vec_env_cls=object)
     with pytest.raises(TypeError, match="unexpected keyword argument 'monitor'"):
         make_vec_env(task, 1, monitor=True)

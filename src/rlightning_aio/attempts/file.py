@@ -13,6 +13,7 @@ import contextlib
 import fcntl
 import json
 import os
+from collections import Counter
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self, TypeAlias
@@ -116,6 +117,11 @@ class ResultsFile:
     def is_handed_out(self, spec: EpisodeSpec) -> bool:
         """Return True if the attempts at a task were handed out."""
         return spec.key in self._handed_out
+
+    def left(self) -> Counter[EpisodeKey]:
+        """Count the attempts in groups that were not handed out, but those to be played again."""
+        final = (key for (key, _, _), line in self._lines.items() if line.is_final)
+        return Counter(key for key in final if key not in self._handed_out)
 
     def find(self, spec: EpisodeSpec, index: int, sub_env: int = 0) -> Attempt | None:
         """Read an attempt that is not played again; None if there is none."""

@@ -13,6 +13,7 @@ import contextlib
 import sys
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 from weakref import WeakSet
 
@@ -22,10 +23,11 @@ from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.numbers import Numbers
+from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.queue import LOOK_SECONDS, AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
-from rlightning_aio.attempts.tasks import TaskSource
+from rlightning_aio.attempts.tasks import TaskSource, spec_of_task
 from rlightning_aio.attempts.tries import Try, surely
 from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome
@@ -77,7 +79,8 @@ async def play(
         rules: see `Rules`.
         results: a file to add attempts to, and to continue from; it has no observations.
 
-    Groups come in the order of their ends. When the iterator ends, is closed
+    Groups come in the order of their ends; of a list of tasks, those come first that a file has as
+    complete, and that were not handed out. When the iterator ends, is closed
     (`contextlib.aclosing`) or cancelled, every env is idle or being replaced.
 
     Raises:
@@ -90,7 +93,12 @@ async def play(
             only envs are left that move something real and have failed: only you reset them.
     """
     _check(group, rules, results, size)
-    engine = _Engine(group, TaskSource(tasks), agent, size, rules or Rules(), results)
+    rules = rules or Rules()
+    if results is not None and isinstance(tasks, Sequence):
+        whole, left = needed(rules, size), results.left()
+        specs = [Players(group).assigned(spec_of_task(task)) for task in tasks]
+        tasks = sorted(specs, key=lambda spec: left[spec.key] < whole)
+    engine = _Engine(group, TaskSource(tasks), agent, size, rules, results)
     running = asyncio.create_task(engine.run())
     _in_play.add(group)
     running.add_done_callback(lambda _: _in_play.discard(group))

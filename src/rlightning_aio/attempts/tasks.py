@@ -41,14 +41,14 @@ class TaskSource:
             return None
         try:
             if self._async is None:
-                return _spec_of(next(self._sync))
+                return spec_of_task(next(self._sync))
             if self._reading is None:
                 self._reading = asyncio.ensure_future(_read(self._async))
                 self._reading.add_done_callback(lambda _: wake.set())
             if not self._reading.done():
                 return None
             reading, self._reading = self._reading, None
-            return _spec_of(reading.result())
+            return spec_of_task(reading.result())
         except (StopIteration, _NoMore):
             self.is_at_end = True
             return None
@@ -71,7 +71,8 @@ async def _read(tasks: AsyncIterator[Any]) -> Any:
         raise _NoMore from None
 
 
-def _spec_of(task: Any) -> EpisodeSpec:
+def spec_of_task(task: Any) -> EpisodeSpec:
+    """Return what a task that may be a tuple says."""
     if isinstance(task, tuple):
         return EpisodeSpec(*cast("tuple[Any, ...]", task))
     return task
