@@ -16,7 +16,6 @@ from itertools import chain, groupby
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio.attempts import Attempt, EpisodeSpec, play
-from rlightning_aio.attempts.players import Players
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
@@ -38,19 +37,9 @@ def reward(reward: list[float | None], **columns: Any) -> list[float | None]:
     return reward
 
 
-def task_of(prompt: Any) -> EpisodeSpec:
-    """Return a task with the prompt in its options, and a seed that is made from it."""
-    text = json.dumps(prompt, sort_keys=True)
-    return EpisodeSpec("", zlib.crc32(text.encode()), {"prompt": prompt})
-
-
 @contextlib.contextmanager
 def rollouts(
-    group: EnvGroup,
-    agent: Agent,
-    *,
-    rules: Rules | None = None,
-    task: Callable[[Any], EpisodeSpec] = task_of,
+    group: EnvGroup, agent: Agent, *, rules: Rules | None = None
 ) -> Generator[Callable[[list[Any], Any], dict[str, Any]]]:
     """Make the `rollout_func` of a `GRPOTrainer`; initialise the group, and close it at the end::
 
@@ -66,8 +55,9 @@ def rollouts(
             the length of ``completion_ids``. Reward functions get everything else, and ``reward``
             and ``outcome`` (of a rollout that has failed: None, and its `Outcome`).
         rules: see `Rules`; those with ``first`` lack the rollouts that are cancelled.
-        task: makes the task of a prompt; by default its options are ``{"prompt": prompt}``, and the
-            same prompt has the same seed, in every process.
+
+    A reset has the options ``{"prompt": prompt}``, and the same prompt has the same seed, in every
+    process.
 
     The function raises `RLightningError` if all rollouts of a batch have failed, and `ValueError`
     if an agent returns something else.
@@ -75,7 +65,7 @@ def rollouts(
     with asyncio.Runner() as runner:
 
         def rollout_func(prompts: list[Any], trainer: Any) -> dict[str, Any]:
-            attempts = runner.run(_played(group, agent, rules, [task(one) for one in prompts]))
+            attempts = runner.run(_played(group, agent, rules, prompts))
             return _columns(attempts, trainer.processing_class)
 
         runner.run(group.init())
@@ -86,21 +76,27 @@ def rollouts(
 
 
 async def _played(
-    group: EnvGroup, agent: Agent, rules: Rules | None, specs: list[EpisodeSpec]
+    group: EnvGroup, agent: Agent, rules: Rules | None, prompts: list[Any]
 ) -> list[Attempt]:
-    """Play attempts at tasks, which follow one another if they are the same; return them in order.
+    """Play attempts at prompts, which follow one another if they are the same; return these.
 
-    Where a batch is cut for several processes, a process has fewer of one task than of others.
+    Where a batch is cut for several processes, a process has fewer of one prompt than of others.
     """
-    specs = [*map(Players(group).assigned, specs)]  # As `play` has them.
+    specs = [_task_of(prompt) for prompt in prompts]
     runs = [list(run) for _, run in groupby(specs, lambda spec: spec.key)]
     size = math.gcd(*map(len, runs))
     tasks = [spec for run in runs for spec in run[::size]]
+    # By seed and options: `play` adds an entry and the name of its task.
     found = defaultdict[Any, list[Attempt]](list)
     async with contextlib.aclosing(play(group, tasks, agent, size, rules)) as groups:
         async for attempts in groups:
-            found[attempts.spec.key] += attempts
-    return [found[spec.key].pop(0) for spec in specs]
+            found[attempts.spec.key[2:]] += attempts
+    return [found[spec.key[2:]].pop(0) for spec in specs]
+
+
+def _task_of(prompt: Any) -> EpisodeSpec:
+    text = json.dumps(prompt, sort_keys=True)
+    return EpisodeSpec("", zlib.crc32(text.encode()), {"prompt": prompt})
 
 
 def _columns(attempts: list[Attempt], tokenizer: Any) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 import rlightning_aio as rl
-from rlightning_aio.attempts import EpisodeSpec
 from rlightning_aio.trl import reward, rollouts
 
 TRAINER = SimpleNamespace(processing_class=SimpleNamespace(eos_token_id=99))
@@ -77,27 +76,6 @@ def test_a_batch_in_which_all_fail_is_an_error() -> None:
         asked(["?!"])
 
 
-def test_entries_that_differ_alone_are_not_mixed() -> None:
-    """The user's own function makes the task of a prompt."""
-
-    def task(prompt: str) -> EpisodeSpec:
-        return EpisodeSpec("", 7, {"prompt": "x"}, entry=prompt)
-
-    entries = [
-        {"name": name, "task": Guess, "placement": "loop", "num_workers": 1} for name in "ab"
-    ]
-
-    async def named(episode: Any) -> Any:
-        await episode.step(1)
-        return {"prompt_ids": [1], "completion_ids": [2], "env": episode.env_id}
-
-    with rollouts(rl.build_env_group(entries), named, task=task) as rollout_func:
-        found = rollout_func(["b", "a", "b"], TRAINER)
-    assert found["env"] == ["b-0", "a-0", "b-0"]
-    assert found["logprobs"] is None
-    assert found["env_mask"] == [[1]] * 3
-
-
 def test_envs_may_have_a_task_with_a_name() -> None:
     """The tasks of prompts have none, so they are those of the entry."""
 
@@ -110,6 +88,8 @@ def test_envs_may_have_a_task_with_a_name() -> None:
     with rollouts(rl.build_env_group("CartPole-v1", num_workers=2), steps) as rollout_func:
         found = rollout_func(["a", "a", "b", "b"], TRAINER)
     assert [one.kind for one in found["outcome"]] == ["terminated"] * 4
+    assert found["logprobs"] is None
+    assert found["env_mask"] == [[1]] * 4
 
 
 @pytest.mark.parametrize(
