@@ -86,10 +86,8 @@ def make_vec_env(
     vec_envs = import_module("stable_baselines3.common.vec_env")
     dummy = vec_envs.DummyVecEnv
     if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, dummy):
-        remedy = "leave it out, or call Stable-Baselines3's make_vec_env"
-        raise ValueError(
-            f"vec_env_cls is {vec_env_cls.__name__}, and these envs are in a VecEnv: {remedy}"
-        )
+        where = f"vec_env_cls is {vec_env_cls.__name__}, and these envs are in a VecEnv"
+        raise ValueError(f"{where}: leave it out, or call Stable-Baselines3's make_vec_env")
     make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
     given = {**more, "env_kwargs": env_kwargs, "monitor_kwargs": _Continued(more)}
     inspect.signature(make).bind(env_id, n_envs, seed, vec_env_kwargs=vec_env_kwargs, **given)

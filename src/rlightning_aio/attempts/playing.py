@@ -14,7 +14,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 from weakref import WeakSet
 
 from rlightning_aio._core.group.api.facade import is_resettable
@@ -79,9 +79,8 @@ async def play(
         rules: see `Rules`.
         results: a file to add attempts to, and to continue from; it has no observations.
 
-    Groups come in the order of their ends; of a list of tasks, those come first that a file has as
-    complete, and that were not handed out. When the iterator ends, is closed
-    (`contextlib.aclosing`) or cancelled, every env is idle or being replaced.
+    Groups come in the order of their ends; of a list of tasks, those in `results` first. When the
+    iterator ends, is closed (`contextlib.aclosing`) or cancelled, every env is idle or replaced.
 
     Raises:
         TypeError: the group is synchronous, or an argument has another type.
@@ -94,14 +93,9 @@ async def play(
     """
     _check(group, rules, results, size)
     rules = rules or Rules()
-    if results is not None and isinstance(tasks, Sequence):
-        whole, left = needed(rules, size), results.left()
-        specs = [Players(group).assigned(spec_of_task(task)) for task in tasks]
-        tasks = sorted(specs, key=lambda spec: left[spec.key] < whole)
-    engine = _Engine(group, TaskSource(tasks), agent, size, rules, results)
-    running = asyncio.create_task(engine.run())
-    _in_play.add(group)
-    running.add_done_callback(lambda _: _in_play.discard(group))
+    source = TaskSource(_left_first(tasks, group, needed(rules, size), results))
+    engine = _Engine(group, source, agent, size, rules, results)
+    running = _started(engine, group)
     try:
         while True:
             while engine.done:
@@ -115,6 +109,22 @@ async def play(
         running.cancel()
         await asyncio.wait({running})  # Cancelled once more, it ends all the same.
         _ = running.cancelled() or running.exception()
+
+
+def _started(engine: _Engine, group: EnvGroup) -> asyncio.Task[None]:
+    running = asyncio.create_task(engine.run())
+    _in_play.add(group)
+    running.add_done_callback(lambda _: _in_play.discard(group))
+    return running
+
+
+def _left_first(tasks: Any, group: EnvGroup, whole: int, results: ResultsFile | None) -> Any:
+    """Put those of a list first of which a file has a `whole` group that was not handed out."""
+    if results is None or not isinstance(tasks, Sequence):
+        return tasks
+    assigned, left = Players(group).assigned, results.left()
+    specs = [assigned(spec_of_task(task)) for task in cast("Sequence[Any]", tasks)]
+    return sorted(specs, key=lambda spec: left[spec.key] < whole)
 
 
 def _check(group: Any, rules: Any, results: Any, size: int) -> None:
