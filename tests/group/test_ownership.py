@@ -158,34 +158,6 @@ def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
         assert found[0][0].reward.tolist() == [4.0] * 3
 
 
-@pytest.mark.parametrize("kind", ["sync", "asyncio"])
-def test_a_forked_child_is_refused(kind: str) -> None:
-    """It can neither use nor close the group of its parent, which continues."""
-    own = asyncio.Runner()
-    group: Any = (sync if kind == "sync" else rlightning_aio).build_env_group(PROBE)
-
-    def wait(result: Any) -> Any:
-        return own.run(result) if asyncio.iscoroutine(result) else result
-
-    wait(group.init())
-    batch, _ = wait(group.reset())
-    child = os.fork()
-    if child == 0:
-        refused = 0
-        for ask in (group.reset, group.close, lambda: group.step_async(batch)):
-            try:
-                wait(ask())
-            except RLightningError as error:
-                refused += "belongs to process" in str(error)
-        os._exit(refused)
-    _, status = os.waitpid(child, 0)
-    assert os.waitstatus_to_exitcode(status) == 3
-    batch, _ = wait(group.step(batch.respond(action=np.array([[0, 4.0]] * 3))))
-    assert batch.reward.tolist() == [4.0] * 3
-    wait(group.close())
-    own.close()
-
-
 # -- errors in callbacks
 
 

@@ -5,18 +5,15 @@ Here it runs in one group with processes and inline envs.
 
 from __future__ import annotations
 
-import asyncio
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from group.sample_envs import Probe
 from hosts import beside_others, thread_host
 from hosts.beside_others import (
     both_ways,
-    check_first_ready,
     check_methods,
     check_three_are_equal,
     check_usable_after_an_error,
@@ -26,8 +23,6 @@ from hosts.thread_host import EnvThread
 from kit.driven import Place
 
 import rlightning_aio.sync
-from rlightning_aio import ENVS, PolicyResponse
-from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.registry import PLACEMENTS, Placement
 
@@ -103,47 +98,13 @@ async def test_an_env_that_raises_stays_usable(facade: Place) -> None:
         await check_usable_after_an_error(group)
 
 
-async def test_results_out_of_band_are_copied(facade: Place) -> None:
-    """The env changes its results in place, and earlier results don't change."""
-    async with facade.build(entry("one", "reusing")) as group:
-        await group.reset()
-        results = [(await group.step(steps(one_0=0)))[0].values()[0] for _ in range(3)]
-    assert [ret.info["nested"] for ret in results] == [{"list": [1]}, {"list": [2]}, {"list": [3]}]
-    assert [ret.observation["items"][0].tolist() for ret in results] == [[1, 1], [2, 2], [3, 3]]
-
-
-async def test_packed_infos_are_decoded(facade: Place) -> None:
-    """A new schema is announced before its first info; options travel out of band."""
-    async with facade.build(entry("one", "gymnasium", task="Tree-v0")) as group:
-        batch, _ = await group.reset(seed=3, options={"nested": [1]})
-        assert batch.values()[0].info == {"seed": 3, "options": {"nested": [1]}}
-        (space,) = group.get_action_spaces()
-        batch, _ = await group.step(steps(one_0=space.sample()))
-        assert batch.values()[0].info["steps"] == 1
-
-
 async def test_methods_are_called_in_the_thread(facade: Place) -> None:
     """Calls return values, and only the caller gets their errors."""
     async with facade.build([entry("one"), entry("two", placement="process")]) as group:
         await check_methods(group)
 
 
-async def test_a_slow_env_does_not_delay_the_first_result(facade: Place, tmp_path: Path) -> None:
-    """Ready results come first, from a thread, a process or inline."""
-    await check_first_ready(facade, THREE_PLACES, "thread", tmp_path)
-
-
 # -- beginnings and ends
-
-
-async def test_an_env_that_cannot_be_built_is_named(facade: Place) -> None:
-    """No thread is left, whatever state the other hosts are in."""
-    fails = entry("bad", num_workers=3, envs_per_process=3, env_kwargs={"fails": 1})
-    others = [entry(f"good_{place}", placement=place) for place in THREE_PLACES]
-    group = facade.build([*others, fails])
-    with pytest.raises(StartFailed, match=r"env 'bad-1'.* could not be built: RuntimeError: no"):
-        await group.init()
-    assert env_threads() == []
 
 
 async def test_a_thread_that_cannot_be_started_fails_the_start(
@@ -189,80 +150,6 @@ async def test_a_thread_that_ends_is_replaced(
         batch, _ = await group.step(steps(one_0=[0.0, 1.0]))
         assert batch.reward.tolist() == [1]
         assert len(env_threads()) == 1
-
-
-class Closing(Probe):
-    """Logs its threads, and raises in `close`."""
-
-    log: ClassVar[list[tuple[str, str]]] = []
-    begun: ClassVar[threading.Event]
-    may_continue: ClassVar[threading.Event]
-
-    def step(self, policy_resp: PolicyResponse) -> Any:
-        self.log.append((f"step {self.worker_index}", threading.current_thread().name))
-        self.begun.set()
-        assert self.may_continue.wait(60)
-        return super().step(policy_resp)
-
-    def close(self) -> None:
-        self.log.append((f"close {self.worker_index}", threading.current_thread().name))
-        if self.worker_index == 1:
-            raise ValueError("stuck")
-
-
-@pytest.fixture
-def closing(monkeypatch: pytest.MonkeyPatch) -> type[Closing]:
-    monkeypatch.setitem(ENVS._classes, "closing", Closing)
-    Closing.log.clear()
-    Closing.begun, Closing.may_continue = threading.Event(), threading.Event()
-    return Closing
-
-
-async def test_envs_are_closed_in_order_in_their_thread(
-    facade: Place, closing: type[Closing]
-) -> None:
-    """Errors name the env."""
-    group = facade.build(entry("one", "closing", num_workers=3, envs_per_process=2))
-    with pytest.warns(UserWarning, match=r"close\(\) of env 'one-1' raised ValueError: stuck"):
-        async with group:
-            await group.reset()
-    names = ["envs from slot 0 on", "envs from slot 1 on", "envs from slot 1 on"]
-    closes = [("close 0", names[0]), ("close 1", names[1]), ("close 2", names[2])]
-    assert sorted(closing.log) == closes
-    assert closing.log.index(closes[1]) < closing.log.index(closes[2])
-
-
-async def test_a_close_drops_requests_that_have_not_begun(closing: type[Closing]) -> None:
-    """It waits for at most one step."""
-    group = rlightning_aio.build_env_group(
-        entry("one", "closing", num_workers=2, envs_per_process=2)
-    )
-    await group.init()
-    batch, _ = await group.reset()
-    group.step_async(batch.respond(action=np.zeros((2, 2))))
-    await asyncio.to_thread(closing.begun.wait)
-    task = asyncio.create_task(group.close())
-    await asyncio.sleep(0)  # It has closed its hosts.
-    closing.may_continue.set()
-    with pytest.warns(UserWarning, match="stuck"):
-        await task
-    assert [event for event, _ in closing.log] == ["step 0", "close 0", "close 1"]
-
-
-async def test_a_step_that_hangs_does_not_keep_a_group_from_closing(
-    facade: Place, closing: type[Closing], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its thread continues, and releases its resources when it ends."""
-    monkeypatch.setattr(times, "CLOSE", 0.05)
-    monkeypatch.setattr(times, "GRACE", 0.05)
-    monkeypatch.setattr(thread_host, "JOIN_SECONDS", 0.05)
-    async with facade.build(entry("one", "closing")) as group:
-        await group.reset()
-        group.step_async(steps(one_0=[0.0, 0.0]))
-        await asyncio.to_thread(closing.begun.wait)
-    (thread,) = env_threads()
-    closing.may_continue.set()
-    thread.join()
 
 
 def test_a_group_that_is_dropped_ends_its_threads() -> None:
