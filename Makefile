@@ -120,7 +120,7 @@ test-sanitized: $(VENV)/installed-test ## the compiled modules under AddressSani
 	        src/rlightning_aio/$$module.c -o build/sanitized/rlightning_aio/$$module.abi3.so || exit; \
 	done
 	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
-	    $(PY) -m pytest tests/protocol \
+	    $(PY) -m pytest tests/protocol tests/hosts/test_link.py \
 	    tests/group/test_stepping.py tests/envs/test_mujoco_batch.py tests/envs/test_mujoco_judging.py
 
 # The rings and the kernel on another processor's memory order: Debian's qemu runs Debian's Python.

@@ -1,10 +1,9 @@
-"""How the poller finds results: what it orders, when it polls, and what it executes itself."""
+"""How the poller waits for results: what it orders, and when it spins."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,11 +24,7 @@ class Worker(Host):
     """The part of a process host that a poller uses."""
 
     host_id: int
-    polled: int = 0
     on_bell = True
-
-    def poll(self) -> None:
-        self.polled += 1
 
 
 class Server(Worker):
@@ -56,30 +51,10 @@ class Server(Worker):
     check_step = check_reset = admit = forget = _not_asked
 
 
-@dataclass(eq=False)
-class Inline(Host):
-    """An inline host that records what it executes."""
-
-    host_id: int
-    waiting: int
-    log: list[int] = field(default_factory=list)
-
-    def execute(self, most: int, is_over: Any) -> int:
-        count = 0
-        while self.waiting and count < most:
-            self.waiting, count = self.waiting - 1, count + 1
-            self.log.append(self.host_id)
-            if is_over is not None and is_over():
-                break
-        return count
-
-
 class Scene:
     """A poller over hosts with given numbers of requests in flight, and a visible bell."""
 
-    def __init__(
-        self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0, clock: Any = time.monotonic
-    ) -> None:
+    def __init__(self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0) -> None:
         count = len(in_flight)
         memory = memoryview(bytearray(bell_size(count)))
         self.bell = TrainerBell(memory, count)
@@ -96,7 +71,7 @@ class Scene:
             return arm(goal, at_last=at_last)
 
         self.bell.arm = noted  # type: ignore[method-assign]
-        self.poller = Poller(self.requests, self.bell, num_cores, clock=clock)
+        self.poller = Poller(self.requests, self.bell, num_cores, clock=time.monotonic)
         kinds = kinds if isinstance(kinds, tuple) else (kinds,) * count
         self.hosts: list[Any] = [kind(k) for k, kind in enumerate(kinds)]
         for host in self.hosts:
@@ -186,14 +161,6 @@ def test_the_bell_is_not_armed_if_all_workers_are_idle() -> None:
 # -- reading
 
 
-def test_only_hosts_with_reports_are_polled() -> None:
-    """Workers that have reported, and servers that owe replies."""
-    scene = Scene(2, 2, 2, 0, kinds=(Worker, Worker, Server, Server))
-    scene.report(1)
-    scene.poller.poll()
-    assert [host.polled for host in scene.hosts] == [0, 1, 1, 0]
-
-
 def test_clients_on_this_machine_are_left_the_cores() -> None:
     """One core for each client that owes a result."""
     scene = Scene(2, kinds=Server, num_cores=2)
@@ -223,66 +190,3 @@ def test_a_spinning_trainer_disarms_the_bell() -> None:
     scene.report(0, 2)
     assert scene.poller.spin(2)
     assert not scene.workers[0].is_due()
-
-
-# -- inline hosts
-
-
-def inline_scene(*waiting: int, workers: int = 0, clock: Any = time.monotonic) -> Scene:
-    """Return a scene with inline hosts and one worker, with given numbers of requests."""
-    kinds = tuple(lambda k, n=n: Inline(k, n) for n in waiting)
-    scene = Scene(*waiting, workers, kinds=(*kinds, Worker), clock=clock)
-    log: list[int] = []
-    for host in scene.hosts[:-1]:
-        host.log = log
-    return scene
-
-
-@given(waiting=st.lists(st.integers(0, 5), min_size=1, max_size=4), wanted=st.integers(1, 12))
-def test_inline_hosts_execute_the_results_that_workers_cannot_provide(
-    waiting: list[int], wanted: int
-) -> None:
-    """At most the wanted number, host by host; returns True if there was anything to do."""
-    scene = inline_scene(*waiting)
-    assert scene.poller.execute(wanted, None) == (sum(waiting) > 0)
-    log = scene.hosts[0].log
-    assert log == [k for k, count in enumerate(waiting) for _ in range(count)][:wanted]
-
-
-def test_the_host_whose_turn_it_is_next_begins() -> None:
-    """So none waits forever for another one, which gets new requests all the time."""
-    scene = inline_scene(9, 9)
-    for _ in range(4):
-        assert scene.poller.execute(2, None)
-    assert scene.hosts[0].log == [0, 0, 1, 1, 0, 0, 1, 1]
-
-
-def test_one_at_a_time_is_executed_while_workers_have_something_to_do() -> None:
-    """The workers' results may come first."""
-    scene = inline_scene(3, 3, workers=1)
-    for count in range(1, 5):
-        assert scene.poller.execute(5, None)
-        assert len(scene.hosts[0].log) == count
-    assert all(one != other for one, other in pairwise(scene.hosts[0].log))
-
-
-def test_inline_hosts_stop_when_the_time_is_over() -> None:
-    """Between two envs; at least one is executed, so that the call makes progress."""
-    times = iter([0.0, 1.0, 2.0, 3.0])
-    scene = inline_scene(9, clock=lambda: next(times))
-    assert scene.poller.execute(9, 2.0)
-    assert len(scene.hosts[0].log) == 3
-    scene = inline_scene(9, clock=lambda: 5.0)
-    assert scene.poller.execute(9, 2.0)
-    assert len(scene.hosts[0].log) == 1
-
-
-def test_without_a_time_limit_the_clock_is_not_read() -> None:
-    """That would slow short steps."""
-
-    def asked() -> float:
-        raise AssertionError
-
-    scene = inline_scene(9, clock=asked)
-    assert scene.poller.execute(9, None)
-    assert len(scene.hosts[0].log) == 9

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import pickle
 import signal
-import sys
 from collections import deque
 from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock, patch
@@ -17,19 +16,11 @@ from protocol.memory_of_rings import unused
 from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
 from rlightning_aio._core.hosts.messages import (
-    Attached,
-    AttachOrder,
-    Built,
-    Closed,
     Died,
-    ErrorText,
     NewSchema,
-    NotBuilt,
-    Raised,
     Reported,
     Result,
     StartOrder,
-    Value,
 )
 from rlightning_aio._core.hosts.process.host import ForkServerHandle, ProcessHost, _surroundings
 from rlightning_aio.config import EnvConfig
@@ -54,13 +45,6 @@ pytestmark = pytest.mark.usefixtures("implementation")
 
 CONFIG = EnvConfig(name="two", backend="gymnasium", task="CartPole-v1", num_workers=2)
 SCHEMA = InfoSchema.of({"x": 1.5})
-
-
-class EndsTheProgram:
-    """It calls `sys.exit` where it is unpickled."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return sys.exit, (3,)
 
 
 class StandIn(ForkServerHandle):
@@ -246,16 +230,6 @@ def test_frames_come_before_later_reports(started: Scene) -> None:
         ]
 
 
-def test_polling_for_reports_reads_no_frame(started: Scene) -> None:
-    """A frame wakes the trainer by itself, so a poll needs no system call."""
-    started.host.submit(steps(1))
-    started.send(FrameKind.RESULT, step(1, 0), b"out of band")
-    started.host.poll()
-    assert started.posted() == []
-    started.read()
-    assert started.posted() == [Result(0, step(1, 0), b"out of band")]
-
-
 def test_a_partial_frame_is_posted_when_it_is_whole(started: Scene) -> None:
     """Reports that arrive meanwhile were sent before it."""
     frame = encode(FrameKind.RESULT, step(1, 0), b"out of band")
@@ -268,48 +242,6 @@ def test_a_partial_frame_is_posted_when_it_is_whole(started: Scene) -> None:
     started.rings.count_frame()
     started.read()
     assert started.posted() == [Result(0, step(1, 0), b"out of band")]
-
-
-def test_each_kind_of_frame_becomes_its_completion(started: Scene) -> None:
-    """If a payload can't be unpickled, its request fails."""
-    error = ErrorText("ValueError", "text", "traceback")
-    broken = b"\x80not a pickle"
-    for kind, number, payload, expected in (
-        (FrameKind.STARTED, 0, pickle.dumps(["s"]), Built(0, ["s"])),
-        (FrameKind.START_ERROR, 1, pickle.dumps(error), NotBuilt(0, 1, error)),
-        (FrameKind.ATTACHED, 0, b"", Attached(0)),
-        (FrameKind.VALUE, step(3, 1), pickle.dumps(7), Value(0, step(3, 1), 7)),
-        (FrameKind.ERROR, step(3, 1), pickle.dumps(error), Raised(0, step(3, 1), error)),
-    ):
-        started.send(kind, number, payload)
-        started.read()
-        assert started.posted() == [expected]
-    started.send(FrameKind.VALUE, step(4, 0), broken)
-    started.send(FrameKind.VALUE, step(4, 1), pickle.dumps(EndsTheProgram()))
-    started.send(FrameKind.STARTED, 0, broken)
-    started.read()
-    raised, ended, not_built = started.posted()
-    assert (type(raised), raised.entry) == (Raised, step(4, 0))
-    assert (ended.entry, ended.error.type_name) == (step(4, 1), "SystemExit")
-    assert (type(not_built), not_built.env_index) == (NotBuilt, 0)
-
-
-def test_requests_travel_by_ring_or_channel(started: Scene) -> None:
-    """Both wake a sleeping worker, and a frame is counted when all of it is written."""
-    (start,) = started.received()
-    assert start.kind == FrameKind.START
-    started.rings.frame_seen()
-    assert started.rings.fall_asleep()
-    started.host.submit(steps(1))
-    assert started.channel.recv(1 << 16) == BELL
-    started.rings.wake_up()
-    assert started.rings.requests() == steps(1).tolist()
-    packed = started.host.packed((3, {"x": 1}))
-    started.host.submit(steps(2)[:1], [packed])
-    assert started.rings.has_frame()
-    (frame,) = started.received()
-    assert (frame.kind, frame.number) == (FrameKind.REQUEST, step(2, 0))
-    assert pickle.loads(frame.payload) == (3, {"x": 1})
 
 
 def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) -> None:
@@ -385,19 +317,6 @@ def test_catching_up_writes_pending_data(started: Scene) -> None:
 # -- life
 
 
-def test_a_start_forks_a_worker_and_sends_its_order(scene: Scene) -> None:
-    """The worker also gets the offsets of its rings and its bell."""
-    scene.start()
-    (order,) = scene.fork_server.orders
-    place = order.place
-    assert (place.host_id, place.num_hosts, place.first_slot, place.num_envs) == (0, 1, 0, 2)
-    assert place.bell_offset == scene.bell_offset
-    scene.host.attach(AttachOrder((), (), 1.5))
-    start, attach = scene.received()
-    assert pickle.loads(start.payload).worker_indices == (0, 1)
-    assert pickle.loads(attach.payload) == AttachOrder((), (), 1.5)
-
-
 def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) -> None:
     """Earlier messages of the worker come first; all unanswered requests are among the last."""
     started.host.submit(steps(1))
@@ -441,21 +360,6 @@ def test_the_ring_of_a_dead_worker_takes_requests_until_its_death_is_posted(star
     assert set(steps(1).tolist()) <= set(died.death.requests)
 
 
-@pytest.mark.parametrize(
-    ("exit_code", "cause"),
-    [
-        (3, "exited with code 3"),
-        (-9, "was killed by SIGKILL (if"),
-        (-250, "was killed by signal 250"),
-    ],
-)
-def test_a_cause_of_death_is_described(started: Scene, exit_code: int, cause: str) -> None:
-    """Signals have their names."""
-    started.host.on_exit(exit_code, "")
-    (died,) = started.posted()
-    assert died.death.cause.startswith(cause)
-
-
 def test_a_replacement_has_a_new_link(started: Scene) -> None:
     """Reports and frames of the former worker are dropped, and counts are correct."""
     bell, old = started.bell, started.channel
@@ -475,32 +379,3 @@ def test_a_replacement_has_a_new_link(started: Scene) -> None:
     assert started.rung == 1
     started.read()
     assert started.posted() == [("reported", steps(3).tolist())]
-
-
-def test_a_close_is_posted_once_with_the_errors_of_the_envs(started: Scene) -> None:
-    """It is posted when the worker has exited, and not before."""
-    errors = [(1, ErrorText("ValueError", "text", "traceback"))]
-    started.host.close()
-    assert [frame.kind for frame in started.received()] == [FrameKind.START, FrameKind.CLOSE]
-    started.send(FrameKind.CLOSED, 0, pickle.dumps(errors))
-    started.read()
-    assert started.posted() == []
-    started.host.on_exit(0, "")
-    assert started.posted() == [Closed(0, errors)]
-    started.host.on_exit(0, "")
-    assert started.posted() == []
-
-
-def test_a_host_without_a_worker_closes_immediately(started: Scene) -> None:
-    """As after a death without a replacement."""
-    started.host.on_exit(1, "")
-    started.posted()
-    started.host.close()
-    assert started.posted() == [Closed(0, [])]
-
-
-def test_a_host_that_was_never_started_can_be_closed(scene: Scene) -> None:
-    """As when another host could not be started."""
-    scene.host.close()
-    assert scene.posted() == [Closed(0, [])]
-    scene.host.release()

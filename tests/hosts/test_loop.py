@@ -118,26 +118,6 @@ async def test_awaitable_envs_of_one_worker_are_in_flight_at_once() -> None:
         assert batch.reward.tolist() == [8.0] * 8
 
 
-async def test_a_collect_wakes_once_for_the_number_it_waits_for() -> None:
-    async with rl.build_env_group(entry(num_workers=50)) as group:
-        batch, _ = await group.reset()
-        gates = {env_id: asyncio.Event() for env_id in group.env_ids}
-        Scripted.gates.update(gates)
-        group.step_async(batch.respond(action=np.full(50, GATE)))
-        collecting = asyncio.ensure_future(group.collect_async(min_results=20))
-        for env_id in group.env_ids[:19]:
-            gates[env_id].set()
-        for _ in range(20):
-            await asyncio.sleep(0)
-        assert not collecting.done()
-        gates["e-40"].set()
-        batch, _ = await collecting
-        assert sorted(batch.ids()) == sorted([*group.env_ids[:19], "e-40"])
-        for gate in gates.values():
-            gate.set()
-        assert len((await group.collect_async(wait_all=True))[0]) == 30
-
-
 async def test_looks_for_late_requests_do_not_multiply(monkeypatch: pytest.MonkeyPatch) -> None:
     """One is planned at a time, also when a late request makes room for one that waits."""
     plan, planned = AwaitedEnvs._plan_look, list[bool]()
@@ -177,29 +157,6 @@ async def test_max_concurrency_limits_how_many_are_busy() -> None:
         assert not batch.restarted.any()
         assert batch.observation[:, 2].tolist() == [1.0] * 6
         assert (batch.busy_ns[4:] < time.monotonic_ns() - opened[1]).all()
-
-
-async def test_an_agent_may_be_one_coroutine_for_each_env() -> None:
-    """While other envs of the group are collected in batches."""
-
-    async def agent(env_id: str, seed: int) -> tuple[int, int]:
-        async with group.episode(env_id, seed=seed) as env:
-            count = 0
-            while not env.is_over:
-                count += 1
-                await env.step(END if count == 5 + seed else STEP)
-            last: Any = env.last
-            return count, int(last.observation[3])
-
-    async with rl.build_env_group(entry(num_workers=12)) as group:
-        batched = group.env_ids[8:]
-        agents = [asyncio.ensure_future(agent(group.env_ids[k], k)) for k in range(8)]
-        batch, _ = await group.reset(env_ids=batched)
-        for _ in range(10):
-            group.step_async(batch.respond(action=np.zeros(len(batch), int)))
-            batch, _ = await group.collect_async(min_results=2)
-            assert set(batch.ids()) <= set(batched)
-        assert await asyncio.gather(*agents) == [(5 + k, k) for k in range(8)]
 
 
 async def test_an_agent_is_woken_by_results_of_its_own_alone(
@@ -453,19 +410,6 @@ async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
         assert "Scripted.step" in caplog.text
 
 
-async def test_an_env_that_hangs_after_a_restore_begins_the_restored_episode_again(
-    place: dict[str, Any],
-) -> None:
-    async with rl.build_env_group(entry(step_timeout=SOON, **place)) as group:
-        await group.reset(seed=3)
-        snapshot = await group.snapshot()
-        await group.reset(seed=7)
-        await group.restore(snapshot)
-        batch, _ = await group.step(steps(e_0=HANG))
-        assert batch.restarted.all()
-        assert batch.observation[:, 3].tolist() == [3]
-
-
 class Tasked(Scripted):
     """Can't be reset without a task."""
 
@@ -615,18 +559,6 @@ async def test_an_env_that_is_not_rebuilt_gets_no_more_episodes_of_a_queue() -> 
         assert len(found.played) == 12
         assert found.failures == {"env_hung": 1}
         assert group.get_workers()[0]["given_up"] == ["e-1"]
-
-
-async def test_restarts_in_a_row_are_counted_until_a_step_succeeds() -> None:
-    async with rl.build_env_group(entry(step_timeout=SOON, max_restarts=1)) as group:
-        await group.reset()
-        for _ in range(3):
-            batch, _ = await group.step(steps(e_0=HANG))
-            assert batch.restarted.all()
-            await group.step(steps(e_0=STEP))
-        await group.step(steps(e_0=HANG))
-        with pytest.raises(EnvHung, match="after 1 restarts in a row"):
-            await group.step(steps(e_0=HANG))
 
 
 async def test_an_env_that_can_not_be_rebuilt_fails_its_requests_until_it_can() -> None:
@@ -927,18 +859,6 @@ async def test_an_env_that_does_not_suit_its_place_is_refused(
 def test_fields_that_mean_nothing_there_are_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         rl.build_env_group({**entry(), **fields})
-
-
-async def test_snapshots_are_taken_and_restored() -> None:
-    async with rl.build_env_group(entry(num_workers=2)) as group:
-        await group.reset(seed=3)
-        before, _ = await group.step(steps(e_0=STEP, e_1=STEP))
-        snapshot = await group.snapshot()
-        await group.step(steps(e_0=STEP, e_1=STEP))
-        batch, _ = await group.restore(snapshot)
-        assert batch.observation.tolist() == before.observation.tolist()
-        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
-        assert batch.observation[:, 2].tolist() == [2, 2]
 
 
 # -- event loops
