@@ -520,72 +520,6 @@ def test_an_episode_cut_by_the_step_limit_is_done() -> None:
 # -- sent columns
 
 
-@st.composite
-def any_sources(draw: st.DrawFn) -> tuple[Any, Any, list[Any]]:
-    """Return columns of several requests, or none, for the rows of a batch, and the values of each
-    row.
-    """
-    requests: list[Any] = [None]
-    for number in range(draw(st.integers(0, 3))):
-        rows = 4
-        base = number * 10.0 + np.arange(rows)
-        request: dict[str, Any] = {
-            "action": {"move": np.stack((base, -base), axis=1), "jump": (base.astype(int),)},
-            "tag": [f"{number}-{k}" for k in range(rows)],
-        }
-        if draw(st.booleans()):
-            request["log_prob"] = base / 2
-        requests.append(request)
-    n = draw(st.integers(1, 6))
-    chosen = draw(st.lists(st.sampled_from(range(len(requests))), min_size=n, max_size=n))
-    rows = draw(st.lists(st.integers(0, 3), min_size=n, max_size=n))
-    of_rows = np.empty(n, object)
-    of_rows[:] = [requests[k] for k in chosen]
-    return (
-        of_rows,
-        np.array(rows, np.intp),
-        [(requests[k], row) for k, row in zip(chosen, rows, strict=True)],
-    )
-
-
-@given(drawn=any_sources())
-def test_sent_columns_are_in_the_order_of_the_results(
-    drawn: tuple[Any, Any, list[Any]],
-) -> None:
-    """From any requests; rows without a request, or without the column, have no value."""
-    of_rows, rows, expected = drawn
-    batch = results(columns([k % 5 for k in range(len(rows))], None), sources=(of_rows, rows))
-    sent = batch.sent
-    names = {name for request, _ in expected if request for name in request}
-    assert set(sent) == set(sent.keys()) == names
-    for name in ("action", "tag", "log_prob"):
-        assert (name in sent) == (name in names)
-        if name not in names:
-            with pytest.raises(AttributeError, match=f"no '{name}' was sent"):
-                getattr(sent, name)
-            with pytest.raises(KeyError, match=f"no '{name}' was sent"):
-                sent[name]
-    if "tag" in names:
-        assert sent.tag == [request and request["tag"][row] for request, row in expected]
-        assert sent["tag"] == sent.tag
-        move, (jump,) = sent.action["move"], sent.action["jump"]
-        for k, (request, row) in enumerate(expected):
-            if request is None:
-                assert np.isnan(move[k]).all()
-                assert jump[k] == 0
-            else:
-                assert (move[k] == request["action"]["move"][row]).all()
-                assert jump[k] == request["action"]["jump"][0][row]
-        assert (move.shape, jump.dtype) == ((len(rows), 2), int)
-    if "log_prob" in names:
-        found = sent.log_prob
-        for k, (request, row) in enumerate(expected):
-            if request is None or "log_prob" not in request:
-                assert np.isnan(found[k])
-            else:
-                assert found[k] == request["log_prob"][row]
-
-
 def sent_for(n: int, *requests: Any, of_rows: list[int], rows: list[int]) -> Any:
     """Return the sent columns of `n` results that answer these requests."""
     of_each = np.empty(n, object)
@@ -665,16 +599,6 @@ def test_sent_tensors_stay_tensors() -> None:
     assert torch.equal(sent.choice, torch.tensor([6, 0, 4]))
 
 
-def test_sent_columns_are_copies() -> None:
-    """A policy may change its arrays afterwards."""
-    action, tags = {"a": (np.zeros(2),)}, ["x", "y"]
-    kept = {"action": copied(action), "tag": copied(tags)}
-    action["a"][0][:] = 9
-    tags[0] = "z"
-    assert kept["action"]["a"][0].tolist() == [0, 0]
-    assert kept["tag"] == ["x", "y"]
-
-
 def test_sent_tensors_are_copies() -> None:
     """Like arrays."""
     torch = pytest.importorskip("torch")
@@ -741,52 +665,6 @@ def test_sent_columns_can_be_copied_and_pickled() -> None:
 
 
 # -- infos
-
-
-@given(
-    infos=st.lists(
-        st.fixed_dictionaries(
-            {},
-            optional={
-                "count": st.integers(-9, 9),
-                "speed": st.floats(allow_nan=False),
-                "position": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
-                "name": st.text(max_size=3),
-                "nested": st.fixed_dictionaries({}, optional={"deep": st.integers(0, 9)}),
-            },
-        ),
-        min_size=1,
-        max_size=5,
-    )
-)
-def test_infos_are_columns_with_masks(infos: list[dict[str, Any]]) -> None:
-    """Typed if possible; masks show the rows with the key, also in nested dicts."""
-    batch = results(
-        columns(
-            list(range(len(infos))),
-            None,
-            out_of_band={k: {"info": info} for k, info in enumerate(infos)},
-        )
-    )
-
-    def check(found: Any, given_: list[Any], path: str = "") -> None:
-        keys = {key for info in given_ for key in info}
-        assert {key for key in found if key[0] != "_"} == keys, path
-        for key in keys:
-            has = [key in info for info in given_]
-            assert found["_" + key].tolist() == has
-            if key == "nested":
-                check(found[key], [info.get(key, {}) for info in given_], key)
-                continue
-            for value, info in zip(found[key], given_, strict=True):
-                if key in info:
-                    assert np.array_equal(value, info[key])
-
-    check(batch.infos, infos)
-    kinds = {"count": "i", "speed": "f", "position": "i", "name": "O"}
-    for key in kinds.keys() & batch.infos.keys():
-        assert batch.infos[key].dtype.kind == kinds[key]
-    assert batch.infos is batch.infos
 
 
 plain_infos = st.fixed_dictionaries(
@@ -976,33 +854,6 @@ def test_infos_of_sub_environments_have_their_own_masks(
         mask = expected["_" + key].reshape(len(slots), 3)
         np.testing.assert_array_equal(found["_" + key], mask)
         np.testing.assert_array_equal(found[key][mask], expected[key][mask.reshape(-1)])
-
-
-def test_infos_are_those_of_gymnasiums_vector_envs() -> None:
-    """So a loop written for one can read them."""
-    import gymnasium as gym
-
-    class Telling(gym.Env[Any, Any]):
-        observation_space = action_space = spaces.Discrete(2)
-
-        def __init__(self, number: int) -> None:
-            self.number = number
-
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-            return 0, infos[self.number]
-
-    infos: list[dict[str, Any]] = [
-        {"x": 1, "where": np.array([1.0, 2.0])},
-        {"x": 2, "episode": {"r": 3.5, "l": 2}, "final_obs": np.zeros(2)},
-        {},
-    ]
-    vector = gym.vector.SyncVectorEnv([lambda k=k: Telling(k) for k in range(3)])
-    _, expected = vector.reset()
-    vector.close()
-    batch = results(
-        columns([0, 1, 2], None, out_of_band={k: {"info": info} for k, info in enumerate(infos)})
-    )
-    assert repr(batch.infos) == repr(expected)
 
 
 def test_one_key_of_all_infos_is_a_column() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -171,28 +170,6 @@ def test_the_short_way_writes_the_same_rows(kind: type[Plain], history: list[Any
         assert row.slab.done_ns[1] >= row.slab.busy_ns[1] >= 0
 
 
-@pytest.mark.parametrize("kind", [Plain, Renewed])
-@given(history=histories, apart=st.sets(st.integers(0, 30)))
-def test_requests_out_of_band_have_the_same_effect_as_those_in_the_row(
-    kind: type[Plain], history: list[Any], apart: set[int]
-) -> None:
-    """They may alternate in any order; the episodes are the same."""
-    runner, env, row = runner_and_row(kind)
-    other, other_env, other_row = runner_and_row(kind)
-    for number, (what, then) in enumerate(history):
-        env.next = other_env.next = then
-        if what == "reset":
-            found = runner.execute(Operation.RESET, None)
-            op, arguments = Operation.RESET, (None, {})
-            in_row = partial(other.execute, op, None)
-        else:
-            found = runner.step()
-            op, arguments = Operation.STEP, (None, {})
-            in_row = other.step
-        expected = other.execute(op, arguments) if number in apart else in_row()
-        assert row.contents(found) == other_row.contents(expected)
-
-
 def test_a_reward_is_one_number_in_any_form() -> None:
     """An array of one element is a number, as on the long way; an error names other values."""
     runner, env, row = runner_and_row()
@@ -209,38 +186,7 @@ def test_a_reward_is_one_number_in_any_form() -> None:
             runner.step()
 
 
-def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
-    """The seed counts once; the next reset has none."""
-    runner, env, row = runner_and_row()
-    env.next = {}
-    row.slab.seed[1] = 7 + 1
-    runner.execute(Operation.RESET, None)
-    runner.execute(Operation.RESET, None)
-    assert env.seeds == [7, None]
-
-
-def test_infos_of_an_inline_env_are_copied() -> None:
-    """An info may be a dict that the env continues to change."""
-    runner, env, _ = runner_and_row(inline=True)
-    env.next = {"nested": {"list": [1]}}
-    out_of_band = runner.execute(Operation.RESET, None)
-    env.next["nested"]["list"].append(2)
-    assert out_of_band == {"info": {"nested": {"list": [1]}}}
-
-
 # -- what a row says, in each mode
-
-
-def flags_and_sums(slab: Slab, row: int = 0) -> list[Any]:
-    """Return is_reset, over, return and length; the return only if there is a length."""
-    lengths = slab.episode_length[row]
-    returns = np.where(lengths > 0, slab.episode_return[row], 0)
-    return [
-        slab.is_reset[row].tolist(),
-        slab.over[row].tolist(),
-        returns.tolist(),
-        lengths.tolist(),
-    ]
 
 
 def writer_of(
@@ -249,42 +195,6 @@ def writer_of(
     slab = new_slab(RowLayout(SPACE, spaces.Discrete(2), head, agents), 1)
     fields = {"env_id": "e-0", "announce": infos_out_of_band, **fields}
     return RowWriter(slab, 0, autoreset=mode, **fields), slab
-
-
-@pytest.mark.parametrize(
-    ("mode", "after_the_end", "then"),
-    [
-        # Without a reset, later steps belong to no episode.
-        ("disabled", [[False, False], [False, True], [3, 0], [3, 0]],
-                     [[False, False], [False, True], [4, 0], [4, 0]]),
-        # The step after the end is a reset.
-        ("next_step", [[False, True], [False, False], [3, 0], [3, 0]],
-                      [[False, False], [False, False], [4, 1], [4, 1]]),
-        # The result of the end has the first observation of the next episode.
-        ("same_step", [[False, False], [False, False], [3, 1], [3, 1]],
-                      [[False, False], [False, False], [4, 2], [4, 2]]),
-    ],
-)  # fmt: skip
-def test_a_row_has_flags_and_sums(
-    mode: Autoreset, after_the_end: list[Any], then: list[Any]
-) -> None:
-    """The second of two sub-environments ends in the second step."""
-    writer, slab = writer_of(mode, (2,))
-    begin(writer, {})
-    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
-    assert slab.reward[0].tolist() == [0, 0]
-    no = np.zeros(2, bool)
-    step(writer, np.ones(2), no, no, {})
-    assert flags_and_sums(slab) == [[False] * 2, [False] * 2, [1] * 2, [1] * 2]
-    step(writer, np.ones(2), np.array([False, True]), no, {})
-    assert flags_and_sums(slab) == [[False] * 2, [False, True], [2] * 2, [2] * 2]
-    assert slab.terminated[0].tolist() == [False, True]
-    step(writer, np.ones(2), no, no, {})
-    assert flags_and_sums(slab) == after_the_end
-    step(writer, np.ones(2), no, no, {})
-    assert flags_and_sums(slab) == then
-    begin(writer, {})
-    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
 
 
 def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
@@ -301,33 +211,6 @@ def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
 
 
 # -- what has no place in the row
-
-
-def test_infos_that_do_not_fit_go_out_of_band() -> None:
-    """So do extras and observations without a fixed size; the row holds the rest."""
-    row = Row(RowLayout(SPACE, spaces.Discrete(2), (), ()))
-    writer = RowWriter(row.slab, 1, env_id="e-0", autoreset="disabled", announce=row.announce)
-    observation = np.array([1.0, 2.0])
-    assert begin(writer, {"x": 1.5}, observation) is None
-    assert row.info(None) == {"x": 1.5}
-    assert row.slab.observation[1].tolist() == [1, 2]
-    assert begin(writer, {}, observation) is None
-    assert row.slab.info_mark[1] == NO_INFO
-    nested = {"nested": {"x": 1}}
-    assert begin(writer, nested, observation) == {"info": nested}
-    assert row.slab.info_mark[1] == PICKLED
-    assert begin(writer, {}, observation, {"e": 1}) == {"extra": {"e": 1}}
-    texts = Row(RowLayout(spaces.Text(9), spaces.Discrete(2), (), ()))
-    writer = RowWriter(texts.slab, 1, env_id="e-0", autoreset="disabled", announce=texts.announce)
-    assert begin(writer, {"x": 2.5}, "abc") == {"observation": "abc"}
-    assert texts.info(None) == {"x": 2.5}
-
-
-def test_without_schemas_infos_are_not_packed() -> None:
-    """An env_server writes so: infos of clients arrive in their own bytes."""
-    writer, slab = writer_of("disabled", ())
-    assert begin(writer, {"x": 1.5}, np.zeros(2)) == {"info": {"x": 1.5}}
-    assert slab.info_mark[0] == PICKLED
 
 
 def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
