@@ -1,28 +1,18 @@
-"""Rings: both sides over one block of memory, in any order of events, and in real processes."""
+"""Rings: what is in an entry, impossible counts, fences, and what must stop.
+
+That no entry is lost, random programs show, `test_interleavings`, and `test_bell` in processes.
+"""
 
 from __future__ import annotations
 
-import mmap
-import os
-import random
-import socket
 import sys
 import threading
-from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.stateful import (
-    RuleBasedStateMachine,
-    initialize,
-    invariant,
-    precondition,
-    rule,
-    run_state_machine_as_test,
-)
 from protocol.memory_of_rings import both_sides, memory_size, unused
 
 from rlightning_aio.protocol.entries import (
@@ -40,149 +30,10 @@ from rlightning_aio.protocol.rings import bell_size
 if TYPE_CHECKING:
     from types import FrameType
 
-    from rlightning_aio.protocol.rings import WorkerRings
 
 STEP = Operation.STEP
 
 pytestmark = pytest.mark.usefixtures("implementation")
-
-
-class RingsMachine(RuleBasedStateMachine):
-    """Entries arrive once, in order; a sleeping side is rung according to the rules.
-
-    This process drives both sides, so each event is atomic; the test with two processes covers
-    the rest.
-    """
-
-    @initialize(rows=st.integers(1, 6))
-    def start(self, rows: int) -> None:
-        self.rows = rows
-        self.bell, self.trainer, self.worker = both_sides(rows)
-        self.number = 0
-        self.requested: deque[int] = deque()
-        self.reported: deque[int] = deque()
-        self.frames = [0, 0]
-        self.asleep = False
-        # The armed number of reports, and the number that needs no further ring.
-        self.armed: int | None = None
-        self.settled: int | None = None
-        self.read = 0
-
-    @precondition(lambda self: self.room())
-    @rule(data=st.data())
-    def request(self, data: st.DataObject) -> None:
-        count = data.draw(st.integers(1, self.room()))
-        entries = [entry(self.number + k + 1, k, STEP) for k in range(count)]
-        self.number += count
-        self.requested.extend(entries)
-        assert self.trainer.request(np.array(entries, np.int64)) == self.asleep
-
-    def room(self) -> int:
-        """Send requests to idle envs, since each may have only one in flight."""
-        return self.rows - len(self.requested) - len(self.reported)
-
-    @precondition(lambda self: not self.asleep)
-    @rule(data=st.data())
-    def serve(self, data: st.DataObject) -> None:
-        bells: list[int] = []
-        executed: list[int] = []
-        in_rows = [data.draw(st.booleans()) for _ in self.requested]
-
-        def execute(request: int) -> bool:
-            executed.append(request)
-            return in_rows[len(executed) - 1]
-
-        served = self.worker.serve(
-            execute, unused, lambda: bells.append(len(executed)), unused, [], 0
-        )
-        assert served == bool(self.requested)
-        assert executed == list(self.requested)
-        self.reported += [done for done, in_row in zip(executed, in_rows, strict=True) if in_row]
-        self.requested.clear()
-        assert len(bells) == (served and self.look())
-
-    def look(self) -> bool:
-        """Expect a ring after a report: one for each arming, once there are enough reports,
-        and none for a disarmed bell.
-        """
-        enough = self.armed is None or self.read + len(self.reported) >= self.armed
-        if self.armed == self.settled or not enough:
-            return False
-        self.settled = self.armed
-        return self.armed is not None
-
-    @precondition(lambda self: self.room())
-    @rule()
-    def report(self) -> None:
-        """Report an entry that came in a frame."""
-        self.number += 1
-        done = entry(self.number, 0, Operation.RESET)
-        bells: list[int] = []
-        self.worker.report(done, lambda: bells.append(done))
-        self.reported.append(done)
-        assert len(bells) == self.look()
-
-    @rule()
-    def read_reports(self) -> None:
-        assert self.trainer.reports().tolist() == list(self.reported)
-        self.read += len(self.reported)
-        self.reported.clear()
-
-    @rule(count=st.integers(1, 6))
-    def order(self, count: int) -> None:
-        self.bell.arm(self.bell.goal(count), at_last=False)
-        # A goal that was armed too late takes effect at the next check.
-        self.armed = self.read + count
-
-    @rule()
-    def withdraw(self) -> None:
-        self.bell.disarm()
-        self.armed = None
-
-    @rule()
-    def send_frame(self) -> None:
-        self.frames[0] += 1
-        assert self.trainer.count_frame() == self.asleep
-
-    @precondition(lambda self: self.frames[0] >= 0)
-    @rule()
-    def see_frame(self) -> None:
-        """Also before it is counted: the trainer counts a frame after it has written it."""
-        self.frames[0] -= 1
-        self.worker.frame_seen()
-
-    @rule()
-    def send_frame_back(self) -> None:
-        self.worker.count_frame()
-        self.frames[1] += 1
-
-    @precondition(lambda self: not self.asleep)
-    @rule()
-    def fall_asleep(self) -> None:
-        something = bool(self.requested or self.frames[0] > 0)
-        self.asleep = self.worker.fall_asleep()
-        assert self.asleep == (not something)
-
-    @precondition(lambda self: self.asleep)
-    @rule()
-    def wake_up(self) -> None:
-        self.worker.wake_up()
-        self.asleep = False
-
-    @invariant()
-    def both_sides_agree(self) -> None:
-        if not hasattr(self, "trainer"):
-            return
-        assert self.bell.unread() == len(self.reported)
-        assert self.bell.with_news() == [0] * bool(self.reported)
-        assert self.trainer.has_frame() == (self.frames[1] > 0)
-        assert self.worker.has_frame() == (self.frames[0] > 0)
-        assert self.worker.has_news() == bool(self.frames[0] > 0 or self.requested)
-
-
-def test_rings() -> None:
-    """In any order of events."""
-    run_state_machine_as_test(RingsMachine, settings=settings(stateful_step_count=40))
 
 
 @given(
@@ -226,50 +77,6 @@ def test_the_trainer_sees_the_entry_in_execution_and_its_start() -> None:
     assert trainer.current() == (entry(7, 2, STEP), 123)
     worker.idle()
     assert trainer.current()[0] == 0
-
-
-def _work(rings: WorkerRings, channel: socket.socket) -> None:
-    """A worker without envs, which ends when the trainer closes the channel."""
-    while True:
-        if rings.serve(lambda _: True, unused, lambda: channel.send(b"!"), unused, [], 0):
-            continue
-        if rings.fall_asleep():
-            if not channel.recv(1 << 16):
-                return
-            rings.wake_up()
-
-
-def test_two_processes_never_miss_each_other() -> None:
-    """In thousands of rounds in which either side may fall asleep at the wrong moment."""
-    rows = 5
-    memory = memoryview(mmap.mmap(-1, memory_size(rows)))
-    bell, rings, worker = both_sides(rows, memory)
-    ours, theirs = socket.socketpair()
-    pid = os.fork()
-    if pid == 0:
-        ours.close()
-        try:
-            _work(worker, theirs)
-        finally:
-            os._exit(0)
-    theirs.close()
-    draw, number = random.Random(0), 0
-    for _ in range(4000):
-        count = draw.randint(1, rows)
-        entries = [entry(number + k, k, STEP) for k in range(count)]
-        number += count
-        if rings.request(np.array(entries, np.int64)):
-            ours.send(b"!")
-        found: list[int] = []
-        while len(found) < count:
-            wanted = draw.randint(1, count - len(found))
-            bell.arm(bell.goal(wanted), at_last=draw.random() < 0.5)
-            if bell.unread() < wanted:
-                ours.recv(1 << 16)
-            found += rings.reports().tolist()
-        assert found == entries
-    ours.close()
-    assert os.waitpid(pid, 0)[1] == 0
 
 
 def test_each_thread_has_its_own_fence() -> None:
