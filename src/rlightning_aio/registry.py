@@ -221,7 +221,7 @@ PLACEMENTS: dict[str, Placement] = {
         spreads=True,
         refuses={"ray_options": _NOT_RAYS, "max_concurrency": _NOT_ON_LOOP},
         awaits="also",
-        check="rlightning_aio._core.hosts.process.system:check_system",
+        check="rlightning_aio._core.hosts.process.host:check_system",
     ),
     "loop": Placement(
         "rlightning_aio._core.hosts.loop:LoopHost",

@@ -14,7 +14,7 @@ from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio._core.group.supervision import overdue
+from rlightning_aio._core.group.supervision import workers
 
 
 class Stuck(Counts):
@@ -37,7 +37,7 @@ def gate(tmp_path: Any) -> Any:
 
 def watch(group: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a group whose envs have been reset wait no more than a moment."""
-    monkeypatch.setattr(overdue, "OWED_SECONDS", 0.3)
+    monkeypatch.setattr(workers, "OWED_SECONDS", 0.3)
     supervisor = group._core.supervisor
     supervisor.overdue.begin(time.monotonic())
     supervisor.plan()

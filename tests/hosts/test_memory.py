@@ -7,7 +7,7 @@ import subprocess
 import sys
 from threading import Event, Thread
 
-from rlightning_aio._core.hosts.memory import resident_mb
+from rlightning_aio._core.hosts.processes import resident_mb
 
 
 def test_a_thread_that_ends_meanwhile_hides_no_memory() -> None:

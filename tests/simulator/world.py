@@ -53,7 +53,7 @@ from simulator.sockets import Epoll, Loop, Sockets, WakeUp, run_in_process
 from rlightning_aio import sharing
 from rlightning_aio._core.group.drivers import sync_driver
 from rlightning_aio._core.group.setup import start_orders
-from rlightning_aio._core.group.supervision import hint, overdue
+from rlightning_aio._core.group.supervision import hint, workers
 from rlightning_aio._core.hosts import descriptors
 from rlightning_aio._core.hosts.awaiting import awaited_envs
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
@@ -232,7 +232,7 @@ class World:
             (exchange, "new_fence", lambda: self.point),
             (rings, "new_fence", lambda: self.point),
             # A call that would wait for ever must be found to.
-            (overdue, "OWED_SECONDS", math.inf),
+            (workers, "OWED_SECONDS", math.inf),
             (rays.MODULE, "ray", rays.SimulatedRay(self)),
             (secrets, "randbits", self.rng.getrandbits),
             # The sizes of messages decide where they are cut, so none depends on the machine.

@@ -33,11 +33,10 @@ from rlightning_aio._core.group.supervision.fault_messages import (
 )
 from rlightning_aio._core.group.supervision.hang_detector import HangDetector
 from rlightning_aio._core.group.supervision.hint import Hint
-from rlightning_aio._core.group.supervision.overdue import Overdue
 from rlightning_aio._core.group.supervision.places import Places
 from rlightning_aio._core.group.supervision.renewals import Renewals
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
-from rlightning_aio._core.group.supervision.workers import Workers
+from rlightning_aio._core.group.supervision.workers import Overdue, Workers
 from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.limits import restart_pause
 from rlightning_aio._core.hosts.messages import (

@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
-from rlightning_aio._core.hosts.process.descendants import adopt_orphans, children, kill_below
 from rlightning_aio._core.hosts.process.fork_messages import (
     CloseLimit,
     Exited,
@@ -44,6 +43,7 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Preload,
     Ready,
 )
+from rlightning_aio._core.hosts.processes import adopt_orphans, children, kill_below
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

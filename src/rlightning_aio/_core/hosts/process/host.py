@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
-from rlightning_aio._core.hosts.memory import resident_mb
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
@@ -37,7 +36,8 @@ from rlightning_aio._core.hosts.process.fork_messages import (
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 from rlightning_aio._core.hosts.process.link import Link
 from rlightning_aio._core.hosts.process.spares import RunningForkServer
-from rlightning_aio._core.hosts.process.system import processor_ns
+from rlightning_aio._core.hosts.processes import processor_ns, resident_mb
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
@@ -447,6 +447,21 @@ class ProcessHost(Host):
         if self._link is not None:
             self._link.catch_up()
         return (len(self._wiring.completions), self.traffic) != (posted, traffic)
+
+
+def check_system(config: EnvConfig) -> None:
+    """Check that worker processes can run on this system.
+
+    Raises:
+        ConfigError: it is not Linux.
+    """
+    if sys.platform != "linux":
+        raise ConfigError(
+            f"entry {config.name!r}: worker processes (placement: process) need Linux, and this is "
+            f"{sys.platform}. Here, use placement: inline (the envs live in this process), "
+            "placement: loop (awaitable envs, in the asynchronous group) or backend: env_server "
+            "(envs elsewhere connect); make_vec steps MuJoCo's tasks in one batch in this process"
+        )
 
 
 def _new_channel() -> tuple[socket.socket, socket.socket]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from rlightning_aio._core.hosts import times
-from rlightning_aio._core.hosts.process.descendants import kill_below
+from rlightning_aio._core.hosts.processes import kill_below
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import MessageSocket

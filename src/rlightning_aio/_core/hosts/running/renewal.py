@@ -12,7 +12,7 @@ import os
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio._core.hosts.memory import resident_mb
+from rlightning_aio._core.hosts.processes import resident_mb
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig

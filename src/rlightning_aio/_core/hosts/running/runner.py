@@ -25,7 +25,6 @@ from rlightning_aio._core.hosts.messages import (
     NewSchema,
     OutOfBand,
 )
-from rlightning_aio._core.hosts.running.env_calls import call_env
 from rlightning_aio._core.hosts.running.renewal import HandedOn
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
@@ -229,7 +228,7 @@ class EnvRunner:
             return partial(self._restore, *arguments), self._finish_restore
         if arguments[0] == RENEW:
             return self._spend, _outcome
-        return partial(call_env, self.env, *arguments), _outcome
+        return partial(_call, self.env, *arguments), _outcome
 
     def _spend(self) -> None:
         self.is_spent = not self.is_hardware
@@ -540,3 +539,52 @@ def stop_one(runners: Sequence[EnvRunner], index: int) -> None:
     """Begin to stop one of the envs of a host in this process, if it is built."""
     for runner in runners[index : index + 1]:
         begin_stops([runner.env])
+
+
+# -- methods and attributes of an env, by name -------------------------------------
+
+
+def _call(env: BaseEnv, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Call a method of the env, or else of the outermost wrapper that has it.
+
+    Raises:
+        AttributeError: none of them has it.
+    """
+    if name == "get_attr":
+        return _get_attr(env, *args, **kwargs)
+    if name == "set_attr":
+        return _set_attr(env, *args, **kwargs)
+    return getattr(_layer_with(env, name, f"{name}()"), name)(*args, **kwargs)
+
+
+def _layer_with(env: BaseEnv, name: str, words: str) -> Any:
+    for layer in _layers(env):
+        if hasattr(layer, name):
+            return layer
+    raise AttributeError(
+        f"neither env {env.env_id!r} nor its simulator, nor a wrapper around that, has {words}"
+    )
+
+
+def _layers(env: BaseEnv) -> Iterator[Any]:
+    """The env, its simulator's wrappers from the outermost in, and the simulator itself."""
+    seen: set[int] = set()
+    layer: Any = env
+    while layer is not None and id(layer) not in seen:
+        yield layer
+        seen.add(id(layer))
+        layer = getattr(layer, "env", None)
+    yield _simulator(env)
+
+
+def _simulator(env: BaseEnv) -> Any:
+    return env if env.env is None else getattr(env.env, "unwrapped", env.env)
+
+
+def _get_attr(env: BaseEnv, name: str) -> Any:
+    return getattr(_layer_with(env, name, name), name)
+
+
+def _set_attr(env: BaseEnv, name: str, value: Any) -> None:
+    owner = next((layer for layer in _layers(env) if hasattr(layer, name)), _simulator(env))
+    setattr(owner, name, value)

@@ -1,4 +1,5 @@
-"""What a worker's envs have started (browsers, simulators, shells), found and killed with it.
+"""Processes of this machine: what a worker's envs have started (browsers, simulators, shells) is
+found and killed with it; the memory and the processor time that one uses.
 
 A process whose parent ends becomes a child of its nearest ancestor that adopts. Each worker adopts,
 so that all that its envs have started stays below it, also what begins a session of its own. The
@@ -25,6 +26,7 @@ then, and ends by itself.
 """
 
 _PR_SET_CHILD_SUBREAPER: Final = 36
+_PAGE_MB: Final = os.sysconf("SC_PAGE_SIZE") / 1e6
 _MOST_ROUNDS: Final = 100
 """Each kills all that was found, so a second one only meets what was started meanwhile."""
 
@@ -84,3 +86,33 @@ def _variables(pid: int) -> bytes:
         return b"\0" + Path(f"/proc/{pid}/environ").read_bytes()
     except OSError:  # It has ended meanwhile, or it is another user's.
         return b""
+
+
+def resident_mb(pid: int) -> float:
+    """Return the resident memory of a process and its descendants in MB; 0 if it has ended."""
+    process = Path(f"/proc/{pid}")
+    try:
+        pages = int((process / "statm").read_text().split()[1])
+        threads = [*(process / "task").iterdir()]
+    except (OSError, ValueError):  # It has ended meanwhile, or this isn't Linux.
+        return 0.0
+    children: list[int] = []
+    for thread in threads:
+        with contextlib.suppress(OSError):  # A thread may have ended, too.
+            children += map(int, (thread / "children").read_text().split())
+    return pages * _PAGE_MB + sum(map(resident_mb, children))
+
+
+def processor_ns(pid: int) -> int | None:
+    """Return for how long the living threads of a process have run or waited for a core, in ns.
+
+    None if the process has ended, or the kernel keeps no such accounts.
+    """
+    ran = 0
+    try:
+        for accounts in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            on_core, in_queue, _ = accounts.read_text().split()
+            ran += int(on_core) + int(in_queue)
+    except (OSError, ValueError):
+        return None  # A thread has ended meanwhile, or the accounts have another form.
+    return ran or None
