@@ -26,10 +26,17 @@ if TYPE_CHECKING:
 
 
 class Agents:
-    """`AgentSteps` of one group, on its event loop."""
+    """`AgentSteps` of one group, on its event loop.
+
+    Args:
+        steps, driver: of the group.
+
+    Attributes:
+        steps: as given.
+    """
 
     def __init__(self, steps: AgentSteps, driver: AioDriver) -> None:
-        self._steps = steps
+        self.steps = steps
         self._driver = driver
         self._serving: asyncio.Task[None] | None = None
 
@@ -41,8 +48,8 @@ class Agents:
         loop = asyncio.get_running_loop()
         reply: asyncio.Future[Any] = loop.create_future()
         step = AgentStep(env_id, what, reply)
-        if self._steps.ask(step):
-            serving = self._driver.run(self._steps.serve(time.monotonic()))
+        if self.steps.ask(step):
+            serving = self._driver.run(self.steps.serve(time.monotonic()))
             self._serving = new_task(serving, loop, Context())  # In no agent's context.
             self._serving.add_done_callback(self._on_end)
         return step, reply
@@ -54,24 +61,12 @@ class Agents:
         try:
             return await outcome_of(reply)
         except asyncio.CancelledError:
-            self._steps.leave(step)
+            self.steps.leave(step)
             raise
-
-    def loss(self, env_id: str) -> Outcome | None:
-        """The loss of an idle env's episode since its newest result; None if it has not lost it."""
-        return self._steps.loss(env_id)
-
-    def queues(self, env_id: str) -> bool:
-        """Return True if requests to an env may wait in a queue of `max_concurrency`."""
-        return self._steps.queues(env_id)
-
-    def seconds_in_env(self, env_id: str) -> float | None:
-        """Return what `AgentSteps` documents."""
-        return self._steps.seconds_in_env(env_id)
 
     def _on_end(self, task: asyncio.Task[None]) -> None:
         if task is self._serving and task.cancelled():
-            self._steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
+            self.steps.fail(asyncio.CancelledError())  # Perhaps before it had begun.
 
 
 async def outcome_of(reply: asyncio.Future[Any]) -> Any:
@@ -192,7 +187,7 @@ class EnvEpisode:
         """
         if self.lost is None:
             value = await self._asked(MethodCall(name, args, kwargs))
-            if (lost := self._agents.loss(self.env.env_id)) is None:
+            if (lost := self._agents.steps.loss(self.env.env_id)) is None:
                 return value
             self._lose(lost)
         raise self._error(None)
@@ -200,7 +195,7 @@ class EnvEpisode:
     @property
     def queues(self) -> bool:
         """Return True if steps may wait in a queue of `max_concurrency`."""
-        return self._agents.queues(self.env.env_id)
+        return self._agents.steps.queues(self.env.env_id)
 
     @property
     def seconds_in_env(self) -> float | None:
@@ -208,7 +203,7 @@ class EnvEpisode:
 
         None while a step waits in a queue.
         """
-        return self._agents.seconds_in_env(self.env.env_id)
+        return self._agents.steps.seconds_in_env(self.env.env_id)
 
     def _lose(self, lost: Outcome) -> None:
         self.lost, self.is_over = lost, True

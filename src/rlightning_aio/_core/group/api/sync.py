@@ -134,9 +134,7 @@ class EnvHandle(EnvHandleInterface):
         return only_result(self._group.step(steps_of(self.env_id, response)))
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.calls.call_one(time.monotonic(), slot, (name, args, kwargs))
-        return self._driver.run(procedure)
+        return self._group.call_with(name, args, kwargs, [self.env_id])[0]
 
 
 def due_for_reset(group: EnvGroup) -> NDArray[np.bool_]:

@@ -30,33 +30,25 @@ class Calls:
         self._envs = tables.envs
         self._requests = tables.requests
         self._supervisor = supervisor
-        self._intake = waiting.intake
         self._waiting = waiting
-
-    def call_one(self, now: float, slot: int, call: Call) -> Procedure[Any]:
-        """Call a method of one env and return its value."""
-        with self._observed.call("call", now):
-            return (yield from self._call(now, self._requests.alone(slot), call))[0]
 
     def call(self, now: float, env_ids: Sequence[str] | None, call: Call) -> Procedure[list[Any]]:
         """Call a method of envs, or of every local env, in parallel and return its values."""
         with self._observed.call("call", now):
-            return (yield from self._call(now, self._envs.chosen(env_ids), call))
-
-    def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
-        send = self._prepared(now, slots, call[0], [call] * len(slots))
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return values_of(ticket)
+            slots = self._envs.chosen(env_ids)
+            send = self._prepared(now, slots, [call] * len(slots), call[0])
+            ticket, _ = yield from self._waiting.ask(now, slots, send)
+            return values_of(ticket)
 
     def prepared(
         self, now: float, env_ids: Sequence[str], calls: Sequence[Call]
     ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
         """Check a call of one method for each env; return the slots, and what sends the calls."""
         slots = self._envs.chosen(env_ids)
-        return slots, self._prepared(now, slots, calls[0][0], calls)
+        return slots, self._prepared(now, slots, calls, calls[0][0])
 
     def _prepared(
-        self, now: float, slots: NDArray[np.intp], name: str, calls: Sequence[Call]
+        self, now: float, slots: NDArray[np.intp], calls: Sequence[Call], name: str
     ) -> Callable[[Ticket], None]:
         return self.request(now, slots, Operation.CALL, name, calls, f"the arguments of {name}()")
 
@@ -79,7 +71,6 @@ class Calls:
             arguments: of the request to each slot.
             what: describes the arguments in messages.
         """
-        self._intake.apply_completions()
         self._envs.check_local(slots, f"call {name} of")
         self._waiting.check_sendable(now, slots, f"call {name} of")
         packed = [

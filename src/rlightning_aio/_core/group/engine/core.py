@@ -130,7 +130,8 @@ class Core:
     ) -> None:
         """Send resets, whose results `collect` returns."""
         with self.observed.call("reset_async", now):
-            self._resets.reset_async(now, seed, options, env_ids)
+            _, send = self._resets.prepared(now, seed, options, env_ids)
+            send(None)
         self.waiting.wake()
 
     # -- ends without results ---------------------------------------------------------

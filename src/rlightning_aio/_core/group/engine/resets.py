@@ -49,7 +49,6 @@ class Resets:
         self._supervisor = supervisor
         self._places = supervisor.places
         self._results = results
-        self._intake = waiting.intake
         self._waiting = waiting
 
     def reset(
@@ -62,29 +61,31 @@ class Resets:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
         if env_ids is None and self._places.servers:
             now = yield from self._await_clients(now)
-        slots = self._envs.chosen(env_ids)
-        return (yield from self._reset(now, seed, options, slots))
+        slots, send = self.prepared(now, seed, options, env_ids)
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
+        return ticket, slots
 
     def prepared(
-        self, now: float, seed: Seeds, options: dict[str, Any] | None, env_ids: Sequence[str]
-    ) -> tuple[NDArray[np.intp], Callable[[Ticket], None]]:
-        """Check resets; return the slots, and what sends the resets for a ticket."""
-        slots = self._envs.chosen(env_ids)
-        return slots, self._prepared(now, seed, options, slots)
-
-    def reset_async(
         self,
         now: float,
         seed: Seeds,
         options: dict[str, Any] | None,
         env_ids: Sequence[str] | None,
-    ) -> None:
-        """Send resets, whose results the collector gets."""
+    ) -> tuple[NDArray[np.intp], Callable[[Ticket | None], None]]:
+        """Check resets; return the slots, and what sends the resets.
+
+        That is given the ticket that they are for; None: the collector gets their results.
+        """
         slots = self._envs.chosen(env_ids)
-        seeds = self._seeds_for(slots, seed)
+        seeds = seeds_for(self._envs, seed, slots)
         self._waiting.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
-        self._send(slots, seeds, options, packed, COLLECTOR, now)
+
+        def send(ticket: Ticket | None) -> None:
+            owner = COLLECTOR if ticket is None else ticket.owner
+            self._send(slots, seeds, options, packed, owner, now)
+
+        return slots, send
 
     def _await_clients(self, now: float) -> Procedure[float]:
         """Wait until every place has a client."""
@@ -96,30 +97,6 @@ class Resets:
             now = yield Wait(self._supervisor.next_check(due if due < math.inf else None))
             self._waiting.check(now)
         return now
-
-    def _reset(
-        self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
-    ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
-        send = self._prepared(now, seed, options, slots)
-        ticket, _ = yield from self._waiting.ask(now, slots, send)
-        return ticket, slots
-
-    def _prepared(
-        self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
-    ) -> Callable[[Ticket], None]:
-        seeds = self._seeds_for(slots, seed)
-        self._waiting.check_sendable(now, slots, "reset")
-        packed = self._packed_resets(slots, seeds, options)
-
-        def send(ticket: Ticket) -> None:
-            self._send(slots, seeds, options, packed, ticket.owner, now)
-
-        return send
-
-    def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds) -> NDArray[np.int64]:
-        """Apply completions, and return the seeds of resets that are about to be sent."""
-        self._intake.apply_completions()
-        return seeds_for(self._envs, seed, slots)
 
     def _packed_resets(
         self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None

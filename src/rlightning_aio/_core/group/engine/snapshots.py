@@ -113,7 +113,6 @@ class Snapshots:
         for slot, snapshot in zip(each, snapshots, strict=True):
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot])
             check_same(snapshot, identity, self._envs.describe(slot))
-        self._waiting.intake.apply_completions()
         self._waiting.check_sendable(now, slots, "restore")
         states = [(snapshot.versions, snapshot.state) for snapshot in snapshots]
         packed = [

@@ -118,12 +118,13 @@ class Waiting:
         self.poll()
 
     def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
-        """Raise an error if the group is closed, or an env of `slots` is busy or gone.
+        """Apply completions; raise an error if the group is closed, or a slot is busy or gone.
 
         What was cancelled or aborted and still runs in an env is ended before, inline by executing
         it.
         """
         self._lifetime.check_open()
+        self.intake.apply_completions()
         while (slot := self._requests.first_not_idle(slots)) is not None:
             if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
                 break

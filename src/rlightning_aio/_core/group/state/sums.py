@@ -213,12 +213,9 @@ class Sums:
         """Return the sums of some envs together, of their workers, and what they do now."""
         found = self.added(slots)
         states = self._requests.state[slots]
-        is_there = np.array([bool(self._envs.env_ids[slot]) for slot in slots.tolist()], np.bool_)
-        idle = is_there & (states == int(State.IDLE))
-        busy = is_there & (states == int(State.BUSY))
-        counts = [int(np.count_nonzero(which)) for which in (is_there, idle, busy)]
-        found |= zip(("envs", "idle", "busy"), counts, strict=True)
-        found["uncollected"] = counts[0] - counts[1] - counts[2]
+        idle, busy = (int(np.count_nonzero(states == int(s))) for s in (State.IDLE, State.BUSY))
+        found |= {"envs": len(slots), "idle": idle, "busy": busy}
+        found["uncollected"] = len(slots) - idle - busy
         chosen = set(slots.tolist())
         records = [record for record in self._records if record.slots.start in chosen]
         found["restarts"] = sum(record.restarts for record in records)
