@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
@@ -148,78 +147,6 @@ def test_published_figures_stay() -> None:
         assert [one[3] for one in by_number(found)] == [34, 55, 45, 47, 48, 40, 51, 53]
 
 
-@pytest.mark.parametrize("mode", [None, AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_episode_n_has_its_own_seed(mode: AutoresetMode | None) -> None:
-    """``seed + n * N + k``, with N sub-environments in the group, in any order of ends; if
-    sub-environments reset themselves, the seed is that of the first.
-    """
-    seen: set[int] = set()
-
-    def notes(batch: rl.BatchedData) -> Any:
-        seen.update(np.ravel(batch.observation).astype(int).tolist())
-        return nothing(batch)
-
-    make = scripted(lambda seed: seed % 2 == 0)
-    own = make if mode is None else lambda: SyncVectorEnv([make] * 2, autoreset_mode=mode)
-    found = evaluated(group_of(own, own), 3, seed=10, policy=notes)
-    width = 1 if mode is None else 2
-    rounds = 3 if mode is None else 1
-    assert seen == set(range(10, 10 + rounds * 2 * width))
-    counts = {(one.env_id, one.sub_env): 0 for one in found.attempts}
-    assert len(counts) == 2 * width
-    for one in found.attempts:
-        key = one.env_id, one.sub_env
-        assert one.index == counts[key]
-        counts[key] += 1
-        success = one.success
-        assert one.length == one.reward == (SHORT if success else LONG)
-        assert (one.spec.seed is None) == (mode is not None and one.index > 0)
-    assert set(counts.values()) == {3}
-
-
-def test_a_resumed_evaluation_equals_an_uninterrupted_one(tmp_path: Path) -> None:
-    """Finished episodes aren't played again, and are passed on first."""
-    envs = [scripted(lambda seed: seed % 3 == 0)] * 3
-    whole = evaluated(group_of(*envs), 4, seed=5)
-    kept: list[Attempt] = []
-
-    def interrupts(attempt: Attempt) -> None:
-        kept.append(attempt)
-        if len(kept) == 5:
-            raise KeyboardInterrupt
-
-    path = tmp_path / "results.jsonl"
-    with ResultsFile(path) as results, pytest.raises(KeyboardInterrupt):
-        evaluated(group_of(*envs), 4, seed=5, results=results, on_episode=interrupts)
-    seen: list[Attempt] = []
-    with ResultsFile(path) as results:
-        rest = evaluated(group_of(*envs), 4, seed=5, results=results, on_episode=seen.append)
-        assert len(results) == 12
-    assert by_number(rest) == by_number(whole)
-    assert seen == rest.attempts
-    assert sorted(seen[:5], key=str) == sorted(kept, key=str)
-    with ResultsFile(path) as results:
-        fewer = evaluated(group_of(*envs), 1, seed=5, results=results)
-    assert [one[2] for one in by_number(fewer)] == [0, 0, 0]
-
-
-def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
-    """With its seed, so the statistics equal those without a death."""
-    calls = 0
-
-    def dies_once(batch: rl.BatchedData) -> Any:
-        nonlocal calls
-        calls += 1
-        return np.full(len(batch), calls == 4)
-
-    env = scripted(lambda seed: seed % 2 == 0)
-    group = group_of(env, placement="process")
-    found = evaluated(group, 3, seed=0, policy=dies_once)
-    assert found.failures == {"env_died": 1}
-    assert [one.length for one in found.attempts] == [SHORT, LONG, SHORT]
-    assert [len(one.failures) for one in found.attempts] == [0, 1, 0]
-
-
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_the_first_of_two_episodes_to_end_is_not_repeated(
     mode: AutoresetMode, tmp_path: Path
@@ -312,15 +239,6 @@ def test_entries_of_different_spaces_have_a_policy_each() -> None:
         with pytest.raises(ValueError, match=r"no policy was given for .* 'car'.* cart, bar"):
             evaluate(group, policies, 2)
         assert group.pending == []
-
-
-def test_an_episode_may_be_for_one_env() -> None:
-    """Others leave it to that one."""
-    queue = [EpisodeSpec("", seed, env_id="env-1") for seed in range(3)]
-    with group_of(*HALF_SUCCEED) as group:
-        found = evaluate(group, nothing, [*queue, EpisodeSpec("", 9)])
-    own = [one.spec.seed or 0 for one in found.attempts if one.env_id == "env-1"]
-    assert sorted(own)[:3] == [0, 1, 2]
 
 
 def test_an_env_that_was_given_up_before_plays_nothing() -> None:
@@ -449,24 +367,6 @@ def test_a_step_that_takes_too_long_for_an_evaluation_that_has_ended_is_aborted(
     assert not found.failures
 
 
-async def test_nothing_is_left_of_an_evaluation_that_is_cancelled() -> None:
-    """It may be cancelled where it waits for an env, or for the policy."""
-    waits = asyncio.Event()
-
-    async def never(batch: rl.BatchedData) -> Any:
-        waits.set()
-        await asyncio.Event().wait()
-
-    async with rl.build_env_group("CartPole-v1", num_workers=2, max_episode_steps=5) as group:
-        playing = asyncio.ensure_future(evaluate(group, never, 2, min_results=1))
-        await waits.wait()
-        playing.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await playing
-        assert group.pending == []
-        assert len((await evaluate(group, nothing, 2)).played) == 4
-
-
 def test_it_resets_envs_at_their_ends_by_itself() -> None:
     """At the limits of the open context, or else at their own, if they have any."""
     for limit, lengths in ((None, {SHORT, LONG}), (5, {SHORT, 5})):
@@ -478,17 +378,6 @@ def test_it_resets_envs_at_their_ends_by_itself() -> None:
                 with group.auto_reset(limit or 3):  # None is open.
                     found = evaluate(group, nothing, 1)
                 assert {episode.length for episode in found.played} == {SHORT, limit or 3}
-
-
-def test_it_needs_its_own_envs() -> None:
-    """This is checked before anything is sent."""
-    with group_of(scripted(lambda _: True)) as group, group.auto_reset(9):
-        with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
-            evaluate(group, nothing, 0)
-        with pytest.raises(ValueError, match="retries must be at least 0, not -1"):
-            evaluate(group, nothing, 1, retries=-1)
-        with pytest.raises(ValueError, match="there is no env 'other-0' to play"):
-            evaluate(group, nothing, [EpisodeSpec("", 0, env_id="other-0")])
 
 
 # -- statistics -------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
+from test_evaluation_queue import Tasks, evaluated, group_of, rows
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -52,29 +52,34 @@ def test_numbers_of_numpy_are_saved_and_found_again(tmp_path: Path) -> None:
     assert [json.loads(line)["options"] for line in lines[1:]] == [{"longer": 2}] * 3
 
 
-def test_the_options_can_not_name_another_task() -> None:
-    """The record would be that of a task that was not played."""
-    queue = [EpisodeSpec("1", 0, {"task": "3"})]
-    with pytest.raises(ValueError, match=r"options .*name a task.*task='1'"):
-        evaluated(group_of(), queue)
+ONE = EpisodeSpec("1", 0)
 
 
-def test_an_entry_that_is_missing_is_named() -> None:
-    """The message lists those that are there."""
-    with pytest.raises(ValueError, match="there is no entry 'other'; entries are env"):
-        evaluated(group_of(), [EpisodeSpec("1", 0, entry="other")])
+@pytest.mark.parametrize(
+    ("episodes", "options", "message"),
+    [
+        (0, {}, "episodes must be at least 1, not 0"),
+        (1, {"retries": -1}, "retries must be at least 0, not -1"),
+        ([ONE], {"seed": 3}, "seed is for a number of episodes"),
+        ([("1", 0)], {}, r"should be EpisodeSpec, not \('1', 0\)"),
+        ([EpisodeSpec("1", 0, {"task": "3"})], {}, r"options .*name a task.*task='1'"),
+        ([EpisodeSpec("1", 0, entry="other")], {}, "no entry 'other'; entries are env"),
+        ([EpisodeSpec("1", 0, env_id="other-0")], {}, "there is no env 'other-0' to play"),
+    ],
+)
+def test_what_can_not_be_evaluated_is_refused(
+    episodes: Any, options: dict[str, Any], message: str
+) -> None:
+    """Before anything is sent."""
+    with pytest.raises((ValueError, TypeError), match=message):
+        evaluated(group_of(), episodes, **options)
 
 
-def test_what_is_no_episode_is_refused() -> None:
-    """A tuple of task and seed is none."""
-    with pytest.raises(TypeError, match=r"should be EpisodeSpec, not \('1', 0\)"):
-        evaluated(group_of(), [("1", 0)])
-
-
-def test_a_seed_for_a_queue_is_refused() -> None:
-    """It would be ignored."""
-    with pytest.raises(ValueError, match="seed is for a number of episodes"):
-        evaluated(group_of(), seed=3)
+def test_a_queue_for_sub_environments_is_refused() -> None:
+    """They would end their episodes together."""
+    pole = sync.build_env_group("CartPole-v1", num_envs=2, placement="inline")
+    with pytest.raises(ValueError, match="has 2 sub-environments"):
+        evaluated(pole, [])
 
 
 def test_clients_that_have_not_dialled_in_are_not_evaluated() -> None:
@@ -123,13 +128,3 @@ def test_a_process_that_ends_while_a_film_begins_is_replaced(tmp_path: Path) -> 
     found = evaluated(group_of(2, placement="process", **fields), queue, video=tmp_path / "films")
     assert rows(found) == [("1", seed, seed + 1.0, seed + 1) for seed in (0, 1, 2, 3, 9)]
     assert not found.failed
-
-
-@pytest.mark.parametrize(
-    "fields",
-    [{"envs_per_process": 1}, {"envs_per_process": 3}],
-    ids=["a worker for each", "one worker"],
-)
-def test_each_placement_plays_the_same(fields: dict[str, Any]) -> None:
-    """So do envs that share a process."""
-    assert rows(evaluated(group_of(placement="process", **fields))) == ROWS

@@ -150,13 +150,6 @@ def test_an_entry_is_found_by_its_task() -> None:
             evaluate(group, nothing, [EpisodeSpec("CartPole-v1", 3)] * 2)
 
 
-def test_sub_environments_are_refused() -> None:
-    """They would end their episodes together."""
-    entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2}
-    with pytest.raises(ValueError, match="has 2 sub-environments"):
-        evaluated(sync.build_env_group({**entry, "placement": "inline"}), [])
-
-
 # -- faults -------------------------------------------------------------------------------
 
 
@@ -196,20 +189,6 @@ def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
         causes = {one.spec.task: one.outcome.cause for one in found.failed}
         assert "group.reset(env_ids=['env-0'])" in causes["1"]
         assert not any(one.failures for one in found.attempts)
-
-
-def test_an_episode_whose_worker_always_ends_fails() -> None:
-    """Its worker is replaced each time, and other episodes continue."""
-    group = group_of(2, env_kwargs={"breaks": {"2": DIE}}, placement="process")
-    queue = [EpisodeSpec("1", 0), EpisodeSpec("2", 0), EpisodeSpec("3", 5)]
-    found = evaluated(group, queue, retries=1)
-    (failed,) = found.failed
-    assert (failed.spec.task, len(failed.failures)) == ("2", 1)
-    assert "exited with code 3" in failed.outcome.cause
-    assert [(one.spec.task, one.length) for one in found.played] == [
-        ("1", 1),
-        ("3", 6),
-    ]
 
 
 @pytest.mark.parametrize("breaks", [DIE, HANG])
