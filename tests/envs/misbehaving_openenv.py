@@ -16,41 +16,21 @@ from typing import TYPE_CHECKING, Any, Self
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.frames import Opcode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from websockets.http11 import Request, Response
 
 LOG = logging.getLogger("misbehaving")
 LOG.setLevel(logging.WARNING)  # Below that, it has the headers of its clients.
-STEP_ERRORS = ("INVALID_JSON", "UNKNOWN_TYPE", "VALIDATION_ERROR", "EXECUTION_ERROR")
-CONNECT_ERRORS = ("CAPACITY_REACHED", "FACTORY_ERROR", "SESSION_ERROR", "unreachable")
-FATES = (
-    "ok",
-    "late",
-    "never",
-    "lost before",
-    "lost after",
-    "half a frame",
-    "no JSON",
-    "another type",
-    "leaked",
-    "idle loss",
-    "restart",
-    *STEP_ERRORS,
-)
-"""`never`: the reply comes after the socket is closed; `leaked`: the slot stays taken, too."""
-GOES_ON = ("ok", "late", "another type")
-ANSWERED = (*GOES_ON, "never", "idle loss")
+ERRORS = ("EXECUTION_ERROR", "FACTORY_ERROR")
+"""Fates that are an answer; the others lose the socket, but for `ok` and `another type`."""
+GOES_ON = ("ok", "another type")
 
 
 class Session:
     """One env, of a socket."""
 
     def __init__(self) -> None:
-        self.is_leaked = False
         self.step_count, self.episode_id = 0, None
 
 
@@ -62,26 +42,23 @@ class Misbehaving:
         authorization: of those who may connect, if it is given.
 
     Attributes:
-        fates, connect_fates: of the next messages and connections; later ones succeed.
+        fates: of the next messages; later ones succeed. `never`: the reply comes after the
+            socket is closed.
         executed: number of executions of each action.
         sessions: those that take a slot; most: the largest number at once.
         sockets: of the clients that are connected.
-        refused: a connection was refused.
-        loses_pongs: pings are never answered.
-        on_never: gets the number of an action whose fate is `never`.
+        refused: a connection was refused; asked: a message has come whose fate is `never`.
     """
 
     def __init__(self, capacity: int, authorization: str | None = None) -> None:
         self.fates: deque[str] = deque()
-        self.connect_fates: deque[str] = deque()
         self.executed: Counter[int] = Counter()
         self.capacity = capacity
         self.sessions: set[Session] = set()
         self.sockets: set[ServerConnection] = set()
         self.most = 0
         self.refused = asyncio.Event()
-        self.loses_pongs = False
-        self.on_never: Callable[[int], object] = lambda number: None
+        self.asked = asyncio.Event()
         self._authorization = authorization
 
     async def __aenter__(self) -> Self:
@@ -102,10 +79,6 @@ class Misbehaving:
         self._server.close()
         await self._server.wait_closed()
 
-    def reap(self) -> None:
-        """Free the leaked slots."""
-        self.sessions = {session for session in self.sessions if not session.is_leaked}
-
     def restart(self) -> None:
         """Forget all sessions."""
         self.sessions.clear()
@@ -116,30 +89,17 @@ class Misbehaving:
         """Let a client talk, or answer it otherwise."""
         if request.headers.get("Authorization") != self._authorization:
             return socket.respond(401, "")
-        if self.connect_fates and self.connect_fates[0] == "unreachable":
-            self.connect_fates.popleft()
-            socket.transport.abort()
-        elif self.loses_pongs:
-            send_frame = socket.protocol.send_frame
-            socket.protocol.send_frame = lambda frame: (
-                None if frame.opcode is Opcode.PONG else send_frame(frame)
-            )
         return None
 
     # -- messages
 
     async def _talk(self, socket: ServerConnection) -> None:
         with contextlib.suppress(ConnectionClosed):
-            fate = self.connect_fates.popleft() if self.connect_fates else "ok"
-            if len(self.sessions) >= self.capacity:
-                fate = "CAPACITY_REACHED"
-            if fate != "ok":
-                self.refused.set()
-                self.reap()
-                code = "FACTORY_ERROR" if fate == "unreachable" else fate
-                await self._error(socket, code, "as it should not")
+            if len(self.sessions) < self.capacity:
+                await self._serve(socket)
                 return
-            await self._serve(socket)
+            self.refused.set()
+            await self._error(socket, "CAPACITY_REACHED", "as it should not")
 
     async def _serve(self, socket: ServerConnection) -> None:
         session = Session()
@@ -152,36 +112,29 @@ class Misbehaving:
                     return
         finally:
             self.sockets.discard(socket)
-            if not session.is_leaked:
-                self.sessions.discard(session)
+            self.sessions.discard(session)
 
     async def _answer(self, socket: ServerConnection, session: Session, message: Any) -> bool:
         fate = self.fates.popleft() if self.fates else "ok"
-        if fate == "never" and message["type"] != "step":
-            fate = "late"  # Only steps have a short limit.
-        if fate in STEP_ERRORS:
+        if fate in ERRORS:
             await self._error(socket, fate, "as it should not")
             return True
         if fate != "lost before":
             reply = self._executed(session, message)
             if fate == "another type":
                 reply["type"] = "state" if reply["type"] == "observation" else "observation"
-            await self._begin(socket, session, fate, message)
-            if fate in ANSWERED:
+            await self._begin(socket, fate)
+            if fate in (*GOES_ON, "never", "idle loss"):
                 await socket.send(json.dumps(reply))
             if fate in GOES_ON:
                 return True
         socket.transport.abort()
         return False
 
-    async def _begin(
-        self, socket: ServerConnection, session: Session, fate: str, message: Any
-    ) -> None:
+    async def _begin(self, socket: ServerConnection, fate: str) -> None:
         """Do what precedes the reply, or replaces it."""
-        if fate == "late":
-            await asyncio.sleep(0.005)
-        elif fate == "never":
-            self.on_never(message["data"]["number"])
+        if fate == "never":
+            self.asked.set()
             await socket.wait_closed()
         elif fate == "no JSON":
             await socket.send("{")
@@ -189,7 +142,6 @@ class Misbehaving:
             socket.transport.write(b"\x81\x7e\x01\x00{")
         elif fate == "restart":
             self.restart()
-        session.is_leaked = fate == "leaked"
 
     def _executed(self, session: Session, message: Any) -> dict[str, Any]:
         kind, data = message["type"], message.get("data")

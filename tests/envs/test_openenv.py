@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from cli.command import invoke, start, write_config
-from envs.misbehaving_openenv import Misbehaving, numbers
+from envs.misbehaving_openenv import ERRORS, Misbehaving, numbers
 from gymnasium import spaces
 from patience import HANG
 
@@ -53,7 +53,10 @@ def entry(url: str, **fields: Any) -> dict[str, Any]:
     return {"name": "o", "backend": "openenv", "task": url, **fields}
 
 
-@pytest.mark.parametrize("fate", ["idle loss", "lost before", "lost after", "restart"])
+FATES = ("idle loss", "lost before", "lost after", "restart", "half a frame", "no JSON")
+
+
+@pytest.mark.parametrize("fate", [*FATES, "another type"])
 def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
     """The step is answered by the first result of a new episode; its action is not sent again."""
     asyncio.run(_lose(fate))
@@ -83,6 +86,44 @@ async def _lose(fate: str) -> None:
         batch, _ = await group.step(steps_of("o-0"))
         assert batch.observation[0]["count"] == 1
         assert not batch.truncated.any()
+
+
+@on_asyncio
+async def test_a_reply_that_nobody_waits_for_answers_no_other_request() -> None:
+    """Replies have no numbers, so an aborted step ends its session."""
+    async with (
+        Misbehaving(capacity=2) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
+        await group.reset()
+        server.fates.append("never")
+        group.step_async(steps_of("o-0"))
+        await server.asked.wait()
+        await group.abort()
+        assert (await group.reset())[0].observation[0]["answers"] is None
+        steps = steps_of("o-0")
+        batch, _ = await group.step(steps)
+        assert batch.observation[0]["answers"] == steps.values()[0].action["number"]
+        assert set(server.executed.values()) == {1}
+
+
+@pytest.mark.parametrize("code", ERRORS)
+def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
+    asyncio.run(_fail(code))
+
+
+async def _fail(code: str) -> None:
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
+        await group.reset()
+        server.fates.append(code)
+        with pytest.raises(rl.EnvRaised, match=f"{code}: as it should not"):
+            await group.step(steps_of("o-0"))
+        await group.reset()
+        batch, _ = await group.step(steps_of("o-0"))
+        assert batch.observation[0]["count"] == 1
 
 
 @on_asyncio
