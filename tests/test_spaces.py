@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import pickle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -15,9 +15,6 @@ from gymnasium import spaces
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
 from rlightning_aio.spaces import Anything
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 class Talk:
@@ -106,28 +103,6 @@ async def test_rollouts_hold_lists_next_to_arrays() -> None:
     assert json.loads(json.dumps(seen)) == seen
     assert rollout.log_prob.shape == (24,)
     assert rollout.advantages(np.zeros(24), np.zeros(len(rollout.ends)), 0.9, 0.9).shape == (24,)
-
-
-async def test_a_block_of_rollouts_holds_nested_lists() -> None:
-    async with rl.build_env_group(entry()) as group:
-        with group.auto_reset(math.inf):
-            policy = lambda batch: {"action": say(batch)}  # noqa: E731
-            rollout = await Collector(group, policy, num_transitions=15, wait_all=True).collect()
-    assert rollout.shape == (5, 3)
-    assert [len(row) for row in rollout.action] == [3] * 5
-
-
-async def test_snapshots_statistics_and_timelines_take_them(tmp_path: Path) -> None:
-    async with rl.build_env_group(entry()) as group:
-        with group.trace(tmp_path / "trace.json"):
-            batch, _ = await group.reset(seed=1)
-            batch, _ = await group.step(batch.respond(action=say(batch)))
-            snapshot = await group.snapshot()
-            before = batch.observation["messages"]
-            batch, _ = await group.step(batch.respond(action=say(batch)))
-            batch, _ = await group.restore(snapshot)
-        assert batch.observation["messages"] == before
-    assert json.loads((tmp_path / "trace.json").read_text())["traceEvents"]
 
 
 async def test_nothing_is_pickled_on_the_loop() -> None:

@@ -127,34 +127,6 @@ def test_the_first_reset_is_like_every_other(make: Any) -> None:
     assert not torch.equal(first["policy"], env.reset(seed=6).observation["policy"])
 
 
-def test_manager_based_steps_equal_the_bare_simulators(make: Any) -> None:
-    """200 steps, including resets, equal those of the bare simulator."""
-    env = make(num_envs=4, max_episode_steps=60)
-    assert env.max_episode_steps == 60
-    ours = [env.reset(seed=1)] + [env.step(respond(a)) for a in actions(200, 4)]
-    env.close()
-    bare = bare_simulator(MANAGER_BASED, 4, 60)
-    try:
-        bare.reset(seed=1)
-        observation, _ = bare.reset(seed=1)
-        assert torch.equal(ours[0].observation["policy"], observation["policy"])
-        num_ended = 0
-        for ret, action in zip(ours[1:], actions(200, 4), strict=True):
-            observation, reward, terminated, truncated, extras = bare.step(torch.tensor(action))
-            assert torch.equal(ret.observation["policy"], observation["policy"])
-            assert torch.equal(ret.last_reward, reward)
-            assert torch.equal(ret.last_terminated, terminated)
-            assert torch.equal(ret.last_truncated, truncated)
-            ended = bool((terminated | truncated).any())
-            assert ("final_obs" in ret.info) == ("episode_info" in ret.info) == ended
-            if ended:
-                num_ended += 1
-                assert torch.equal(ret.info["final_obs"]["policy"], extras["final_obs"]["policy"])
-        assert num_ended >= 3
-    finally:
-        bare.close()
-
-
 def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
     """200 steps of both agents, including resets, equal those of the bare simulator."""
     env = make(MARL, "isaac_marl", num_envs=3, max_episode_steps=40)

@@ -17,7 +17,7 @@ from kit.tokens import Tokens, marked, two_workers
 from on_ray import cheetahs
 from patience import HANG
 
-from rlightning_aio.errors import EnvHung, EnvRaised, WorkerDied
+from rlightning_aio.errors import EnvRaised, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -63,15 +63,6 @@ def test_a_death_in_a_step_gives_marked_results(start: Start) -> None:
         tokens.check(batch)
 
 
-def test_a_death_is_raised_where_that_is_asked_for(start: Start) -> None:
-    """With what was owed; the envs of other actors go on."""
-    group, tokens = start(on_worker_death="raise"), Tokens()
-    with pytest.raises(WorkerDied, match=r"env 'faulty-0'.*was lost.*faulty-0, faulty-1") as told:
-        group.step(tokens.steps(group.group.env_ids, {"faulty-0": "sigkill"}))
-    assert told.value.results.ids() == ["faulty-2", "faulty-3"]
-    tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
-
-
 def test_an_idle_actor_that_dies_is_replaced_when_it_is_needed(start: Start) -> None:
     """Who asks next is told, and a call ends in an error."""
     group, tokens = start(), Tokens()
@@ -114,16 +105,6 @@ def test_an_actor_that_hangs_is_killed(start: Start, hang: str) -> None:
         assert select.select([watch], [], [], HANG)[0], "it lives"
     finally:
         os.close(watch)
-
-
-def test_a_hang_is_raised_where_that_is_asked_for(start: Start) -> None:
-    """With what others owed; who steps alone in a call is named."""
-    group, tokens = start(step_timeout=LIMIT, on_worker_death="raise"), Tokens()
-    with pytest.raises(
-        EnvHung, match=rf"env 'faulty-3'.*longer than {LIMIT} s for a step"
-    ) as caught:
-        group.step(tokens.steps(["faulty-0", "faulty-3"], {"faulty-3": "sleep"}))
-    assert caught.value.results.ids() == ["faulty-0"]
 
 
 TRAINER = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium as gym
@@ -13,9 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vector.toys import assert_alike, toy
 
+from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
 from rlightning_aio.vector import VectorEnv, make_vec
 
 SIZE = 3
+NUM_EXAMPLES = 6 if "RLIGHTNING_AIO_EXAMPLES" not in os.environ else settings().max_examples
 MODES = list(AutoresetMode)
 seeds = st.none() | st.integers(0, 99) | st.lists(
     st.none() | st.integers(0, 99), min_size=SIZE, max_size=SIZE + 1
@@ -57,17 +60,27 @@ TOY = doings(
     ["speed", "own", "render_mode"],
     [(name, value) for name in ("speed", "own") for value in (0.5, [1.0, 2.0, 3.0], (1.0, 2.0))],
 )
-PENDULUM = doings(
-    st.sampled_from([[-3.0], [0.1], [2.0]]),
-    [
-        ("np_random_seed",),
-        ("_elapsed_steps",),
-        ("no_such",),
-    ],
+TOGETHER = doings(
+    st.integers(0, 99),
+    [("np_random_seed",), ("_elapsed_steps",), ("init_qpos",), ("no_such",)],
     ["dt", "_max_episode_steps", "render_mode", "np_random_seed"],
-    [("frame_skip", 3), ("frame_skip", [1, 1, 1]), ("_max_episode_steps", 4), ("own", (1.0, 2.0))],
+    [
+        ("frame_skip", 3),
+        ("frame_skip", [1, 1, 1]),
+        ("_max_episode_steps", 4),
+        ("own", (1.0, 2.0)),
+    ],
 )
-"""Operations on simulations that share a model, whose methods can't be called."""
+"""Operations on simulations that share a model, whose methods can't be called; a step has seeds."""
+TASKS = ("InvertedPendulum-v5", "Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Humanoid-v5")
+
+
+def actions_of(env: Any, given: list[Any]) -> Any:
+    """The actions of a step; for a space of floats, samples by the numbers that are given."""
+    if isinstance(env.single_action_space, gym.spaces.Discrete):
+        return np.array(given, env.action_space.dtype)
+    env.action_space.seed(given[0])
+    return env.action_space.sample()[: len(given)]
 
 
 def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
@@ -77,7 +90,7 @@ def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
         what, arguments = "reset", [None, due.copy(), None]
     try:
         if what == "step":
-            return env.step(np.array(arguments[0], env.action_space.dtype))
+            return env.step(actions_of(env, arguments[0]))
         if what == "reset":
             seed, mask, options = arguments
             if mask is not None:
@@ -122,15 +135,19 @@ def test_it_does_the_same_as_gymnasiums(mode: AutoresetMode, did: list[Any], see
     compare(ours, SyncVectorEnv([toy] * SIZE, autoreset_mode=mode), did, seed)
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@settings(max_examples=12)
-@given(did=histories(PENDULUM), seed=st.integers(0, 99))
-def test_envs_that_are_stepped_together_do_the_same(
-    mode: AutoresetMode, did: list[Any], seed: int
-) -> None:
+@pytest.mark.parametrize("task", TASKS)
+def test_envs_that_are_stepped_together_do_the_same(task: str, mode: AutoresetMode) -> None:
     """Simulations of one model, whose Gymnasium env takes the state of each in turn."""
-    arguments = {"autoreset_mode": mode}
-    task, kwargs = "InvertedPendulum-v5", {"max_episode_steps": 7}
-    ours = make_vec(task, SIZE, vector_kwargs=arguments, **kwargs)
-    theirs = gym.make_vec(task, SIZE, "sync", arguments, **kwargs)
-    compare(ours, theirs, did, seed)
+    arguments, kwargs = {"autoreset_mode": mode}, {"max_episode_steps": 7}
+
+    @settings(max_examples=NUM_EXAMPLES)
+    @given(histories(TOGETHER), st.integers(0, 99), st.sampled_from([0.1, 2.0]))
+    def check(did: list[Any], seed: int, weight: float) -> None:
+        with outdated_assets_accepted():
+            ours = make_vec(task, SIZE, vector_kwargs=arguments, **kwargs)
+            theirs = gym.make_vec(task, SIZE, "sync", arguments, **kwargs)
+        compare(ours, theirs, [("set_attr", "_ctrl_cost_weight", weight), *did], seed)
+
+    check()
