@@ -89,14 +89,6 @@ def test_a_setting_that_cannot_start_is_reported_and_the_others_are_measured(
     assert "needs a process of its own" in done.stdout
 
 
-def test_a_bench_without_any_working_setting_fails(tmp_path: Path) -> None:
-    """The message is the cause."""
-    entry = {"name": "robot", "backend": "unbuildable", "task": "any"}
-    done = invoke("bench", write_config(tmp_path, entry), *QUICK)
-    assert done.exit_code == 1
-    assert "no such robot" in done.stderr
-
-
 def test_an_interrupted_bench_prints_its_results_so_far(tmp_path: Path) -> None:
     """Ctrl-C ends it after the present measurement."""
     with start("bench", write_config(tmp_path, CARTPOLE), "--rounds", 10**6, "--json") as child:

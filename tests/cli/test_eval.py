@@ -55,15 +55,6 @@ def test_the_name_of_an_entry_may_have_a_slash(tmp_path: Path) -> None:
     assert invoke_json("rollout", config, "--steps", 9)
 
 
-def test_a_policy_is_given_by_module_and_name(tmp_path: Path) -> None:
-    """This is as for rollout; a step limit applies."""
-    config = write_config(tmp_path, {**POLE, "max_episode_steps": 4})
-    policy = "cli.stub_policies:respond"
-    document = invoke_json("eval", config, "--episodes", 2, "--policy", policy)
-    assert document["policy"] == policy
-    assert document["parts"][0]["length"]["mean"] == 4
-
-
 def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
     """An evaluation in two parts has the results of one in a single part."""
     config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
@@ -114,26 +105,6 @@ def test_an_error_of_the_policy_is_no_interrupt(tmp_path: Path) -> None:
     table = " ".join(invoke(*words).stdout.split())
     assert table.startswith("Ended by an error after 6 episodes, so short ones are favoured: ")
     assert "20 episodes of each env were to be played" in table
-
-
-def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:
-    """A second command is refused until the first one ends in any way."""
-    waiting = {"name": "slow", "task": "cli.judged_env:wait", "num_workers": 2}
-    config, file = write_config(tmp_path, waiting), tmp_path / "episodes.jsonl"
-    words = (config, "--seed", 0, "--resume", file, "--episodes")
-    with start("eval", *words, 2) as child:
-        assert child.stderr is not None
-        while "waits" not in (line := child.stderr.readline()):
-            assert line, "it has ended"
-        before = file.read_bytes()
-        assert "another program is writing this file" in refused(*words, 2)
-        assert file.read_bytes() == before
-        child.kill()
-        child.communicate(timeout=HANG)
-    # The killed command has played all episodes.
-    row = {**json.loads(before.splitlines()[1]), "env_id": "slow-1", "seed": 1}
-    file.write_text(f"{file.read_text()}{json.dumps(row)}\n")
-    assert len(invoke_json("eval", *words, 1)["attempts"]) == 2
 
 
 def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
@@ -228,18 +199,6 @@ def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
     assert "failed: task 'raises', seed 1, on env 'many-0': not_started: " in done.stdout
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("a ")]
     assert line.split()[1:3] == ["2", "50.0%"]
-
-
-def test_a_queue_is_drawn_and_filmed(tmp_path: Path) -> None:
-    """The first episode of each task."""
-    config = write_config(tmp_path, {**SWITCHING, "num_workers": 2})
-    plot, films = tmp_path / "plot.png", tmp_path / "films"
-    asked = ("--tasks", "a,b", "--seeds", "0:4", "--video", films, "--plot", plot)
-    # In a process of its own, because matplotlib keeps its fonts open.
-    done = run("eval", config, *asked)
-    assert done.returncode == 0, done.stderr
-    assert {path.name for path in films.iterdir()} == {"many-a-seed-0.mp4", "many-b-seed-0.mp4"}
-    assert plot.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_film_that_cannot_be_kept_ends_it_with_one_message(tmp_path: Path) -> None:

@@ -13,36 +13,6 @@ if TYPE_CHECKING:
 
 STUB = {"name": "stub", "backend": "stub", "task": "any"}
 
-# A YAML text, overrides, and words of the message, which also names the file.
-WRONG: dict[str, tuple[str, list[str], list[str]]] = {
-    "no YAML": ("envs: [", [], ["line ", "not valid YAML"]),
-    "an unknown field": (
-        "envs: [{name: a, backend: gymnasium, task: CartPole-v1, num_worker: 2}]",
-        [],
-        ["envs.0 ('a')", "num_worker", "num_workers"],
-    ),
-    "an override of nothing": (
-        "envs: [{name: a, backend: gymnasium, task: CartPole-v1}]",
-        ["envs.3.num_workers=2"],
-        ["override 'envs.3.num_workers=2'"],
-    ),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-def test_a_wrong_config_is_code_2_and_names_the_field(
-    tmp_path: Path, wrong: tuple[str, list[str], list[str]]
-) -> None:
-    """The message has file, entry and field; stdout is empty."""
-    text, overrides, named = wrong
-    path = tmp_path / "wrong.yaml"
-    path.write_text(text)
-    done = invoke("rollout", path, *overrides)
-    assert done.exit_code == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith(f"error: {path}: ")
-    assert [words for words in named if words not in done.stderr] == []
-
 
 def test_a_wrong_config_shows_no_traceback(tmp_path: Path) -> None:
     """Stderr has one line."""
@@ -51,13 +21,6 @@ def test_a_wrong_config_shows_no_traceback(tmp_path: Path) -> None:
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "num_workers" in done.stderr
-
-
-def test_a_missing_file_is_named() -> None:
-    """It counts as a wrong configuration."""
-    done = invoke("rollout", "nowhere.yaml")
-    assert done.exit_code == 2
-    assert done.stderr.startswith("error: nowhere.yaml: ")
 
 
 @pytest.mark.parametrize("words", [["--steps", "0"], ["--min-results", "none"], ["--nonsense"]])

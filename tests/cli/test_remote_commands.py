@@ -254,14 +254,3 @@ def test_keys_that_cannot_be_written_are_one_message(tmp_path: Path) -> None:
     done = invoke("keygen", tmp_path / "keys", "left")
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr.startswith(f"error: no keys can be written into {tmp_path / 'keys'}: ")
-
-
-def test_keygen_keeps_existing_keys(tmp_path: Path) -> None:
-    """A second call adds a client and changes no other keys."""
-    top = tmp_path / "keys"
-    invoke("keygen", top, "left")
-    before = read_client_keys(top / "left")
-    assert invoke("keygen", top, "left").exit_code == 2
-    assert invoke("keygen", top, "right").exit_code == 0
-    assert read_client_keys(top / "left") == before
-    assert read_client_keys(top / "right").server == before.server

@@ -123,30 +123,6 @@ def test_lengths_count_each_server_once() -> None:
         group.close()
 
 
-def test_local_envs_and_clients_mix_in_one_batch() -> None:
-    """First ready, first served; by_entry() makes stackable parts."""
-    envs = [CountingEnv(k) for k in range(2)]
-    seen: dict[str, int] = {}
-    with (
-        sync.build_env_group([CARTPOLE, entry(2)], mixed_actions=True) as group,
-        clients(group, *envs),
-    ):
-        batch, _ = group.reset(seed=0)
-        # On a busy machine a worker may not run for a while.
-        for _ in range(20_000):
-            for name, part in batch.by_entry().items():
-                for ret in part.values():
-                    seen[ret.env_id] = seen.get(ret.env_id, 0) + 1
-                action = actions(part) if name == "robots" else np.zeros(len(part), np.int64)
-                group.step_async(part.respond(action=action))
-            batch, _ = group.collect_async(deadline=HANG)
-            if len(seen) == 4 and min(seen.values()) > 1:
-                break
-        group.close()
-    assert set(seen) == {"pole-0", "pole-1", "robots-0/c0", "robots-0/c1"}
-    assert min(seen.values()) > 1
-
-
 def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:
     """The group raises `EnvRaised` with the client's name and the remote traceback."""
     env = CountingEnv(0)
@@ -210,22 +186,6 @@ def raise_once(env: CountingEnv) -> Callable[[], None]:
         raise EnvError("not there", blame="policy")
 
     return fail
-
-
-def test_auto_reset_reaches_clients() -> None:
-    """A limit of 3 gives a period of 4 calls."""
-    with sync.build_env_group(entry()) as group, clients(group, CountingEnv(0)):
-        batch, _ = group.reset()
-        steps, flags = [], []
-        with group.auto_reset(max_episode_steps=3):
-            for _ in range(8):
-                group.step_async(batch.respond(action=actions(batch)))
-                batch, truncations = group.collect_async(deadline=HANG)
-                steps.append(int(batch.observation[0, 2]))
-                flags += truncations
-        assert steps == [1, 2, 3, 0, 1, 2, 3, 0]
-        assert flags == [False, False, True, False] * 2
-        group.close()
 
 
 def test_a_server_that_is_restarted_gets_its_clients_back() -> None:

@@ -26,7 +26,7 @@ from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.net.wire import VERSION, ClientHello, Writer
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote import client as client_module
-from rlightning_aio.remote.keys import make_keys, read_client_keys, read_server_keys
+from rlightning_aio.remote.keys import make_keys, read_client_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,19 +38,6 @@ def entry(**env_kwargs: Any) -> dict[str, Any]:
 
 
 # Keys
-
-
-def test_keygen_lays_out_a_directory_for_each_machine(tmp_path: Path) -> None:
-    """Only the owner can read secrets, and each side gets the other's public key."""
-    arm, leg = make_keys(tmp_path, ["arm", "leg"])
-    server = tmp_path / "server"
-    assert (arm, leg) == (tmp_path / "arm", tmp_path / "leg")
-    for secret in (server / "server.key_secret", arm / "client.key_secret"):
-        assert secret.stat().st_mode & 0o777 == 0o600
-    assert sorted(path.name for path in (server / "clients").iterdir()) == ["arm.key", "leg.key"]
-    assert read_client_keys(arm).server == read_client_keys(leg).server
-    assert read_client_keys(arm).secret != read_client_keys(leg).secret
-    assert read_server_keys(server).secret != read_client_keys(arm).secret
 
 
 def test_keys_can_be_added_later_and_are_never_overwritten(tmp_path: Path) -> None:

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 from remote.unreliable import OBSERVATION, Client, Recorder, World
 
-from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import ClientSession, Phase, Refused
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
@@ -32,23 +30,6 @@ def only(results: list[Any]) -> Any:
     return result
 
 
-def test_a_client_is_asked_nothing_until_somebody_asks(world: World) -> None:
-    """The welcome names its env; nothing moves."""
-    assert world.server.clients() == {"srv/0": "a", "srv/1": "b"}
-    assert [one.taken for one in world.seen] == [["a"], ["b"]]
-    assert not world.take()
-    assert not world.clients["a"].executed
-
-
-def test_a_reset_and_a_step_are_answered(world: World) -> None:
-    world.reset("a", seed=3)
-    world.settle()
-    assert only(world.take()).observation.tolist() == [1, 1, 0]
-    world.step("a")
-    world.settle()
-    assert only(world.take()).observation.tolist() == [1, 1, 1]
-
-
 def test_the_first_request_of_a_session_is_a_reset(world: World) -> None:
     """A client refuses another one, and moves nothing."""
     world.step("a")
@@ -57,33 +38,11 @@ def test_the_first_request_of_a_session_is_a_reset(world: World) -> None:
     assert not world.clients["a"].executed
 
 
-def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
-    """The client stays free for a better one."""
-    with pytest.raises(BadAction, match=r"srv/0.*expected shape \(2,\)"):
-        world.server.step(world.places[0], np.zeros(3, np.float32), {})
-    world.reset("a")
-
-
 @pytest.mark.parametrize("options", [{"x": object()}, {0: "x"}, {"x": {"y": 2**70}}])
 def test_reset_options_that_cannot_travel_are_refused(world: World, options: Any) -> None:
     """They would arrive as something else, or not at all."""
     with pytest.raises(ValueError, match="options can't be sent"):
         world.server.check_reset("srv/0", 1, options)
-
-
-def test_an_exception_arrives_with_its_traceback_and_the_env_goes_on(world: World) -> None:
-    """The env can be stepped again after it raised."""
-    world.reset("a")
-    world.settle()
-    client = world.clients["a"]
-    client.raises = True
-    world.step("a")
-    world.settle()
-    assert world.take()[1:] == [ErrorText("Oops", "no", "trace")]
-    client.raises = False
-    world.step("a")
-    world.settle()
-    assert only(world.take()).observation.tolist() == [1, 1, 1]
 
 
 def test_an_answer_that_nobody_waits_for_ends_the_session(world: World) -> None:
@@ -175,16 +134,6 @@ def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -
     second.connect()
     world.settle()
     assert second.session.phase is Phase.SERVING
-
-
-def test_a_server_that_closes_says_goodbye(world: World) -> None:
-    """Clients end their sessions at once and hang up; no place hears of it."""
-    world.server.close("done")
-    world.flush()
-    world.settle()
-    assert world.clients["a"].ended == ["the server ended the session: done"]
-    assert world.clients["a"].session.phase is Phase.AWAY
-    assert not world.seen[0].lost
 
 
 def meta(**changes: Any) -> EnvMeta:

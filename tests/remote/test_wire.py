@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 from hypothesis import given
 from hypothesis import strategies as st
 from remote.random_spaces import any_info, any_space, same, sampled
@@ -62,28 +61,6 @@ def test_a_frame_named_in_an_info_is_no_view_of_the_message() -> None:
     """An info's arrays are the reader's own, and writable."""
     message, _ = through_wire(ClientResult(number=2, info={"a": np.arange(3)}))
     message.info["a"][0] = 7
-
-
-@pytest.mark.parametrize("agents", [(), ("left", "right")])
-@pytest.mark.parametrize("num_envs", [1, 3])
-def test_rewards_and_flags_survive_for_agents_and_sub_environments(
-    agents: tuple[str, ...], num_envs: int
-) -> None:
-    """Each agent's and sub-environment's reward and flags come back as its own."""
-    single = spaces.Box(-1, 1, (2,))
-    each = batch_space(single, num_envs) if num_envs > 1 else single
-    space = spaces.Dict(dict.fromkeys(agents, each)) if agents else each
-    shape = (num_envs,) if num_envs > 1 else ()
-
-    def per_agent(value: Any) -> Any:
-        return dict.fromkeys(agents, value) if agents else value
-
-    reward, ended = per_agent(np.full(shape, 0.5)), per_agent(np.ones(shape, bool))
-    outcome = ResultFields(sampled(space, 3), reward, ended, ended)
-    layout = ResultLayout(space, num_envs, agents)
-    packed = Packed([], [])
-    header = layout.pack(outcome, packed)
-    assert same(tuple(layout.unpack(*packed, header[1:])), tuple(outcome))
 
 
 def compressed() -> tuple[ResultLayout, Any]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
@@ -26,6 +25,7 @@ from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessio
 from rlightning_aio.types import EnvMeta, EnvRet
 
 if TYPE_CHECKING:
+    from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.net.announcements import Announcement
     from rlightning_aio.protocol.net.server_session import RemoteResult
 
@@ -55,7 +55,6 @@ class Client:
         self.outbox: list[tuple[bytes, list[bytes] | None]] = []
         self.route: bytes | None = None
         self.routes = itertools.count()
-        self.raises = False
         self.begin()
 
     def begin(self) -> None:
@@ -128,11 +127,8 @@ class Client:
         key = (self.route, request.number)
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
-        if self.raises:
-            self.session.fail(request.number, ErrorText("Oops", "no", "trace"))
-        else:
-            self.steps = 0 if isinstance(request, ResetRequest) else self.steps + 1
-            self.session.finish(request.number, self.ret())
+        self.steps = 0 if isinstance(request, ResetRequest) else self.steps + 1
+        self.session.finish(request.number, self.ret())
         self.flush()
 
     def observation(self) -> np.ndarray[Any, Any]:
