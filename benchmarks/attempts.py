@@ -31,7 +31,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from harness import machine_facts
-from waiting import IDLE, MEAN, Waits
+from waiting import Awaiting
 
 import rlightning_aio as rl
 from rlightning_aio.attempts import EpisodeSpec, Rules, play
@@ -192,24 +192,6 @@ def lag_of(lags: list[float]) -> dict[str, float]:
     return {"lag_p99_ms": 1e3 * lags[int(0.99 * len(lags))], "lag_max_ms": 1e3 * lags[-1]}
 
 
-class Waiting(Waits):
-    """An awaitable env, whose steps wait for `mean` s on average."""
-
-    def __init__(self, mean: float) -> None:
-        self.mean = mean
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        del options
-        self.place, self.steps = 97 * (seed or 0), 0
-        return IDLE, {}
-
-    async def step(self, action: Any) -> Any:
-        del action
-        await asyncio.sleep(self.mean * self.latency() / MEAN)
-        self.steps += 1
-        return IDLE, 1.0, self.steps >= LONG, False, {}
-
-
 async def many(number: int, seconds: float, placement: str, mean: float) -> dict[str, float]:
     """Keep a number of attempts in flight for some seconds; `mean` is that of a step."""
     steps, lags = 0, list[float]()
@@ -227,7 +209,7 @@ async def many(number: int, seconds: float, placement: str, mean: float) -> dict
 
     fields: dict[str, Any] = {"placement": placement, "step_timeout": 60}
     async with rl.build_env_group(
-        Waiting, num_workers=number, env_kwargs={"mean": mean}, **fields
+        Awaiting, num_workers=number, env_kwargs={"mean": mean, "length": LONG}, **fields
     ) as group:
         spent = time.thread_time()
         watching = asyncio.create_task(watch(lags))

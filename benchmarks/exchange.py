@@ -20,7 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from contenders import CORES, OursAsync, OursSync, Work
-from harness import STEPS, Contender, Question, Target, measure, parser_of, tables, tell, throughput
+from harness import STEPS, Contender, Question, Target, main, throughput
 
 CHEETAH, POLE = Work("HalfCheetah-v5", 32), Work("CartPole-v1", 64)
 OWN = Work("own_envs:benchmarks/Own20-v0", 32, envs_per_process=-(-32 // CORES))
@@ -140,21 +140,5 @@ QUESTIONS = (
 )  # fmt: skip
 
 
-def main() -> None:
-    given = parser_of(__doc__, QUESTIONS[0].rounds, QUESTIONS[0].seconds).parse_args()
-    reports = [measure(asked, given) for asked in QUESTIONS]
-    for report in reports:
-        for target in report["targets"]:
-            target["subject"] += f", {report['title']}"
-    whole = {
-        **reports[0],
-        "title": "A group and a bare exchange over the same shared memory",
-        "results": {report["title"]: report["results"] for report in reports},
-        "targets": [target for report in reports for target in report["targets"]],
-        "tables": "\n\n".join(tables(report) for report in reports if report["results"]),
-    }
-    tell(whole, given)
-
-
 if __name__ == "__main__":
-    main()
+    main(QUESTIONS, __doc__)

@@ -17,15 +17,16 @@ import sys
 import tempfile
 import time
 import traceback
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
+from unittest.mock import patch
 
 from rlightning_aio.cli.measurement import Figures, family, in_turns, machine_facts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from multiprocessing.connection import Connection
 
 # One math thread for each contender: none is faster with more, and some would
@@ -61,10 +62,7 @@ class Contender:
         """Prepare the first round; called once, not measured."""
 
     def round(self, seconds: float) -> Any:
-        """Run one round of about that length; return the measured figure.
-
-        Any other value that can be pickled is for a script with its own report.
-        """
+        """Run one round of about that length; return the figure, or all of them by column."""
         raise NotImplementedError
 
     def teardown(self) -> None:
@@ -104,7 +102,7 @@ class Question:
     Attributes:
         name: of the result files.
         title: one line, with the workload.
-        unit: of the contenders' figures.
+        unit: of the contenders' figures; the column that is compared, where there are several.
         reference: the name of the contender of which the others' figures are given as multiples;
             the first that took part if this one didn't; empty for none.
         seconds: length of a round.
@@ -118,6 +116,12 @@ class Question:
     reference: str = ""
     rounds: int = 7
     seconds: float = 1.5
+    columns: Sequence[str] = ()
+    """Of the table, where a round returns several figures."""
+
+    def figure(self, value: Any) -> float:
+        """Return what is compared of the value of a round."""
+        return value[self.unit] if self.columns else value
 
 
 def throughput(step: Callable[[], int], seconds: float) -> float:
@@ -139,6 +143,16 @@ def throughput(step: Callable[[], int], seconds: float) -> float:
     return count / (now - began)
 
 
+def busy_ns(pids: Iterable[int]) -> int:
+    """Return the processor time that all threads of these processes have used so far."""
+    found = 0
+    for pid in pids:
+        for thread in Path(f"/proc/{pid}/task").glob("*"):
+            with suppress(FileNotFoundError, ProcessLookupError):
+                found += int(thread.joinpath("schedstat").read_text().split()[0])
+    return found
+
+
 class ContenderFailed(Exception):
     """A contender raised or died; the text has the reason."""
 
@@ -153,7 +167,8 @@ class Stage:
         context = mp.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_perform, args=(theirs, self.contender))
-        with _searched_first(self.contender.source):
+        first = filter(None, [self.contender.source])
+        with patch.object(sys, "path", [*first, *sys.path]):
             self._process.start()
         theirs.close()
         self._answer()
@@ -161,22 +176,12 @@ class Stage:
 
     def round(self, seconds: float) -> tuple[Any, float]:
         """Run a round; return its value, and how many processors all its processes kept busy."""
-        before, began = self._busy_ns(), time.perf_counter_ns()
+        assert self._process.pid is not None
+        before, began = busy_ns(family(self._process.pid)), time.perf_counter_ns()
         self._connection.send(seconds)
         value = self._answer()
         wall = time.perf_counter_ns() - began
-        return value, (self._busy_ns() - before) / wall
-
-    def _busy_ns(self) -> int:
-        assert self._process.pid is not None
-        found = 0
-        for pid in family(self._process.pid):
-            for thread in Path(f"/proc/{pid}/task").glob("*"):
-                try:
-                    found += int(thread.joinpath("schedstat").read_text().split()[0])
-                except (FileNotFoundError, ProcessLookupError):
-                    continue
-        return found
+        return value, (busy_ns(family(self._process.pid)) - before) / wall
 
     def _answer(self) -> Any:
         try:
@@ -194,17 +199,6 @@ class Stage:
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
-
-
-@contextmanager
-def _searched_first(folder: str) -> Iterator[None]:
-    """A process that is started within has this folder first on its path."""
-    path = sys.path[:]
-    sys.path[:0] = filter(None, [folder])
-    try:
-        yield
-    finally:
-        sys.path[:] = path
 
 
 def _perform(connection: Connection, contender: Contender) -> None:
@@ -234,14 +228,20 @@ def _perform(connection: Connection, contender: Contender) -> None:
 
 def measure(question: Question, given: argparse.Namespace) -> dict[str, Any]:
     """Run a question as the command line says; return its report as plain data."""
-    turns, skipped = take_turns(question.contenders, given)
-    figures = {name: Figures([value for value, _ in found]) for name, found in turns.items()}
+    turns, skipped = take_turns(question, given)
+    figures = {
+        name: Figures([question.figure(value) for value, _ in found])
+        for name, found in turns.items()
+    }
     reference = question.reference
     if reference and reference not in figures:
         reference = next(iter(figures), "")
     results: dict[str, dict[str, Any]] = {}
     for name, found in figures.items():
         results[name] = found.as_json()
+        for column in question.columns:
+            values = Figures([value[column] for value, _ in turns[name]])
+            results[name].setdefault("columns", {})[column] = values.as_json()
         cores = [cores for _, cores in turns[name]]
         if question.unit == STEPS:
             spent = [1e6 * busy / rate for busy, rate in zip(cores, found.values, strict=True)]
@@ -256,7 +256,8 @@ def measure(question: Question, given: argparse.Namespace) -> dict[str, Any]:
         "rounds": given.rounds,
         "seconds": given.seconds,
         "reference": reference,
-        "machine": machine_facts(modules_of(question.contenders)),
+        "columns": list(question.columns),
+        "machine": machine_facts({one for each in question.contenders for one in each.requires}),
         "results": results,
         "targets": [
             _judged(target, figures)
@@ -268,16 +269,9 @@ def measure(question: Question, given: argparse.Namespace) -> dict[str, Any]:
 
 
 def take_turns(
-    contenders: Sequence[Contender],
-    given: argparse.Namespace,
-    number_of: Callable[[Any], float] = float,
+    question: Question, given: argparse.Namespace
 ) -> tuple[dict[str, list[tuple[Any, float]]], dict[str, str]]:
     """Let contenders take turns, each in its own process, with one math thread.
-
-    Args:
-        contenders: in the order of their turns.
-        given: the arguments of the command line.
-        number_of: returns what is shown of the value of a round.
 
     Returns the values and the busy processors of each contender's rounds, and the reasons why
     others were left out.
@@ -286,7 +280,7 @@ def take_turns(
     found: dict[str, list[tuple[Any, float]]] = {}
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
-        stages = _stages(contenders, given, stack, skipped)
+        stages = _stages(question.contenders, given, stack, skipped)
         for number, stage in in_turns(stages, given.rounds):
             name = stage.contender.name
             try:
@@ -297,7 +291,7 @@ def take_turns(
                 skipped[name] = _last_line(name, error)
                 continue
             found.setdefault(name, []).append((value, cores))
-            text = number_text(number_of(value))
+            text = number_text(question.figure(value))
             say(f"  round {number + 1}/{given.rounds}  {name:{NAME_WIDTH}} {text}")
     return found, skipped
 
@@ -338,11 +332,6 @@ def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
     return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
 
 
-def modules_of(contenders: Iterable[Contender]) -> set[str]:
-    """Return the modules that any of them needs."""
-    return {name for contender in contenders for name in contender.requires}
-
-
 # ---- reports
 
 
@@ -362,31 +351,38 @@ def spread_text(found: dict[str, Any]) -> str:
     return f"{number_text(found['low'])} to {number_text(found['high'])}"
 
 
+def full_text(found: dict[str, Any]) -> str:
+    """Return a median, and its range unless it was measured once."""
+    median = number_text(found["median"])
+    return median if found["low"] == found["high"] else f"{median} ({spread_text(found)})"
+
+
 def tables(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    results = report["results"]
-    reference = report.get("reference")
-
-    def times_text(times: dict[str, Any]) -> str:
-        return f"{number_text(times['median'])} ({spread_text(times)})"
-
-    more = [
-        (heading, name, text)
-        for heading, name, text in (
-            ("CPU time, µs/step", "cpu_us_per_step", number_text),
-            ("cores used", "cores_used", "{:.2f}".format),
-            (f"times {reference}", "times", times_text),
-        )
-        if any(name in found for found in results.values())
-    ]
-    lines = [
-        f"| {report['title']} | median, {report['unit']} | lowest to highest |"
-        + "".join(f" {heading} |" for heading, _, _ in more),
-        "|---|---:|---:|" + "---:|" * len(more),
-    ]
-    for name, found in results.items():
-        row = f"| {name} | {number_text(found['median'])} | {spread_text(found)} |"
-        lines.append(row + "".join(f" {text(found[key])} |" for _, key, text in more))
+    results, columns = report["results"], report.get("columns")
+    if columns:
+        rows = {
+            name: [full_text(found["columns"][column]) for column in columns]
+            for name, found in results.items()
+        }
+    else:
+        more = [
+            (heading, key, text)
+            for heading, key, text in (
+                ("CPU time, µs/step", "cpu_us_per_step", number_text),
+                ("cores used", "cores_used", "{:.2f}".format),
+                (f"times {report.get('reference')}", "times", full_text),
+            )
+            if any(key in found for found in results.values())
+        ]
+        columns = [f"median, {report['unit']}", "lowest to highest", *(one for one, _, _ in more)]
+        rows = {
+            name: [number_text(found["median"]), spread_text(found)]
+            + [text(found[key]) for _, key, text in more]
+            for name, found in results.items()
+        }
+    lines = [f"| {' | '.join([report['title'], *columns])} |", f"|---{'|---:' * len(columns)}|"]
+    lines += [f"| {' | '.join([name, *cells])} |" for name, cells in rows.items()]
     if report["targets"]:
         lines += ["", "| compared | ratio | lowest to highest | target | |"]
         lines += ["|---|---:|---:|---:|---|", *map(target_row, report["targets"])]
@@ -444,7 +440,19 @@ def tell(report: dict[str, Any], given: argparse.Namespace) -> None:
         given.json.write_text(json.dumps(report, indent=1) + "\n")
 
 
-def main(question: Question, description: str | None) -> None:
-    """Parse the arguments, run the question, print the report."""
-    given = parser_of(description, question.rounds, question.seconds).parse_args()
-    tell(measure(question, given), given)
+def main(questions: Sequence[Question], description: str | None) -> None:
+    """Parse the arguments, run the questions, print the report of all."""
+    given = parser_of(description, questions[0].rounds, questions[0].seconds).parse_args()
+    reports = [measure(question, given) for question in questions]
+    tell(reports[0] if len(reports) == 1 else _joined(reports), given)
+
+
+def _joined(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the reports of several questions as one; their results are by title."""
+    joined = {**reports[0], "skipped": {}}
+    for report in reports:
+        joined["machine"]["versions"] |= report["machine"]["versions"]
+        joined["skipped"] |= report["skipped"]
+    joined["results"] = {report["title"]: report["results"] for report in reports}
+    joined["tables"] = "\n\n".join(tables(report) for report in reports if report["results"])
+    return joined

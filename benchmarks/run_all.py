@@ -1,7 +1,6 @@
 """Run the benchmarks that have results, keep the reports, and renew what shows them.
 
-`tables.md` has the table of each, `README.md` the comparisons with their targets, and
-`docs/pictures/speed.svg` is drawn from the first.
+`tables.md` has the table of each, and `docs/pictures/speed.svg` is drawn from the first.
 
     python benchmarks/run_all.py                      # all of them, a quarter of an hour
     python benchmarks/run_all.py exchange remote
@@ -20,11 +19,11 @@ import sys
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-from harness import machine_text, say, tables, target_row
+from harness import machine_text, say, tables
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
-TABLES, README = HERE / "tables.md", HERE / "README.md"
+TABLES = HERE / "tables.md"
 PICTURE = HERE.parent / "docs" / "pictures" / "speed.svg"
 UNEVEN = ["waiting:benchmarks/Uneven-v0", "64", "--ready", "1", "--envs-per-process", "1"]
 RUNS = {
@@ -72,22 +71,6 @@ def shown(name: str) -> str:
     return f"{own}\n\n{about}. {machine_text(report['machine'])}"
 
 
-def comparisons() -> str:
-    """Return the targets of all kept reports as one table, with the machine of each run."""
-    lines = ["| compared | ratio | lowest to highest | target | |", "|---|---:|---:|---:|---|"]
-    machines: list[str] = []
-    for path in [RESULTS / f"{name}.json" for name in RUNS]:
-        if path.exists():
-            report = json.loads(path.read_text())
-            for target in report["targets"]:
-                if report["title"].endswith("envs"):
-                    target["subject"] += f", {report['title']}"
-                lines.append(target_row(target))
-            if report["targets"]:
-                machines.append(machine_text(report["machine"]))
-    return "\n".join(lines) + "\n\n" + "\n\n".join(dict.fromkeys(machines))
-
-
 def between_marks(text: str, name: str, new: str) -> str:
     """`text` with `new` between the two marks of `name`."""
     marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -95,12 +78,11 @@ def between_marks(text: str, name: str, new: str) -> str:
 
 
 def renew_pages() -> None:
-    """Renew the tables, the comparisons and the picture from the kept reports."""
+    """Renew the tables and the picture from the kept reports."""
     text = TABLES.read_text()
     for name in RUNS:
         text = between_marks(text, name, shown(name))
     TABLES.write_text(text)
-    README.write_text(between_marks(README.read_text(), "comparisons", comparisons()))
     PICTURE.write_text(drawn(RESULTS))
 
 

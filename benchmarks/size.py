@@ -27,7 +27,7 @@ SMALL = [
     "sealing", "sharing", "spaces", "sync", "trees", "types",
 ]  # fmt: skip
 """Modules beside the packages of the engine that belong to it."""
-ENGINE = {"_core", "protocol", "batch", "config", "registry", "remote", *SMALL}
+ENGINE = {"_core", "protocol", "batch", "config", "registry", "remote", "small modules"}
 
 
 def code(folder: str) -> list[Path]:
@@ -37,14 +37,6 @@ def code(folder: str) -> list[Path]:
 
 def lines(paths: Iterable[Path]) -> int:
     return sum(path.read_bytes().count(b"\n") for path in paths)
-
-
-def package_of(path: Path) -> str:
-    """Return the row of a module: its package, two deeper in `_core`; small modules share one."""
-    parts = path.relative_to(SRC).with_suffix("").parts
-    if parts[0] == "_core":
-        return "/".join(parts[:3] if len(parts) > 3 else parts[:-1])
-    return "small modules" if parts[0] in SMALL else parts[0]
 
 
 def options() -> list[str]:
@@ -63,12 +55,12 @@ def main() -> None:
     modules = code("src")
     packages: Counter[str] = Counter()
     for path in modules:
-        packages[package_of(path)] += lines([path])
+        name = path.relative_to(SRC).parts[0].removesuffix(".py")
+        packages["small modules" if name in SMALL else name] += lines([path])
     sums = Counter({"engine": 0, "around the engine": 0})
     for name, count in sorted(packages.items()):
-        engine = name == "small modules" or name.partition("/")[0] in ENGINE
-        sums["engine" if engine else "around the engine"] += count
-        print(f"{count:7,}  {'' if engine else '  '}{name}")
+        sums["engine" if name in ENGINE else "around the engine"] += count
+        print(f"{count:7,}  {'' if name in ENGINE else '  '}{name}")
     pages = list((ROOT / "docs").glob("*.md"))
     texts = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING")]
     found = {

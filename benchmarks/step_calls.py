@@ -140,36 +140,21 @@ def counted(group: Any, call: Callable[[], Any]) -> Calls:
     return fewest_of(found)
 
 
-def stepped(turn: Callable[[Any, Any], Any]) -> Calls:
-    """Count a turn of the synchronous group, which takes a response and returns a batch."""
+def step() -> Calls:
+    """Count `step` of the synchronous group."""
     with build_env_group(CARTPOLE) as group, group.auto_reset():
         batch, _ = group.reset(seed=0)
         actions = np.zeros(NUM_ENVS, np.int64)
 
         def call() -> None:
             nonlocal batch
-            batch, _ = turn(group, batch.respond(action=actions))
+            batch, _ = group.step(batch.respond(action=actions))
 
         return counted(group, call)
 
 
-def step_and_collect() -> Calls:
-    """Count `step_async` and `collect_async` of the synchronous group."""
-
-    def turn(group: Any, response: Any) -> Any:
-        group.step_async(response)
-        return group.collect_async(wait_all=True)
-
-    return stepped(turn)
-
-
-def step() -> Calls:
-    """Count `step` of the synchronous group."""
-    return stepped(lambda group, response: group.step(response))
-
-
 def step_and_collect_async() -> Calls:
-    """Count the same as `step_and_collect` on an event loop (uvloop's)."""
+    """Count `step_async` and `collect_async` on an event loop (uvloop's)."""
 
     async def main() -> Calls:
         async with rlightning_aio.build_env_group(CARTPOLE) as group:
@@ -222,9 +207,8 @@ def collect_16() -> Calls:
 
 
 MEASURED = {
-    "step_async and collect_async": step_and_collect,
-    "the same, asynchronous": step_and_collect_async,
     "step": step,
+    "step_async and collect_async": step_and_collect_async,
     "VectorEnv.step": vector_step,
     "Collector.collect, 16 transitions": collect_16,
 }

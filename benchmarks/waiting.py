@@ -8,6 +8,7 @@ sleeps for log-normal times as well, whose spread is wider.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from statistics import NormalDist
 from typing import Any
@@ -40,15 +41,26 @@ class Waits:
 
 
 class Awaiting(Waits):
+    """An awaitable one.
+
+    Args:
+        mean: seconds of a step.
+        length: steps of an episode.
+    """
+
+    def __init__(self, mean: float = MEAN, length: float = math.inf) -> None:
+        self.share, self.length = mean / MEAN, length
+
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         del options
-        self.place = 97 * (seed or 0)
+        self.place, self.steps = 97 * (seed or 0), 0
         return IDLE, {}
 
     async def step(self, action: Any) -> Any:
         del action
-        await asyncio.sleep(self.latency())
-        return IDLE, 1.0, False, False, {}
+        await asyncio.sleep(self.share * self.latency())
+        self.steps += 1
+        return IDLE, 1.0, self.steps >= self.length, False, {}
 
 
 class BriefSleeping(Waits, gym.Env[Any, Any]):

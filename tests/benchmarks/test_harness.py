@@ -53,15 +53,13 @@ if __name__ == "__main__":
     ours = Scripted("ours", [10.0, 30.0, 12.0], turns)
     peer = Scripted("peer", [5.0, 10.0, 4.0], turns)
     others = [cls(cls.__name__, [], turns) for cls in (Absent, Broken, Dies)]
-    main(
-        Question(
-            "toy", "A toy", "things/s", [ours, *others, peer],
-            [Target("ours", "peer", 2.5), Target("ours", "peer", 2.0, True),
-             Target("ours", "Absent", 1.0)],
-            reference="peer", rounds=3,
-        ),
-        None,
+    question = Question(
+        "toy", "A toy", "things/s", [ours, *others, peer],
+        [Target("ours", "peer", 2.5), Target("ours", "peer", 2.0, True),
+         Target("ours", "Absent", 1.0)],
+        reference="peer", rounds=3,
     )
+    main([question], None)
 '''
 
 

@@ -17,9 +17,8 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "step_calls.py"
 TWINS = 0 if kernel.selected == "c" else 7
 STEP = {"calls": 44 + TWINS, "functions": 40 + TWINS, "files": 12 + (TWINS > 0)}
 MOST = {
-    "step_async and collect_async": STEP | {"calls": 43 + TWINS},
-    "the same, asynchronous": STEP,
     "step": STEP | {"calls": 42 + TWINS},
+    "step_async and collect_async": STEP,
     "VectorEnv.step": {"calls": 68 + TWINS},
     # It steps twice. A round may wait once more in the second, if a worker is late: 294 to 309.
     "Collector.collect, 16 transitions": {"calls": 309 + 2 * TWINS},
