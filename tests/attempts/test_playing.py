@@ -308,6 +308,29 @@ async def test_tasks_are_read_as_envs_become_free() -> None:
     assert len(asyncio.all_tasks()) == 1
 
 
+async def test_an_iterator_that_is_left_does_not_wait_for_an_env_that_closes() -> None:
+    """It has raised, and another takes its place; the group waits for that, when it asks next."""
+    closing, closed = asyncio.Event(), asyncio.Event()
+
+    class Slow(AwaitedRoom):
+        async def close(self) -> None:
+            closing.set()
+            await closed.wait()
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step("raise")
+
+    fields: dict[str, Any] = {"on_env_error": "restart", "max_restarts": 0, "close_timeout": 1e3}
+    async with rl.build_env_group(task=Slow, placement="loop", num_workers=1, **fields) as group:
+        waiting = asyncio.ensure_future(anext(play(group, tasks(1), agent)))
+        await closing.wait()
+        waiting.cancel()
+        await asyncio.wait([waiting], timeout=HANG)
+        closed.set()
+        assert waiting.cancelled()
+        assert group.pending == []
+
+
 @pytest.mark.parametrize("retries", [0, 2])
 async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
     async def agent(episode: AttemptEpisode) -> None:

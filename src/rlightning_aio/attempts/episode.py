@@ -224,9 +224,8 @@ class AttemptInPlay(AttemptEpisode):
 
         Hardware stays, and so do the envs of clients.
         """
-        if self._episode.lost is None:  # Else it is rebuilt already.
-            with contextlib.suppress(NotImplementedError, RLightningError):
-                await self._episode.env.call(RENEW)
+        with contextlib.suppress(NotImplementedError, RLightningError):
+            await self._episode.call(RENEW)  # Refused after a loss: it is rebuilt already.
 
     def end(self, why: str) -> None:
         """Refuse further steps."""

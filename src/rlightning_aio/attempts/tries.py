@@ -113,7 +113,7 @@ class Try:
             ended, result = await self._play(limit)
             await self._leave()
         if ended.kind in ("env_raised", "not_started"):
-            await surely({asyncio.ensure_future(view.renew())})
+            await self._renew()
         self._has_ended = True
         if isinstance(self.error, _NoCoroutine):
             raise TypeError(*self.error.args)
@@ -186,6 +186,13 @@ class Try:
     async def _leave(self) -> None:
         self._view.end("is over")
         await surely({asyncio.ensure_future(self._view.leave())})
+
+    async def _renew(self) -> None:
+        renewing = asyncio.ensure_future(self._view.renew())
+        await self._within(renewing, None)  # It may wait for another env, which still closes.
+        if not renewing.done():
+            renewing.cancel()
+            await self._leave()
 
     def _abandon(self, playing: asyncio.Task[Any]) -> None:
         if playing.done():
