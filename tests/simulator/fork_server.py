@@ -27,6 +27,7 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     NotForked,
     Ready,
 )
+from rlightning_aio._core.hosts.process.host import ForkServerHandle
 from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
@@ -37,8 +38,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import Completion, WorkerPlace
 
-__all__ = ["ForkServer"]
+__all__ = ["ForkServer", "kill"]
 
+_kill = ForkServerHandle.kill
 _CLOSE_SECONDS = 1.2
 _DUMP_SECONDS = 0.3
 _LEAST_START_SECONDS = 5.0
@@ -147,9 +149,13 @@ class ForkServer(Living):
             worker, _ = self._children[message.host_id]
             if message.dump:
                 worker.stderr += _DUMP
-                if not (worker.has_started() or worker.is_late()):
-                    self.world.wrongs.append(f"{worker.name} is killed as late although it wasn't")
             self.later(_DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL))
+
+    def check_late(self, host_id: int) -> None:
+        """Check a worker that the trainer is about to kill as hung; the order may arrive later."""
+        worker, _ = self._children.get(host_id, (None, 0))
+        if worker is not None and not (worker.has_started() or worker.is_late()):
+            self.world.wrongs.append(f"{worker.name} is killed as late although it wasn't")
 
     def _fork(self, place: WorkerPlace, channel: int, arena: int) -> None:
         sockets, host_id = self.world.sockets, place.host_id
@@ -188,6 +194,13 @@ class ForkServer(Living):
             self.later(0.01, partial(self._until_gone, since_ns))
         else:
             self.end(0)
+
+
+def kill(handle: Any, host: Any, *, dump: bool) -> None:
+    """Do what `ForkServerHandle.kill` does, and check that a worker which is killed as hung is."""
+    if dump and handle._server is not None:
+        handle._server.process.check_late(host.host_id)
+    _kill(handle, host, dump=dump)
 
 
 class _Worker(Worker):

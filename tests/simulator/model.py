@@ -747,6 +747,9 @@ class Model:
             after = [state.copy() for state in (env.state, *env.loose)]
             for state in after:  # It may have been done with it.
                 state.play(request)
+            for done, state in itertools.product((request, Request("reset")), env.torn):
+                after.append(state.copy())
+                after[-1].play(done)
             if self._may_be_rebuilt(env, request):  # And interrupted in the reset that follows.
                 env.errors = env.errors[0], self._most_errors(env)
                 after += [env.fresh(), env.fresh()]

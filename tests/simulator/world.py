@@ -45,7 +45,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from simulator import rays
-from simulator.fork_server import ForkServer
+from simulator.fork_server import ForkServer, kill
 from simulator.network import Network
 from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, WakeUp, run_in_process
@@ -207,6 +207,7 @@ class World:
             (socket, "socketpair", self.sockets.pair),
             (descriptors, "WakeUp", partial(WakeUp, self.sockets)),
             (subprocess, "Popen", partial(ForkServer, self)),
+            (process_hosts.ForkServerHandle, "kill", kill),
             (spares, "_spares", {}),
             (os, "close", self.sockets.close_descriptor),
             (os, "set_inheritable", self.sockets.set_inheritable),
