@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from kit.counting import CountingEnv as CountedSteps
 from kit.scripted import Awaitable, Counts
-from simulator.world import Faults, World
+from simulator.world import Deadlock, Faults, World
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -227,3 +227,18 @@ def test_clients_of_an_env_server_are_simulated() -> None:
     worlds = [world(seed) for seed in range(5)]
     assert [one.trace for one in worlds] == [world(seed).trace for seed in range(5)]
     assert any(one.counts["cuts"] for one in worlds)
+
+
+def test_a_program_that_goes_on_without_end_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing happens in its world: its event loop turns."""
+    monkeypatch.setattr("simulator.world._MAX_EVENTS", 1000)
+
+    def turn() -> None:
+        asyncio.get_running_loop().call_soon(turn)
+
+    async def main() -> None:
+        turn()
+        await asyncio.Event().wait()
+
+    with World(1) as world, pytest.raises(Deadlock):
+        world.run(main())

@@ -76,7 +76,7 @@ _TICK_NS: Final = 200
 """How long it takes to read the clock. So a loop that only looks at the clock ends."""
 _START_NS: Final = 10**12
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
-_MAX_EVENTS: Final = 2_000_000
+_MAX_EVENTS: Final = 500_000
 
 
 class Deadlock(AssertionError):
@@ -155,6 +155,7 @@ class World:
         self._notes: list[tuple[Any, ...]] = []
         self._events: list[list[Any]] = []
         self._order = itertools.count()
+        self._num_events = 0
         self._processes: list[Process] = []
         self.stopped: list[Living] = []
         self._pieces = self.rng.choice((3, 10, 30, 100))
@@ -354,10 +355,9 @@ class World:
         while self._events:
             if until_ns is not None and self._events[0][0] > until_ns:
                 return False
-            at, order, callback = heapq.heappop(self._events)
+            self._count_event()
+            at, _, callback = heapq.heappop(self._events)
             if callback is not None:
-                if order > _MAX_EVENTS:
-                    raise Deadlock(f"{_MAX_EVENTS} events have led to nothing")
                 self.now_ns = max(self.now_ns, at)
                 self.running = NOBODY
                 try:
@@ -366,6 +366,17 @@ class World:
                     self.running = None
                 return True
         return False
+
+    def _count_event(self) -> None:
+        """Count what happens, and what the trainer does: a program that goes on and on must fail.
+
+        Raises:
+            Deadlock: it is more than any program needs.
+        """
+        self._num_events += 1
+        if self._num_events > _MAX_EVENTS:
+            self._num_events = 0  # Now the program is closed.
+            raise Deadlock(f"{_MAX_EVENTS} events have led to nothing")
 
     def sleep(self, seconds: float) -> None:
         """Take this long, in the trainer or in a process."""
@@ -388,6 +399,7 @@ class World:
         until = None if seconds is None else self.now_ns + max(0, int(seconds * 1e9))
         if self.running is not None:
             return self.running.wait_for(ready, until)
+        self._count_event()
         self.sleep(1e-6)  # A system call takes time, so a loop of calls that don't wait ends.
         while not (found := ready()):
             if not self.happen(until):
@@ -417,6 +429,7 @@ class World:
         if self.running is not None:
             self.running.point()
             return
+        self._count_event()
         chance, faults = self.rng.random(), self.faults
         if chance < faults.lags:
             self.counts["lags"] += 1
