@@ -390,28 +390,28 @@ def test_a_wrong_field_causes_no_further_messages() -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_num_envs_of_a_backend_with_single_envs_is_refused() -> None:
-    """The message has the field to use instead."""
-    arm = {"name": "arm", "backend": "piper", "task": "can0", "num_envs": 4}
-    said = "envs.0 ('arm'), num_envs: backend 'piper' makes single envs; use num_workers: 4"
-    assert said in problems_of(arm)
-
-
-def test_a_missing_task_is_named() -> None:
-    """It is the only field without a default."""
-    assert "envs.0 ('mujoco'), task: is required" in problems_of([{"backend": "mujoco"}])
-    assert "envs.0, backend: is required" in problems_of([{"num_workers": 2}])
-
-
-def test_a_name_must_not_be_empty() -> None:
-    """Env ids begin with it."""
-    assert "envs.0, name: " in problems_of(HOPPER | {"name": ""})
-
-
-def test_two_entries_must_not_share_a_name() -> None:
-    """Their envs would have the same ids."""
-    message = problems_of([HOPPER, CARTPOLE, CARTPOLE | {"name": "hopper"}])
-    assert "envs.2 ('hopper'), name: is also the name of envs.0" in message
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        (
+            {"name": "arm", "backend": "piper", "task": "can0", "num_envs": 4},
+            "envs.0 ('arm'), num_envs: backend 'piper' makes single envs; use num_workers: 4",
+        ),
+        ([{"backend": "mujoco"}], "envs.0 ('mujoco'), task: is required"),
+        ([{"num_workers": 2}], "envs.0, backend: is required"),
+        (HOPPER | {"name": ""}, "envs.0, name: "),
+        (
+            [HOPPER, CARTPOLE, CARTPOLE | {"name": "hopper"}],
+            "envs.2 ('hopper'), name: is also the name of envs.0",
+        ),
+        ("configs/hopper.yaml", "load_config reads files"),
+        (CONFIGS / "hopper.yaml", "load_config reads files"),
+    ],
+    ids=str,
+)
+def test_what_is_missing_or_twice_is_named(entries: Any, said: str) -> None:
+    """With what to do."""
+    assert said in problems_of(entries)
 
 
 VALUES: dict[str, Any] = {
@@ -568,19 +568,6 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 def test_other_values_are_refused(cfgs: object) -> None:
     """Only entries are accepted."""
     assert problems_of(cfgs).startswith("environment configuration: ")
-
-
-def test_a_path_in_place_of_entries_is_refused_with_a_hint() -> None:
-    """The message names load_config."""
-    assert "load_config reads files" in problems_of("configs/hopper.yaml")
-    assert "load_config reads files" in problems_of(CONFIGS / "hopper.yaml")
-
-
-def test_env_config_suggests_the_nearest_field() -> None:
-    """It does so when it is made in Python, too."""
-    with pytest.raises(ConfigError, match=r"num_worker: .* did you mean 'num_workers'") as caught:
-        EnvConfig(**HOPPER, num_worker=3)
-    assert caught.value.__cause__ is caught.value.__context__ is None
 
 
 def test_env_config_lists_everything_that_is_wrong() -> None:

@@ -43,16 +43,6 @@ def test_every_make_target_exists(command: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_configuration_block_loads(tmp_path: Path) -> None:
-    """The YAML block is a valid configuration."""
-    from rlightning_aio import load_config
-
-    path = tmp_path / "file.yaml"
-    path.write_text(blocks("yaml", CONFIGURATION)[0])
-    configs = load_config(path, ["envs.0.num_workers=16"])
-    assert [config.num_workers for config in configs] == [16, 8]
-
-
 def test_the_page_on_configuration_names_every_field() -> None:
     """Each field of `EnvConfig` has its item, and no item names another."""
     from rlightning_aio import EnvConfig
@@ -67,9 +57,3 @@ def test_the_page_on_configuration_names_every_field() -> None:
 def test_it_is_short() -> None:
     """A reader reads the whole README before going on."""
     assert len(README.split()) <= 700
-
-
-def test_every_linked_file_exists() -> None:
-    """Every relative link of the README has a target."""
-    targets = re.findall(r"\]\((?!http)([^)#]+)\)", README)
-    assert [target for target in targets if not (ROOT / target).exists()] == []

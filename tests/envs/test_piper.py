@@ -224,16 +224,6 @@ def test_the_action_space_is_the_limits(arm: WatchedArm, make: Any) -> None:
         env.step(respond([0.6, *space.low[1:]]))
 
 
-def test_an_action_of_the_wrong_shape_raises(arm: WatchedArm, make: Any) -> None:
-    """The error lists the elements with their limits, and the given shape."""
-    env = make()
-    for action, found in ((READY, r"shape \(6,\)"), (None, "None"), ("left", "a str")):
-        env.reset()
-        expected = rf"shape \(7,\): joint_1 in \[-2.6179, 2.6179\] rad, .*gripper.*; got {found};"
-        with pytest.raises(BadAction, match=expected):
-            env.step(respond(action))
-
-
 STOPS = {
     "hold": lambda arm: sent_joints(arm.commands) and not arm.emergency_stopped,
     "emergency_stop": lambda arm: arm.emergency_stopped,

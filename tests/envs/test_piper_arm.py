@@ -24,7 +24,6 @@ pytestmark = pytest.mark.simulators
 
 ON = CanFrame(0x471, bytes([7, 2, 0, 0, 0, 0, 0, 0]))
 STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
-RESUME = CanFrame(0x150, bytes([2, 0, 0, 0, 0, 0, 0, 0]))
 
 
 def mode(move: int, speed: int) -> CanFrame:

@@ -86,18 +86,6 @@ def test_arms_in_a_group_reach_their_targets(placement: str) -> None:
         assert group.get_env_stats()["arm-1"]["mean_length"] == 20
 
 
-def test_a_bad_action_reaches_the_trainer_and_not_the_arm() -> None:
-    """The worker's error has the joint and its limits; after a reset the arm continues."""
-    with sync.build_env_group(entry()) as group:
-        batch, _ = group.reset()
-        bad = np.array([[9.0, *READY[1:], 0.0]], np.float32)
-        with pytest.raises(BadAction, match=r"joint_1 = 9 rad is outside"):
-            group.step(batch.respond(action=bad))
-        batch, _ = group.reset()
-        batch, _ = group.step(batch.respond(action=np.array([[*READY, 0.0]], np.float32)))
-        assert batch.info()[0]["arm_status"] == "NORMAL"
-
-
 ACTIONS_THAT_ARE_NONE = {
     "NaN": ([0.1, *READY[1:5], math.nan, 0.0], r"joint_6 = nan rad is outside \[-2\.09439, 2"),
     "infinity": ([0.1, *READY[1:5], math.inf, 0.0], r"joint_6 = inf rad is outside \[-2\.09439"),

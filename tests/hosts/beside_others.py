@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from group.sample_envs import Gate, Probe
+from group.sample_envs import Probe
 
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def entry(name: str, backend: str, placement: str, **fields: Any) -> Any:
@@ -70,19 +67,3 @@ async def check_methods(group: Any) -> None:
     assert await handle.get_attr("label") == "changed"
     await group.reset()
     assert (await handle.step([0.0, 2.0])).last_reward == 2
-
-
-async def check_first_ready(facade: Any, places: tuple[str, ...], slow: str, gates: Path) -> None:
-    """Check that an env that waits at a gate in place `slow` delays no other place."""
-    gate = Gate(str(gates), "slow-0").make()
-    quick = [entry(f"quick_{place}", "probe", place) for place in places]
-    held = entry("slow", "gated", slow, env_kwargs={"gates": str(gates)})
-    async with facade.build([held, *quick]) as group:
-        batch, _ = await group.reset()
-        group.step_async(batch.respond(action=np.zeros((1 + len(places), 2))))
-        ready: set[str] = set()
-        while len(ready) < len(places):
-            ready.update((await group.collect_async())[0].ids())
-        assert ready == {f"quick_{place}-0" for place in places}
-        gate.open()
-        assert (await group.collect_async())[0].ids() == ["slow-0"]

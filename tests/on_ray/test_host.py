@@ -9,17 +9,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from group.sample_envs import Probe
 from hosts import beside_others
 from hosts.beside_others import (
-    both_ways,
-    check_first_ready,
-    check_methods,
-    check_three_are_equal,
-    check_usable_after_an_error,
     steps,
 )
-from kit.driven import without_times
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet
 from rlightning_aio.errors import ConfigError, StartFailed
@@ -31,53 +24,9 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.ray
 
-CHEETAH = {"backend": "mujoco", "task": "HalfCheetah-v5", "num_workers": 4}
-THREE_PLACES = ("inline", "ray", "process")
-
 
 def entry(name: str, backend: str = "probe", placement: str = "ray", **fields: Any) -> Any:
     return beside_others.entry(name, backend, placement, **fields)
-
-
-async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Place) -> None:
-    """In one group, to the last bit, infos included, however results are waited for."""
-    entries = [
-        entry(place, placement=place, **CHEETAH, **apart)
-        for place, apart in zip(
-            THREE_PLACES, ({}, {"envs_per_process": 2}, {"envs_per_process": 2}), strict=True
-        )
-    ]
-    draw = np.random.default_rng(0)
-    resets = 0
-    async with facade.build(entries) as group:
-        batch, _ = await group.reset(seed={id_: 7 + int(id_[-1]) for id_ in group.env_ids})
-        with group.auto_reset(max_episode_steps=20):
-            for number in range(100):
-                action = np.tile(draw.uniform(-1, 1, (4, 6)), (3, 1))
-                batch, flags = await both_ways(number, group, batch, action)
-                check_three_are_equal(batch, flags)
-                resets += int(np.sum(batch.is_reset))
-        stats = group.get_env_stats()
-    episodes = [[without_times(stats[f"{place}-{k}"]) for k in range(4)] for place in THREE_PLACES]
-    assert episodes[0] == episodes[1] == episodes[2]
-    assert resets == 4 * 12
-
-
-async def test_an_env_that_raises_stays_usable(sync_facade: Place) -> None:
-    """Its neighbour's result comes with the error, and both go on."""
-    async with sync_facade.build(entry("one", num_workers=2, envs_per_process=2)) as group:
-        await check_usable_after_an_error(group)
-
-
-async def test_methods_are_called_in_the_actor(sync_facade: Place) -> None:
-    """In a process of its own; a value that can't be sent is the caller's error alone."""
-    async with sync_facade.build([entry("one"), entry("two", placement="process")]) as group:
-        await check_methods(group)
-
-
-async def test_a_slow_actor_keeps_nobody_waiting(facade: Place, tmp_path: Path) -> None:
-    """Whoever is ready comes first, from an actor, a process or inline."""
-    await check_first_ready(facade, THREE_PLACES, "ray", tmp_path)
 
 
 def wide() -> type[gym.Env[Any, Any]]:
@@ -195,22 +144,3 @@ def test_options_that_mean_nothing_are_refused(
     """Before anything starts."""
     with pytest.raises(ConfigError, match=said):
         sync_facade.build(entry("one", ray_options=options))
-
-
-async def test_closing_errors_are_told_with_ids(
-    sync_facade: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each env is closed, whatever another's close has raised."""
-
-    class Loud(Probe):
-        def close(self) -> None:
-            raise ValueError(f"stuck at {self.worker_index}")
-
-    monkeypatch.setitem(ENVS._classes, "loud", Loud)
-    group = sync_facade.build(entry("one", "loud", num_workers=2, envs_per_process=2))
-    with (
-        pytest.warns(UserWarning, match="env 'one-0' raised ValueError: stuck at 0"),
-        pytest.warns(UserWarning, match="env 'one-1' raised ValueError: stuck at 1"),
-    ):
-        async with group:
-            await group.reset()

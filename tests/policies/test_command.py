@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
 from cli.command import invoke, invoke_json, write_config
-from policies.counting import chunk_of
 from policies.servers import OpenPiServer, serving
-
-from rlightning_aio.policies import ActionChunks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,14 +14,6 @@ if TYPE_CHECKING:
 ENTRY = {
     "name": "env", "task": "policies.counting:Counting", "placement": "inline", "num_workers": 2,
 }  # fmt: skip
-
-
-def _chunks(batch: Any) -> Any:
-    return np.stack([chunk_of(observation) for observation in batch.observation])
-
-
-three_of_each = ActionChunks(_chunks, 3)
-"""A policy that the command names."""
 
 
 def check(document: Any) -> None:
@@ -43,13 +31,6 @@ def test_all_actions_of_openpi_s_chunks_are_played_by_default(tmp_path: Path) ->
         check(invoke_json("eval", config, "--policy", policy, "--seeds", "0:4"))
 
 
-def test_a_policy_of_a_module_may_return_chunks(tmp_path: Path) -> None:
-    """If it plays them by itself."""
-    config, file = write_config(tmp_path, ENTRY), tmp_path / "results.jsonl"
-    words = ("eval", config, "--policy", "policies.test_command:three_of_each", "--resume", file)
-    check(invoke_json(*words, "--seeds", "0:4"))
-
-
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
@@ -65,18 +46,3 @@ def test_what_is_no_policy_server_is_refused(
     done = invoke("eval", write_config(tmp_path, ENTRY), *words, "--seeds", "0:4")
     assert done.exit_code == code
     assert message in done.stderr
-
-
-def test_an_error_of_the_server_is_shown_in_words(tmp_path: Path) -> None:
-    """The command ends with it, without a traceback of its own."""
-
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            connection.send("KeyError: 'observation/image'")
-
-    config = write_config(tmp_path, ENTRY)
-    with serving(Server()) as url:
-        done = invoke("eval", config, "--policy", url.replace("ws", "openpi", 1), "--seeds", "0:4")
-    assert done.exit_code == 1
-    assert "reports an error:\nKeyError: 'observation/image'" in done.stderr
-    assert "Traceback" not in done.stderr

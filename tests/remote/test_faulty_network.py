@@ -8,30 +8,15 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
-from kit.counting import ClientThread
 from patience import HANG
 from remote.faulty_proxy import Faults, FaultyProxy
-from remote.recording import HEARTBEAT, RecordingEnv
+from remote.recording import HEARTBEAT
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-REQUESTS = int(os.environ.get("RLIGHTNING_AIO_FAULTY_REQUESTS", "400"))
-"""For each kind of network; 10,000 take some minutes."""
-CLIENTS = 3
-
-
-NETWORKS = {
-    "breaking": Faults(cut=0.02),
-    "falling silent": Faults(silence=0.006),
-    "both": Faults(cut=0.01, silence=0.008),
-}
 
 
 def make_config(num_clients: int) -> dict[str, Any]:
@@ -58,30 +43,6 @@ def check(ends: dict[int, tuple[str, str]], folder: Path, proxy: FaultyProxy) ->
     fates = [name for name in ("cut", "silence") if getattr(proxy.faults, name)]
     assert all(proxy.tally[name] for name in fates), "the network had too few faults"
     return dict(Counter(fate for _, fate in ends.values()))
-
-
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("network", NETWORKS)
-def test_no_request_is_executed_twice_and_each_ends_once(
-    network: str, tmp_path: Path, record_property: Callable[[str, Any], None]
-) -> None:
-    """Every request of the trainer ends in its own result, or in a marked one."""
-    envs = [RecordingEnv(k, tmp_path / f"c{k}") for k in range(CLIENTS)]
-    with (
-        sync.build_env_group(make_config(CLIENTS)) as group,
-        FaultyProxy(group["robots-0"].address, NETWORKS[network], seed=1) as proxy,
-    ):
-        threads = [ClientThread(proxy.address, f"c{k}", env) for k, env in enumerate(envs)]
-        for env in envs:
-            env.stays = True
-        ends = exchange(group, REQUESTS)
-        for env in envs:
-            env.stays, env.finished = False, True
-        group.close()
-        for thread in threads:
-            thread.join()
-    record_property("network", proxy.tally)
-    record_property("requests", check(ends, tmp_path, proxy))
 
 
 @pytest.mark.timeout(1500)
