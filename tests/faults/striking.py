@@ -6,15 +6,11 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.hosts.awaiting.event_loop import _CollectorTime
-
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
 
-# Of the garbage collector.
-COLLECTOR = _CollectorTime.__call__.__code__
 DRIVER = ("/group/api/sync.py", "/group/drivers/sync_driver.py", "/collecting/procedure.py")
 
 
@@ -27,8 +23,7 @@ class Strike:
     """A trace function that presses Ctrl-C at the n-th line of this library.
 
     Lines of the driver count only while it holds Ctrl-C back: where it doesn't any more, nothing is
-    called before it returns, so Python doesn't look for signals there. What the garbage collector
-    calls doesn't count: Python drops what is raised there.
+    called before it returns, so Python doesn't look for signals there.
 
     Attributes:
         left: lines until then; 0 afterwards.
@@ -38,8 +33,6 @@ class Strike:
         self.left = line
 
     def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
-        if frame.f_code is COLLECTOR:
-            return None
         return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
 
     def _line(self, frame: FrameType, event: str, arg: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import pickle
 import signal
 from collections import deque
 from typing import TYPE_CHECKING, Any
@@ -15,6 +14,7 @@ from protocol.memory_of_rings import unused
 
 from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
+from rlightning_aio._core.hosts.completion_frames import frame_of
 from rlightning_aio._core.hosts.messages import (
     Died,
     NewSchema,
@@ -205,7 +205,7 @@ def test_a_bell_that_is_read_with_a_frame_can_be_armed_again(started: Scene) -> 
         assert bell.unread() == 0
         scene.serve()
         assert scene.rung == number
-        scene.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
+        scene.send(*frame_of(NewSchema(0, number, SCHEMA)))
         # The channel did not wake the trainer, but something else.
         scene.host.poll()
         assert scene.posted() == [
@@ -219,7 +219,7 @@ def test_frames_come_before_later_reports(started: Scene) -> None:
     """A row can be read only with a known schema, and the trainer reads by either way."""
     for number, look in ((1, started.host.poll), (2, started.read)):
         started.host.submit(steps(number))
-        started.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
+        started.send(*frame_of(NewSchema(0, number, SCHEMA)))
         started.send(FrameKind.RESULT, step(number, 0), b"out of band")
         started.serve(step(number, 1))
         look()
@@ -322,7 +322,7 @@ def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) 
     started.host.submit(steps(1))
     started.serve()
     started.host.submit(steps(2))
-    started.send(FrameKind.INFO_SCHEMA, 1, pickle.dumps(SCHEMA))
+    started.send(*frame_of(NewSchema(0, 1, SCHEMA)))
     started.rings.begin(step(2, 1), 5)
     assert started.host.current_request() == (step(2, 1), 5)
     started.channel.close()

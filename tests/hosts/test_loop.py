@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import logging
 import math
 import time
@@ -654,31 +653,6 @@ async def test_few_of_many_turns_that_block_the_event_loop_are_reported(
     reports = [one for one in caplog.messages if "blocked the event loop" in one]
     assert len(reports) == 3
     assert reports[-1].endswith("every 100th such turn is logged")
-
-
-async def test_the_garbage_collectors_time_is_nobodys(caplog: pytest.LogCaptureFixture) -> None:
-    """A collection happens in the turn of whichever env makes the next object."""
-
-    class Littered(Plain):
-        async def step(self, action: Any) -> Any:
-            gc.collect()
-            return await super().step(action)
-
-    def take_long(phase: str, info: dict[str, int]) -> None:
-        del info
-        if phase == "start":
-            time.sleep(0.12)
-
-    asyncio.get_running_loop().set_debug(False)
-    config = rl.EnvConfig(name="p", task=Littered, placement="loop")
-    async with rl.build_env_group(config) as group:
-        await group.reset(seed=0)
-        gc.callbacks.append(take_long)
-        try:
-            await group.step(steps(p_0=1))
-        finally:
-            gc.callbacks.remove(take_long)
-    assert "blocked the event loop" not in caplog.text
 
 
 async def test_an_interrupt_that_an_env_raises_in_a_worker_is_its_own() -> None:

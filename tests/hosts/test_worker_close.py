@@ -7,6 +7,8 @@ import socket
 import numpy as np
 from protocol.memory_of_rings import both_sides
 
+from rlightning_aio._core.hosts.completion_frames import completion_in
+from rlightning_aio._core.hosts.messages import Closed
 from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import FrameKind, FrameReader, encode
@@ -24,4 +26,4 @@ def test_a_close_comes_before_waiting_requests() -> None:
         trainer.count_frame()
         worker.serve()
         replies = FrameReader().feed(ours.recv(1 << 16))
-        assert [frame.kind for frame in replies] == [FrameKind.CLOSED]
+        assert [completion_in(0, frame) for frame in replies] == [Closed(0, [])]

@@ -254,7 +254,7 @@ def test_info_that_cannot_be_sent_is_named_once(
             client.session.finish(wire_number, ret)
             client.flush()
             world.settle()
-    assert [result.info for result in world.take()] == [{"fine": 1}] * 2
+    assert [message.info for _, message in world.take()] == [{"fine": 1}] * 2
     assert [record.message for record in caplog.records] == [
         "a: camera of the env's info can't be sent and is left out"
     ]
@@ -275,7 +275,7 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
     client.session.answer(number, outcome, info, {}, 0, 0)
     client.flush()
     world.settle()
-    assert only(world.take()).info == {"fine": {1: 2}}
+    assert only(world.take())[1].info == {"fine": {1: 2}}
     assert [record.message for record in caplog.records] == [
         "a: 0 of the env's info can't be sent and is left out"
     ]

@@ -17,17 +17,14 @@ from rlightning_aio.protocol.net.client_session import (
     Ended,
     Phase,
     Refused,
-    ResetRequest,
-    StepRequest,
-    Welcomed,
 )
 from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
+from rlightning_aio.protocol.net.wire import Reset, Step, Welcome
 from rlightning_aio.types import EnvMeta, EnvRet
 
 if TYPE_CHECKING:
-    from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.net.announcements import Announcement
-    from rlightning_aio.protocol.net.server_session import RemoteResult
+    from rlightning_aio.protocol.net.server_session import Answer
 
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 ACTION = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -61,7 +58,7 @@ class Client:
         """Start the process, or restart it."""
         self.lives += 1
         self.steps = 0
-        self.todo: StepRequest | ResetRequest | None = None
+        self.todo: Step | Reset | None = None
         meta = EnvMeta(env_id="env", observation_space=OBSERVATION, action_space=ACTION)
         self.session = ClientSession(meta, self.name)
 
@@ -108,7 +105,7 @@ class Client:
             else:
                 self.refused.append(event.text)
             self.hang_up()
-        elif event is not None and not isinstance(event, Welcomed):
+        elif event is not None and not isinstance(event, Welcome):
             self.todo = event
 
     def leave(self) -> None:
@@ -121,13 +118,13 @@ class Client:
     def execute(self) -> None:
         """Execute the pending request once."""
         request = self.todo
-        if not isinstance(request, StepRequest | ResetRequest):
+        if not isinstance(request, Step | Reset):
             return
         self.todo = None
         key = (self.route, request.number)
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
-        self.steps = 0 if isinstance(request, ResetRequest) else self.steps + 1
+        self.steps = 0 if isinstance(request, Reset) else self.steps + 1
         self.session.finish(request.number, self.ret())
         self.flush()
 
@@ -150,13 +147,13 @@ class Recorder:
     def __init__(self) -> None:
         self.taken: list[str] = []
         self.lost: list[tuple[str, bool]] = []
-        self.answers: list[RemoteResult | ErrorText] = []
+        self.answers: list[Answer] = []
         self.since: float | None = None
 
     def on_taken(self, announced: Announcement) -> None:
         self.taken.append(announced.meta.env_id)
 
-    def on_answer(self, answer: RemoteResult | ErrorText) -> None:
+    def on_answer(self, answer: Answer) -> None:
         self.answers.append(answer)
 
     def on_lost(self, cause: str, *, in_order: bool) -> None:
@@ -215,7 +212,7 @@ class World:
         while moved:
             moved = False
             for client in self.clients.values():
-                if isinstance(client.todo, StepRequest | ResetRequest):
+                if isinstance(client.todo, Step | Reset):
                     client.execute()
                     moved = True
                 while client.outbox:

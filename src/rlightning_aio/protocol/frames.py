@@ -17,27 +17,21 @@ HEADER: Final = struct.Struct("<IIq")
 
 
 class FrameKind(IntEnum):
-    """The kind of a frame; `completion_frames` has the completion of each that a worker sends.
+    """The kind of a frame.
 
-    The comments name sender, number and payload.
+    The comments name sender, number and payload; `completion_frames` has those of workers.
     """
 
     BELL = 0  # both
     START = 1  # trainer: what to build
-    STARTED = 2  # worker: metadata of each env
-    START_ERROR = 3  # worker; index of the env: the error of building it
-    ATTACH = 4  # trainer: offsets and sizes of the slabs, and the rows of the envs
-    ATTACHED = 5  # worker
-    REQUEST = 6  # trainer; the entry: arguments out of band
+    ATTACH = 2  # trainer: offsets and sizes of the slabs, and the rows of the envs
+    REQUEST = 3  # trainer; the entry: arguments out of band
+    ABORT = 4  # trainer; the request's entry
+    CLOSE = 5  # trainer
+    STARTED = 6  # worker: metadata of each env
     RESULT = 7  # worker; the request's entry: the part out of band
     VALUE = 8  # worker; the request's entry: the value of a call
-    ERROR = 9  # worker; the request's entry: an exception as text
-    INFO_SCHEMA = 10  # worker; the schema's number: a new schema of infos
-    CLOSE = 11  # trainer
-    CLOSED = 12  # worker: errors of close(), by env
-    ABORT = 13  # trainer; the request's entry
-    LOST = 14  # worker; index of an env: why it is gone, and the entry of its request
-    MOVED = 15  # worker; the request's entry: a reset that the next worker executes
+    OTHER = 9  # worker: any other completion
 
 
 class Frame(NamedTuple):

@@ -45,9 +45,6 @@ from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Phase,
     Refused,
-    ResetRequest,
-    StepRequest,
-    Welcomed,
 )
 from rlightning_aio.protocol.net.payload import ResultFields
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
@@ -58,6 +55,9 @@ from rlightning_aio.protocol.net.wire import (
     MAX_FRAME_BYTES,
     MAX_HEARTBEAT,
     MAX_NAME_LENGTH,
+    Reset,
+    Step,
+    Welcome,
     WireError,
     ping_ms,
 )
@@ -166,7 +166,7 @@ class RemoteEnvClient:
         self._is_at_work = False
         self._late_events: list[Event] = []
         self._end_watch: Callable[[], None] | None = None
-        self._request: StepRequest | ResetRequest | None = None
+        self._request: Step | Reset | None = None
         # The env was reset or stepped, or a session has ended, since it was asked that last.
         self._asks_if_finished = False
         self._trouble = ""
@@ -389,10 +389,10 @@ class RemoteEnvClient:
     def _apply(self, event: Event | None) -> None:
         if self._is_at_work and event is not None:
             self._late_events.append(event)
-        elif isinstance(event, StepRequest | ResetRequest):
+        elif isinstance(event, Step | Reset):
             self._request, self._trouble = event, ""
             self._pause = _SECONDS_BETWEEN_ATTEMPTS[0]
-        elif isinstance(event, Welcomed):
+        elif isinstance(event, Welcome):
             self._trouble = ""
             self.num_sessions += 1
             # ZeroMQ takes it for the next connection. In this one, the server's pings say when to
@@ -417,10 +417,10 @@ class RemoteEnvClient:
                 stop(self._env)
             self._env.on_disconnect()
 
-    def _execute(self, request: StepRequest | ResetRequest) -> None:
+    def _execute(self, request: Step | Reset) -> None:
         self._asks_if_finished = True
         try:
-            if isinstance(request, ResetRequest):
+            if isinstance(request, Reset):
                 self._reset(request)
             else:
                 self._step(request)
@@ -458,13 +458,13 @@ class RemoteEnvClient:
                 self._read(0)
             return [] if self._session.phase is Phase.SERVING else [self._env]
 
-    def _reset(self, request: ResetRequest) -> None:
+    def _reset(self, request: Reset) -> None:
         began_ns = time.perf_counter_ns()
         with self._at_work():
             ret = self._env.reset(seed=request.seed, options=request.options)
         self._answer(request.number, "reset", ret, time.perf_counter_ns() - began_ns)
 
-    def _step(self, request: StepRequest) -> None:
+    def _step(self, request: Step) -> None:
         began_ns = time.perf_counter_ns()
         if self._bare_step is not None:
             with self._at_work():

@@ -12,13 +12,8 @@ import pickle
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.messages import (
-    Attached,
     Built,
-    Closed,
     ErrorText,
-    Lost,
-    Moved,
-    NewSchema,
     NotBuilt,
     Raised,
     Result,
@@ -28,8 +23,6 @@ from rlightning_aio.protocol.frames import Frame, FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rlightning_aio._core.hosts.messages import Completion
 
 SENDER: Final = 0
@@ -39,21 +32,33 @@ SENDER: Final = 0
 def frame_of(completion: Completion) -> Frame:
     """Return the frame that reports a completion."""
     try:
-        return Frame(*_ENCODED[type(completion)](completion))
-    except BaseException as error:
-        text = pickle.dumps(ErrorText.of(error))
         if isinstance(completion, Built):
-            return Frame(FrameKind.START_ERROR, len(completion.started) - 1, text)
+            return Frame(FrameKind.STARTED, 0, dumped_with_code(completion.started))
+        if isinstance(completion, Result):
+            payload = completion.out_of_band
+            if type(payload) is not bytes:
+                payload = dumped(payload, "the result")
+            return Frame(FrameKind.RESULT, completion.entry, payload)
+        if isinstance(completion, Value):
+            payload = dumped(completion.value, "what it returned")
+            return Frame(FrameKind.VALUE, completion.entry, payload)
+        return Frame(FrameKind.OTHER, 0, pickle.dumps(completion))
+    except BaseException as error:
+        if isinstance(completion, Built):
+            last = len(completion.started) - 1
+            return frame_of(NotBuilt(SENDER, last, ErrorText.of(error)))
         if isinstance(completion, Result | Value):
-            return Frame(FrameKind.ERROR, completion.entry, text)
+            return frame_of(Raised(SENDER, completion.entry, ErrorText.of(error)))
         raise
 
 
 def completion_in(host_id: int, frame: Frame) -> Completion:
     """Return the completion of a host that a frame reports."""
     kind, number, payload = frame
+    if kind == FrameKind.RESULT:
+        return Result(host_id, number, payload)
     try:
-        return _DECODED[kind](host_id, number, payload)
+        found: Any = pickle.loads(payload)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # Unpickling may raise anything.
@@ -62,43 +67,10 @@ def completion_in(host_id: int, frame: Frame) -> Completion:
         if kind == FrameKind.VALUE:
             return Raised(host_id, number, ErrorText.of(error))
         raise
-
-
-def _encoded_result(result: Result) -> tuple[FrameKind, int, bytes]:
-    payload = result.out_of_band
-    if type(payload) is not bytes:
-        payload = dumped(payload, "the result")
-    return FrameKind.RESULT, result.entry, payload
-
-
-_ENCODED: Final[dict[type, Callable[[Any], tuple[FrameKind, int, bytes]]]] = {
-    Built: lambda it: (FrameKind.STARTED, 0, dumped_with_code(it.started)),
-    NotBuilt: lambda it: (FrameKind.START_ERROR, it.env_index, pickle.dumps(it.error)),
-    Attached: lambda _: (FrameKind.ATTACHED, 0, b""),
-    NewSchema: lambda it: (FrameKind.INFO_SCHEMA, it.number, pickle.dumps(it.schema)),
-    Result: _encoded_result,
-    Value: lambda it: (FrameKind.VALUE, it.entry, dumped(it.value, "what it returned")),
-    Raised: lambda it: (FrameKind.ERROR, it.entry, pickle.dumps(it.error)),
-    Lost: lambda it: (FrameKind.LOST, it.env_index, pickle.dumps(it[2:])),
-    Moved: lambda it: (FrameKind.MOVED, it.entry, pickle.dumps(it[2:])),
-    Closed: lambda it: (FrameKind.CLOSED, 0, pickle.dumps(it.errors)),
-}
-"""By the class of a completion: kind, number and payload of its frame."""
-
-_DECODED: Final[dict[int, Callable[[int, int, bytes], Completion]]] = {
-    FrameKind.STARTED: lambda host, _, payload: Built(host, pickle.loads(payload)),
-    FrameKind.START_ERROR: lambda host, index, payload: NotBuilt(
-        host, index, pickle.loads(payload)
-    ),
-    FrameKind.ATTACHED: lambda host, _, __: Attached(host),
-    FrameKind.INFO_SCHEMA: lambda host, number, payload: NewSchema(
-        host, number, pickle.loads(payload)
-    ),
-    FrameKind.RESULT: Result,
-    FrameKind.VALUE: lambda host, entry, payload: Value(host, entry, pickle.loads(payload)),
-    FrameKind.ERROR: lambda host, entry, payload: Raised(host, entry, pickle.loads(payload)),
-    FrameKind.LOST: lambda host, index, payload: Lost(host, index, *pickle.loads(payload)),
-    FrameKind.MOVED: lambda host, entry, payload: Moved(host, entry, *pickle.loads(payload)),
-    FrameKind.CLOSED: lambda host, _, payload: Closed(host, pickle.loads(payload)),
-}
-"""By the kind of a frame: its completion, of a host, a number and a payload."""
+    if kind == FrameKind.STARTED:
+        return Built(host_id, found)
+    return (
+        Value(host_id, number, found)
+        if kind == FrameKind.VALUE
+        else found._replace(host_id=host_id)
+    )

@@ -55,31 +55,6 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class StepRequest:
-    """Step the env, then call `ClientSession.finish` or `ClientSession.fail`."""
-
-    number: int
-    action: Any
-    extras: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class ResetRequest:
-    """Reset the env, then call `ClientSession.finish` or `ClientSession.fail`."""
-
-    number: int
-    seed: int | list[int] | None = None
-    options: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Welcomed:
-    """The server let this client in; either end has `heartbeat` seconds to miss the other."""
-
-    heartbeat: float
-
-
-@dataclass(frozen=True, slots=True)
 class Ended:
     """The session has ended, and with it the trainer's control of the env; hang up."""
 
@@ -94,7 +69,9 @@ class Refused:
     retry: bool
 
 
-Event = StepRequest | ResetRequest | Welcomed | Ended | Refused
+Event = Step | Reset | Welcome | Ended | Refused
+"""Step or reset the env, then call `ClientSession.finish` or `ClientSession.fail`; or the server
+has let this client in; or the session, or the attempt to begin one, is over."""
 
 
 class ClientSession:
@@ -182,8 +159,8 @@ class ClientSession:
         """Read one message. No content makes it raise.
 
         Returns:
-            The event to act on. A `StepRequest` or `ResetRequest` must be answered before the
-            next message is received.
+            The event to act on. A `Step` or `Reset` must be answered before the next message is
+            received.
         """
         try:
             message, frames = self._reader.read(parts)
@@ -206,7 +183,7 @@ class ClientSession:
             return Refused(in_one_line(message.text), message.retry)
         self.phase = Phase.SERVING
         self._last_number = 0
-        return Welcomed(message.heartbeat)
+        return message
 
     def _on_request(self, message: Step | Reset, frames: Sequence[Part]) -> Event | None:
         if self.phase is not Phase.SERVING:
@@ -214,16 +191,13 @@ class ClientSession:
         if not self._last_number and not isinstance(message, Reset):
             raise WireError("the first request of a session is not a reset")
         self._last_number = message.number
-        if isinstance(message, Reset):
-            return ResetRequest(message.number, message.seed, message.options)
-        if self._free_actions:
-            return StepRequest(message.number, message.action, message.extras)
-        try:
-            action = self._actions.unpack(frames, message.texts)
-        except WireError as error:
-            self.fail(message.number, ErrorText(type(error).__name__, str(error), ""))
-            return None
-        return StepRequest(message.number, action, message.extras)
+        if isinstance(message, Step) and not self._free_actions:
+            try:
+                message.action = self._actions.unpack(frames, message.texts)
+            except WireError as error:
+                self.fail(message.number, ErrorText(type(error).__name__, str(error), ""))
+                return None
+        return message
 
     # Answers
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.outcomes import BLAMES
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
     from rlightning_aio.protocol.net.announcements import Announcement, ClientKind
+    from rlightning_aio.protocol.net.payload import ResultFields
     from rlightning_aio.types import EnvMeta
 
 _MAX_REFUSED: Final = 8
@@ -57,27 +58,9 @@ class OutgoingMessage(NamedTuple):
     parts: list[bytes]
 
 
-@dataclass(slots=True)
-class RemoteResult:
-    """The result of one request to a client.
-
-    Attributes:
-        observation: read-only arrays in the shape of the observation space.
-        reward, terminated, truncated: numbers, arrays ``[num_envs]``, or dicts of either by agent.
-        info, extra: as the env returned them.
-        busy_ns: duration of the env's call, by the client's clock.
-        sent_ns: time at which the env produced the result, in ns since the epoch by the
-            client's clock; 0 if the client sent none.
-    """
-
-    observation: Any
-    reward: Any
-    terminated: Any
-    truncated: Any
-    info: dict[str, Any] = field(default_factory=dict[str, Any])
-    extra: dict[str, Any] = field(default_factory=dict[str, Any])
-    busy_ns: int = 0
-    sent_ns: int = 0
+Answer: TypeAlias = "tuple[ResultFields, ClientResult] | ErrorText"
+"""The result of a request, as values in the shape of the spaces and as the client's message; or the
+error."""
 
 
 class PlaceEvents(Protocol):
@@ -87,7 +70,7 @@ class PlaceEvents(Protocol):
         """Note that a client has taken the place; it gets nothing until it is asked."""
         ...
 
-    def on_answer(self, answer: RemoteResult | ErrorText) -> None:
+    def on_answer(self, answer: Answer) -> None:
         """Note the result or the error of the request in flight."""
         ...
 
@@ -370,13 +353,7 @@ class ServerSessions:
             raise WireError(f"an answer to request {message.number}, which is not in flight")
         if isinstance(message, ClientResult):
             header = (message.reward, message.terminated, message.truncated)
-            answer = RemoteResult(
-                *session.announced.results.unpack(frames, message.texts, header),
-                message.info,
-                message.extra,
-                message.busy_ns,
-                message.sent_ns,
-            )
+            answer = session.announced.results.unpack(frames, message.texts, header), message
         else:
             answer = ErrorText(
                 in_one_line(message.exception_type),

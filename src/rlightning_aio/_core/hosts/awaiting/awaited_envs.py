@@ -30,7 +30,6 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     leave_behind,
     log,
     new_task,
-    time_collector,
     watched,
 )
 from rlightning_aio._core.hosts.limits import hung, limits_of
@@ -121,7 +120,6 @@ class AwaitedEnvs:
         done: Callable[[int], object],
         enter: Callable[[int], object] | None = None,
     ) -> None:
-        time_collector()
         self._host_id = host_id
         self._first_slot = first_slot
         self._order = order

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import os
 import time
@@ -47,34 +46,6 @@ async def _served(main: Coroutine[Any, Any, T]) -> T:
     return await main
 
 
-class _CollectorTime:
-    """How long the garbage collector has run in this process; one of `gc.callbacks`.
-
-    Attributes:
-        seconds: in all.
-    """
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._began = 0.0
-
-    def __call__(self, phase: str, info: dict[str, int]) -> None:
-        del info
-        if phase == "start":
-            self._began = time.monotonic()
-        else:
-            self.seconds += time.monotonic() - self._began
-
-
-_collector: Final = _CollectorTime()
-
-
-def time_collector() -> None:
-    """Measure the garbage collector from now on, so that `watched` can leave it out. Idempotent."""
-    if _collector not in gc.callbacks:
-        gc.callbacks.insert(0, _collector)
-
-
 @coroutine
 def watched(
     answering: Coroutine[Any, Any, Any],
@@ -87,8 +58,7 @@ def watched(
     Args:
         answering: a coroutine that has not begun.
         entry: of the request.
-        report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`; after
-            `time_collector` without those of the garbage collector, which no env has chosen.
+        report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`.
         enter: gets `entry` before each turn, and 0 after it.
     """
     send, throw, clock = answering.send, answering.throw, time.monotonic
@@ -96,7 +66,7 @@ def watched(
     while True:
         if enter is not None:
             enter(entry)
-        began, collected = clock(), _collector.seconds
+        began = clock()
         try:
             future = send(None) if error is None else throw(error)
         except StopIteration as stop:
@@ -104,8 +74,7 @@ def watched(
         finally:
             if enter is not None:
                 enter(0)
-            held = clock() - began - (_collector.seconds - collected)
-            if held > LONG_TURN_SECONDS:
+            if (held := clock() - began) > LONG_TURN_SECONDS:
                 report(entry, held)
         error = None
         try:

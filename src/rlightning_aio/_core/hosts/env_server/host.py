@@ -30,7 +30,7 @@ from rlightning_aio._core.hosts.messages import (
 from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_of_band
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation, op_of
-from rlightning_aio.protocol.net.server_session import ClientPlace, RemoteResult, ServerSessions
+from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.net.announcements import Announcement
+    from rlightning_aio.protocol.net.payload import ResultFields
+    from rlightning_aio.protocol.net.server_session import Answer
+    from rlightning_aio.protocol.net.wire import ClientResult
     from rlightning_aio.types import EnvMeta
 
 
@@ -281,7 +284,7 @@ class EnvServerHost(Host):
             Taken(self.host_id, meta, announced.traits, slab if is_new else None, first_slot)
         )
 
-    def on_answer(self, answer: RemoteResult | ErrorText) -> None:
+    def on_answer(self, answer: Answer) -> None:
         self._num_messages += 1
         entry, self._entry = self._entry, 0
         if isinstance(answer, ErrorText):
@@ -289,19 +292,20 @@ class EnvServerHost(Host):
             return
         # The trainer may let its own arithmetic raise; a client's numbers must not.
         with np.errstate(all="ignore"):
-            out_of_band = self._write(answer, is_reset=op_of(entry) == Operation.RESET)
+            out_of_band = self._write(*answer, is_reset=op_of(entry) == Operation.RESET)
         self._post(Result(self.host_id, entry, out_of_band or {}))
 
-    def _write(self, result: RemoteResult, *, is_reset: bool) -> OutOfBand | None:
+    def _write(
+        self, outcome: ResultFields, result: ClientResult, *, is_reset: bool
+    ) -> OutOfBand | None:
         """Write a result into the row; return the parts that have no place there."""
-        ends = result.reward, result.terminated, result.truncated
         # Statistics use this machine's clock; the result has the time of its client's.
         self._sent_ns[self._row] = result.sent_ns or time.time_ns()
         if is_reset:
             info = {**result.info, "client": self.client}
-            parts = result.observation, *ends, info
+            parts = *outcome, info
             return self._writer.write_reset(parts, result.busy_ns, result.extra)
-        parts = result.observation, *ends, result.info
+        parts = *outcome, result.info
         return self._writer.write_step(parts, result.busy_ns, result.extra)
 
     def on_lost(self, cause: str, *, in_order: bool) -> None:

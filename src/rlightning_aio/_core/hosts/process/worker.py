@@ -18,7 +18,7 @@ import sys
 import time
 import traceback
 import weakref
-from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
@@ -30,7 +30,7 @@ from rlightning_aio._core.hosts.running.runner import attach_all, close_all, dis
 from rlightning_aio._core.hosts.spinner import Spinner
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.envs.results import is_awaitable
-from rlightning_aio.protocol.entries import Operation, entry, op_of, slot_of
+from rlightning_aio.protocol.entries import entry, slot_of
 from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.row_writer import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
-
-_STEP: Final = int(Operation.STEP)
 
 
 class TrainerGone(Exception):
@@ -170,20 +168,17 @@ class Worker:
         """
         if self._closing:
             return False
+        return self._execute(request, None)
+
+    def _execute(self, request: int, arguments: bytes | None) -> bool:
+        """Execute one request; return True if its row holds the whole reply, or reply to it."""
         index = slot_of(request) - self._first_slot
-        op, runner = op_of(request), self._runners[index]
-        try:  # As `exchange.serve` does; `execute` would take a microsecond more.
-            if op == _STEP:
-                outcome = self._steps[index]()
-            else:
-                outcome = runner.execute(op, None)
-                self._steps[index] = runner.step  # Perhaps of an env that was rebuilt.
-        except BaseException as error:
-            outcome = error
-        if outcome is None and not self._is_child:
-            return True
-        self._finish(request, outcome)
-        return False
+        runner = self._runners[index]
+        completion = execute(SENDER, runner, request, arguments, self._on_end)
+        self._steps[index] = runner.step  # Perhaps of an env that was rebuilt.
+        if completion is not None:
+            self._post(completion)
+        return completion is None
 
     def _finish(self, request: int, outcome: Any) -> None:
         """Reply to a step or reset whose outcome is not in its row alone.
@@ -327,14 +322,8 @@ class Worker:
         if self._awaits:
             self._submit(request, frame.payload)
             return
-        index = slot_of(request) - self._first_slot
-        runner = self._runners[index]
-        completion = execute(SENDER, runner, request, frame.payload, self._on_end)
-        self._steps[index] = runner.step  # A call may start or stop filming.
-        if completion is None:
+        if self._execute(request, frame.payload):
             self._rings.report(request, self._ring)
-        else:
-            self._post(completion)
 
     def _abort(self, frame: Frame) -> None:
         """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
