@@ -28,7 +28,7 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Ready,
 )
 from rlightning_aio._core.hosts.process.host import ForkServerHandle
-from rlightning_aio._core.hosts.process.worker import Worker
+from rlightning_aio._core.hosts.process.worker import TrainerGone, Worker
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
 if TYPE_CHECKING:
@@ -254,7 +254,9 @@ class _WorkerProcess(Process):
             self._worker.serve()
         except Killed:
             raise
-        except BaseException:  # noqa: BLE001  # As in a real one, it goes to stderr.
+        except BaseException as error:  # noqa: BLE001  # As in a real one, it goes to stderr.
             self.stderr += traceback.format_exc()
+            if not isinstance(error, TrainerGone):
+                self.world.wrongs.append(f"{self.name} ended by {error!r}")
             return 1
         return 0

@@ -65,6 +65,7 @@ class Intake:
         self._requests = tables.requests
         self._record_of = tables.record_of
         self._layout = tables.layout
+        self._lifetime = tables.lifetime
         self._supervisor = supervisor
         self._results = results
         self._episodes = tables.episodes
@@ -253,7 +254,7 @@ class Intake:
     def _on_moved(self, completion: Moved) -> None:
         """Send a reset that a worker has handed on to the next one, or back."""
         slot = self._requests.end(completion.host_id, completion.entry)
-        if slot is None:
+        if slot is None or self._lifetime.closed:  # The next worker has its order to close.
             return
         renewals = self._supervisor.renewals
         host_id = renewals.take_over(completion, slot)

@@ -87,7 +87,7 @@ class Renewals:
         peer = record.peer
         if peer is None or not peer.is_next or not record.stage is peer.stage is Stage.UP:
             return
-        if len(self._tables.slots_of(record)):
+        if len(self._tables.slots_of(record)) or self._tables.lifetime.closed:
             return
         record.stage, record.late, record.deaths = Stage.CLOSING, False, {None: 0}
         record.recycled += 1
