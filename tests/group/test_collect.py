@@ -1,6 +1,6 @@
 """`collect_async` on real workers, whose envs step when the test opens their gates.
 
-Rules that need an exact order of events and a clock are in `test_core`.
+Rules that need an exact order of events and a clock are in `tests/simulator/test_moments.py`.
 """
 
 from __future__ import annotations

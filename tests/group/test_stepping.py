@@ -66,6 +66,8 @@ async def test_a_reset_returns_the_envs_that_it_names(start: Any) -> None:
     assert batch.observation.tolist() == [[k, 1, 0, 5 + k] for k in range(4)]
     ends = batch.terminated | batch.truncated
     assert (batch.reward.any(), ends.any()) == (False, False)
+    batch, flags = await group.reset(env_ids=[])
+    assert (len(batch), flags) == (0, [])
     batch, flags = await group.reset(env_ids=["probe-3", "probe-1"])
     assert batch.ids() == ["probe-3", "probe-1"]
     assert flags == [False, False]
@@ -91,9 +93,16 @@ async def test_seeds_are_an_int_or_a_list(start: Any) -> None:
     assert await seeds(seed={"probe-3": 0}, env_ids=["probe-3"]) == [0]
     with pytest.raises(UnknownEnv, match="'nobody'"):
         await group.reset(seed={"nobody": 1})
-    with pytest.raises(ValueError, match="-2"):
-        await group.reset(seed={"probe-0": -2})
-    assert await seeds() == [-1] * 4
+    before, _ = await group.reset()
+    wrong = (-2, [0, 1, 2, -2], {"probe-0": -2}, 1.5, [0.5] * 4, True, "0123", [None] * 4, 2**63)
+    for seed in wrong:
+        with pytest.raises(ValueError, match="the seed must be an int from 0"):
+            await group.reset(seed=seed)
+    with pytest.raises(ValueError, match="3 seeds for 4 envs"):
+        await group.reset(seed=[1, 2, 3])
+    batch, _ = await group.reset()
+    assert batch.observation[:, 3].tolist() == [-1] * 4
+    assert (batch.observation[:, 1] == before.observation[:, 1] + 1).all(), "nothing was sent"
 
 
 @one_driver
