@@ -23,7 +23,6 @@ from rlightning_aio.plugins.piper.arm import (  # noqa: E402
 pytestmark = pytest.mark.simulators
 
 ON = CanFrame(0x471, bytes([7, 2, 0, 0, 0, 0, 0, 0]))
-STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
 
 
 def mode(move: int, speed: int) -> CanFrame:

@@ -45,23 +45,6 @@ READERS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_whoever_reads_finds_all(name: str) -> None:
-    """Also through functions in C; and the elements are made only once."""
-    calls: list[None] = []
-
-    def make() -> list[dict[str, Any]]:
-        calls.append(None)
-        return copy.deepcopy(INFOS)
-
-    infos = LazyInfos(make)
-    assert isinstance(infos, list)
-    assert not calls
-    assert READERS[name](infos) == INFOS
-    list(infos)
-    assert len(calls) == 1
-
-
 def test_changes_stay() -> None:
     """An info that is changed, as wrappers do at an episode's end, is found changed."""
     infos = LazyInfos(lambda: copy.deepcopy(INFOS))
@@ -107,24 +90,26 @@ def _matched(infos: Any) -> bool:
             return False
 
 
-@pytest.mark.parametrize("name", READERS_OF_COLUMNS)
-def test_whoever_reads_finds_all_columns(name: str) -> None:
-    """Also through functions in C; and they are made only once."""
+KINDS = {"list": (LazyInfos, INFOS), "dict": (LazyColumns, COLUMNS)}
+ALL_READERS = [("list", name) for name in READERS] + [("dict", name) for name in READERS_OF_COLUMNS]
+
+
+@pytest.mark.parametrize(("kind", "name"), ALL_READERS)
+def test_whoever_reads_finds_all(kind: str, name: str) -> None:
+    """Also through functions in C; and the elements are made only once."""
     calls: list[None] = []
+    lazy, expected = KINDS[kind]
 
-    def make() -> dict[str, Any]:
+    def make() -> Any:
         calls.append(None)
-        return copy.deepcopy(COLUMNS)
+        return copy.deepcopy(expected)
 
-    infos = LazyColumns(make)
-    assert isinstance(infos, dict)
+    infos: Any = lazy(make)
+    assert isinstance(infos, type(expected))
     assert not calls
-    assert READERS_OF_COLUMNS[name](infos) == COLUMNS
+    assert (READERS if kind == "list" else READERS_OF_COLUMNS)[name](infos) == expected
     list(infos)
     assert len(calls) == 1
-
-
-KINDS = {"list": (LazyInfos, INFOS), "dict": (LazyColumns, COLUMNS)}
 
 
 @pytest.mark.parametrize("kind", KINDS)

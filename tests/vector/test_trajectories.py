@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from vector.toys import assert_alike
 
-from rlightning_aio.vector import VectorEnv, make_vec
+from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,10 +28,7 @@ MODES = [
 
 # Python caches shared memory, which would count as left behind. TorchRL,
 # once imported, makes processes import everything again.
-PEER: dict[str, dict[str, Any]] = {
-    "async": {"shared_memory": False, "context": "fork"},
-    "sync": {},
-}
+PEER: dict[str, Any] = {"shared_memory": False, "context": "fork"}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -56,8 +53,8 @@ def makers_of(task: str) -> list[Any]:
     return [functools.partial(make, task, k) for k in range(SIZE)]
 
 
-def actions_for(space: gym.Space[Any], count: int, size: int = SIZE) -> list[Any]:
-    batched = batch_space(space, size)
+def actions_for(space: gym.Space[Any], count: int) -> list[Any]:
+    batched = batch_space(space, SIZE)
     batched.seed(0)
     return [batched.sample() for _ in range(count)]
 
@@ -107,15 +104,18 @@ def looped(makers: list[Any], mode: AutoresetMode, actions: list[Any]) -> Iterat
         env.close()
 
 
-def compare(ours: Any, theirs: Any, task: str, count: int, makers: list[Any] | None = None) -> None:
+def compare(ours: Any, theirs: Any, task: str, count: int) -> None:
     """All three make the same episodes, more than one."""
-    makers = makers or makers_of(task)
-    actions = actions_for(theirs.single_action_space, count, len(makers))
+    actions = actions_for(theirs.single_action_space, count)
     mode, ends = theirs.autoreset_mode, 0
-    rollouts = stepped(ours, actions), stepped(theirs, actions), looped(makers, mode, actions)
-    for turn, (found, expected, plain) in enumerate(zip(*rollouts, strict=True)):
+    rollouts = (
+        stepped(ours, actions),
+        stepped(theirs, actions),
+        looped(makers_of(task), mode, actions),
+    )
+    for turn, (found, expected, of_loop) in enumerate(zip(*rollouts, strict=True)):
         assert_alike(found, expected, f"{task}, {turn}")
-        *columns, last = plain if len(plain) == 5 else (*plain, [])
+        *columns, last = of_loop if len(of_loop) == 5 else (*of_loop, [])
         assert_alike(found[: len(columns)], tuple(columns), f"{task} in a loop, {turn}")
         for k, observation in enumerate(last):
             if observation is not None:
@@ -141,30 +141,7 @@ def test_in_workers(mode: AutoresetMode) -> None:
     compare(ours, SyncVectorEnv(makers, autoreset_mode=mode), "HalfCheetah-v5", 200)
 
 
-def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limit: int) -> None:
-    """Four simulations that are one batch."""
-    kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
-    ours: Any = make_vec(task, 4, vector_kwargs=arguments, **kwargs)
-    theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
-    compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_together(mode: AutoresetMode) -> None:
-    """Ends of some envs, and of all in one step."""
-    compare_together("Hopper-v5", mode, 60, "sync", 20)
-
-
-def test_together_with_goals_that_a_reset_draws() -> None:
-    compare_together("Reacher-v5", AutoresetMode.NEXT_STEP, 60, "sync", 20)
-
-
 TASKS = ["HalfCheetah-v5", "CartPole-v1", "Dict", "ALE/Breakout-v5"]
-TOGETHER = [
-    "Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "HumanoidStandup-v5",
-    "InvertedDoublePendulum-v5", "InvertedPendulum-v5", "Pusher-v5", "Reacher-v5", "Swimmer-v5",
-    "Walker2d-v5",
-]  # fmt: skip
 
 
 @pytest.mark.simulators
@@ -176,16 +153,5 @@ def test_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
     if task.startswith("ALE/"):
         pytest.importorskip("ale_py")
     ours = VectorEnv(makers, autoreset_mode=mode)
-    theirs = AsyncVectorEnv(makers, autoreset_mode=mode, **PEER["async"])
+    theirs = AsyncVectorEnv(makers, autoreset_mode=mode, **PEER)
     compare(ours, theirs, task, 1000)
-
-
-@pytest.mark.simulators
-@pytest.mark.parametrize(
-    ("task", "mode"),
-    [(task, AutoresetMode.NEXT_STEP) for task in TOGETHER]
-    + [("Hopper-v5", AutoresetMode.SAME_STEP), ("Hopper-v5", AutoresetMode.DISABLED)],
-)
-def test_together_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
-    """A thousand steps of each MuJoCo task, and of one in each mode."""
-    compare_together(task, mode, 1000, "async", 150)
