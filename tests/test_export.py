@@ -103,13 +103,6 @@ def test_episodes_of_plain_values_are_lists(tmp_path: Path, wait_all: bool) -> N
         writer.add(rollouts[0])
 
 
-def test_copies_of_rollouts_can_be_kept_for_later() -> None:
-    """As a program with an asynchronous group does, whose `collect` is awaited."""
-    kept = [copy.deepcopy(rollout) for rollout in rollouts_of(4, 6)]
-    numbers = [one.observation["agent_pos"][0, 0] for one in whole_episodes(kept)]
-    assert sorted(numbers) == sorted([1, 2, 3, 4] * 2)
-
-
 class Dying(Counting):
     """The worker that executes its second step for the first time dies."""
 

@@ -49,24 +49,20 @@ def announce(monkeypatch: pytest.MonkeyPatch) -> Announce:
     return announce
 
 
-def test_a_registered_class_is_found_by_its_name() -> None:
-    """The decorator returns the class unchanged."""
-    envs = Registry()
-    assert envs.register("own")(OwnEnv) is OwnEnv
-    assert envs.resolve("own") is envs.registered("own") is OwnEnv
-    assert envs.knows("own")
-
-
-def test_a_later_registration_replaces_an_earlier_one() -> None:
-    """A notebook cell can be run twice, and a module reloaded."""
+def test_a_registered_class_replaces_what_had_its_name() -> None:
+    """Such as a built-in backend, or itself, as a notebook cell is run twice; it is unchanged."""
 
     class Again(OwnEnv):
         pass
 
     envs = Registry()
-    envs.register("own")(OwnEnv)
-    envs.register("own")(Again)
-    assert envs.resolve("own") is Again
+    assert envs.registered("mujoco") is None
+    assert envs.resolve("mujoco") is MujocoEnv
+    for kind in (OwnEnv, Again):
+        for name in ("own", "mujoco"):
+            assert envs.register(name)(kind) is kind
+            assert envs.resolve(name) is envs.registered(name) is kind
+            assert envs.knows(name)
 
 
 def test_a_registration_may_declare_an_env_cpu_bound() -> None:
@@ -86,21 +82,6 @@ def test_the_decorator_requires_a_name() -> None:
     """Used bare, it would silently replace the class with a function."""
     with pytest.raises(TypeError, match=r"@ENVS\.register\('my_backend'\)"):
         Registry().register(OwnEnv)  # type: ignore[arg-type]
-
-
-def test_built_in_backends_need_no_registration() -> None:
-    """Their classes are imported when they are resolved."""
-    envs = Registry()
-    assert envs.registered("mujoco") is None
-    assert envs.resolve("mujoco") is MujocoEnv
-    assert envs.resolve("gymnasium") is GymnasiumEnv
-
-
-def test_a_registered_class_replaces_a_built_in_one() -> None:
-    """So a user can replace a backend."""
-    envs = Registry()
-    envs.register("mujoco")(OwnEnv)
-    assert envs.resolve("mujoco") is OwnEnv
 
 
 def test_an_entry_point_never_replaces_a_built_in_backend(announce: Announce) -> None:

@@ -36,13 +36,6 @@ def test_extra_is_a_keyword_and_an_attribute(kind: Any) -> None:
     assert ret._extra == {}
 
 
-def test_results_share_no_default() -> None:
-    """Changing a dict of one result doesn't change another result."""
-    one, other = (EnvRet(env_id="a-0", observation=0) for _ in range(2))
-    one.info["x"] = one._extra["x"] = 1
-    assert (other.info, other._extra) == ({}, {})
-
-
 def test_unknown_fields_raise() -> None:
     """So a misspelt field is not lost."""
     with pytest.raises(ValidationError, match="last_rewrad"):

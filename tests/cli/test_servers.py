@@ -34,21 +34,6 @@ def finish(child: subprocess.Popen[str]) -> Any:
     return json.loads(stdout)
 
 
-def test_rollout_collects_from_clients(tmp_path: Path) -> None:
-    """Random actions fit the announced spaces, and steps are counted."""
-    config = write_config(tmp_path, SERVER)
-    with start("rollout", config, "--steps", 60, "--json") as child:
-        where = address(child)
-        clients = [ClientThread(where, name) for name in ("left", "right")]
-        document = finish(child)
-        for client in clients:
-            client.join()
-    numbers = document["metrics"]
-    assert (document["steps"], numbers["envs/robots/steps"], numbers["envs/envs"]) == (60, 60, 2)
-    # Steps in flight at the end are not counted.
-    assert 60 <= sum(client.env.steps for client in clients) <= 62
-
-
 def test_rollout_collects_from_clients_and_local_envs_together(tmp_path: Path) -> None:
     """Each gets actions of its own space."""
     local = {**CARTPOLE, "num_workers": 2}

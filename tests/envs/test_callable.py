@@ -18,7 +18,6 @@ from rlightning_aio import (
     EnvRaised,
     EnvRet,
     StartFailed,
-    load_config,
 )
 from rlightning_aio.sync import build_env_group
 
@@ -117,16 +116,6 @@ def test_errors_name_the_callable_of_the_env() -> None:
             said = rf"'{env_id}' \(entry '\w+', backend callable, task {name}\) raised"
             with pytest.raises(EnvRaised, match=said):
                 group[env_id].call("nothing")
-
-
-def test_yaml_names_a_function(tmp_path: Any) -> None:
-    """Without a backend, a task that reads ``module:function`` is one."""
-    path = tmp_path / "envs.yaml"
-    path.write_text("envs: [{name: p, task: 'gymnasium:make', env_kwargs: {id: Pendulum-v1}}]")
-    (config,) = load_config(path)
-    assert config.backend == "callable"
-    with build_env_group(config.model_copy(update={"placement": "inline"})) as group:
-        assert group.reset(seed=1)[0].observation.shape == (1, 3)
 
 
 def test_a_vector_env_determines_num_envs() -> None:

@@ -11,7 +11,7 @@ import pytest
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.envs.base import result_of
-from rlightning_aio.envs.fast_path import FastPath, fast_path_of
+from rlightning_aio.envs.fast_path import FastPath
 
 
 @rl.ENVS.register("doubling")
@@ -65,8 +65,3 @@ def test_a_bare_step_without_the_mixin_is_refused() -> None:
     group = sync.build_env_group(backend="mixed", task="-", name="one", placement="inline")
     with pytest.raises(rl.StartFailed, match="FastPath"):
         group.init()
-
-
-def test_what_is_left_out_is_nothing() -> None:
-    found = fast_path_of(object())
-    assert (found.bare_step(), found.bare_reset(), found.fresh_results) == (None, None, False)

@@ -304,14 +304,6 @@ def test_a_group_calls_a_method_of_all_envs(
     assert "steps per second" in capsys.readouterr().out
 
 
-def test_an_error_in_one_env_leaves_the_others_usable(group: EnvGroup) -> None:
-    """It is raised as `EnvRaised`."""
-    with pytest.raises(EnvRaised, match="as asked"):
-        group.step(responses(group.env_ids[:1], wants="an error"))
-    batch, _ = group.step(responses(group.env_ids))
-    assert len(batch) == 3
-
-
 def test_a_group_holds_unusual_envs() -> None:
     """An env without spaces, one whose reset takes no argument, and one in this process."""
     offset = 40

@@ -147,23 +147,6 @@ def test_a_client_without_the_right_key_is_not_admitted(kind: str, tmp_path: Pat
     assert friend.env.steps > 10
 
 
-def test_a_client_learns_that_its_key_is_not_allowed(tmp_path: Path) -> None:
-    """Its message says what to check; adding the key admits it without a restart."""
-    (arm,) = make_keys(tmp_path, ["arm"])
-    listed = tmp_path / "server" / "clients" / "arm.key"
-    hidden = tmp_path / "arm.key"
-    listed.rename(hidden)
-    with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
-        friend = ClientThread(group["robots-0"].address, "arm", keys=arm)
-        while "the server does not know this client's key" not in friend.client.state:
-            look(group)
-        hidden.rename(listed)
-        batch, _ = group.reset()
-        assert batch.values()[0].env_id == "robots-0/arm"
-        group.close()
-        friend.join()
-
-
 def refused(address: str, keys: Path) -> str:
     """Return the error of a client that dials in with `keys` and is refused."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")

@@ -441,12 +441,6 @@ def test_a_step_limit_of_the_entry_ends_episodes(mode: AutoresetMode) -> None:
             assert truncated.tolist() == [step % period == 3 % period] * 2
 
 
-def test_arguments_of_methods_may_have_any_name() -> None:
-    with contextlib.closing(VectorEnv([toy] * 2)) as env:
-        env.call("set_wrapper_attr", name="note", value=3)
-        assert env.get_attr("note") == (3, 3)
-
-
 def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
     """As RLlib does, for example."""
     gym.register(
