@@ -9,22 +9,13 @@ import os
 import re
 import sys
 from collections import Counter
-from datetime import UTC, datetime, timedelta
-from email.utils import format_datetime
-from functools import partial
 from itertools import groupby
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-import openai
 import pytest
 from examples.chat_server import KEY, ChatServer
 from run_python import output_of
-
-import rlightning_aio as rl
-from rlightning_aio.attempts import EpisodeSpec, Rules, play
-from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -140,47 +131,6 @@ def agent(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("agent")
 
 
-class Hanging:
-    """Never answers "hang"; ends with any other action."""
-
-    observation_space = action_space = Anything()
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return [{"role": "user", "content": "Go on."}], {}
-
-    async def step(self, message: Any) -> Any:
-        if message == "hang":
-            await asyncio.Event().wait()
-        return ["over"], 1.0, True, False, {}
-
-
-async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> None:
-    """Its rollout says so; that the model fails for another one is said there."""
-    actions = iter(["hang", "end", None])
-
-    async def model(messages: Any) -> dict[str, Any]:
-        action = next(actions)
-        if action is None:
-            raise RuntimeError("no model")
-        return {"action": action, **dict.fromkeys(agent.TOKENS)}
-
-    config = rl.EnvConfig(
-        name="h", task=Hanging, num_workers=3, placement="loop", step_timeout=0.05
-    )
-    tasks = [EpisodeSpec("", 0, {"task": "any"})]
-    async with rl.build_env_group(config) as group:
-        playing = play(group, tasks, partial(agent.converse, model), 3, Rules(retries=0))
-        rollouts = [line async for attempts in playing for line in agent.rollouts_of(attempts)]
-    ends = {rollout["error"]: rollout["reward"] for rollout in rollouts}
-    assert ends == {
-        "RuntimeError('no model')": None,
-        "hung in a step and was cancelled": None,
-        None: 1.0,
-    }
-    blames = {rollout["error"]: rollout["outcome"]["blame"] for rollout in rollouts}
-    assert set(blames.values()) == {"caller", "either", "policy"}
-
-
 @pytest.mark.parametrize("outage", ["429", "503", "cut off"])
 def test_an_outage_of_the_model_loses_no_episode(
     outage: str,
@@ -216,27 +166,6 @@ def test_an_outage_of_the_model_loses_no_episode(
     away, back = [record.getMessage() for record in caplog.records if record.name == "model"][:2]
     assert re.search(r"has not answered since \d\d:\d\d:\d\d \(.+\); .* for up to 1000 s", away)
     assert "answers again, after" in back
-
-
-def test_a_request_is_sent_again_when_the_server_says_and_not_if_it_is_wrong(
-    agent: ModuleType,
-) -> None:
-    del agent  # It is found on the same path.
-    model = importlib.import_module("model")
-
-    def after(status: int, **headers: str) -> float | None:
-        named = {name.replace("_", "-"): value for name, value in headers.items()}
-        response: Any = SimpleNamespace(status_code=status, headers=named, request=None)
-        error = openai.APIStatusError("no", response=response, body=None)
-        return model.pause_before_next(error, 1.0)
-
-    date = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
-    assert after(429, retry_after="7.5") == 7.5
-    assert 3500 < (after(503, retry_after=date) or 0) <= 3600
-    for status, asked in ((429, "0.1"), (500, "soon"), (503, "nan")):
-        assert 0.5 <= (after(status, retry_after=asked) or 0) <= 1
-    assert 0.5 <= model.pause_before_next(ConnectionError(), 1.0) <= 1
-    assert after(400) is after(401, retry_after="1") is None
 
 
 def test_the_environment_behind_http_is_evaluated() -> None:
