@@ -19,15 +19,6 @@ from typing import TYPE_CHECKING, BinaryIO
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
-__all__ = [
-    "check_folder",
-    "check_regular",
-    "check_writable",
-    "file_name",
-    "finish_file",
-    "write_file",
-]
-
 
 def file_name(text: str) -> str:
     """Return `text` as the beginning of a file name, unchanged unless it holds a slash or NUL.

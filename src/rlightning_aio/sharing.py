@@ -9,8 +9,6 @@ from typing import Any, Final
 
 from rlightning_aio.errors import ConfigError
 
-__all__ = ["check_threads", "num_batches", "num_cores"]
-
 _AS_GOOD: Final = 1.15
 """A worker may have this many times its share if that makes batches fewer and larger."""
 

@@ -50,8 +50,6 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["check"]
-
 _STEPS: Final = 3
 _REPEATED: Final = 100
 """Most steps that are done twice with the same seed."""

@@ -26,18 +26,6 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.types import PolicyResponse
 
-__all__ = [
-    "ACTION_TIMEOUT",
-    "begin_stops",
-    "checked_input_of",
-    "limit_actions",
-    "says_hardware",
-    "stop",
-    "stop_all",
-    "stopped_by_signals",
-    "watched",
-]
-
 _log = logging.getLogger("rlightning_aio")
 
 _LOOK_SECONDS: Final = 0.01

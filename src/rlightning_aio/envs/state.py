@@ -30,16 +30,6 @@ from rlightning_aio.protocol.pickling import CodePickler
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-__all__ = [
-    "SavedState",
-    "load_generators",
-    "load_state",
-    "parts_of",
-    "save_generators",
-    "save_state",
-    "versions_of",
-]
-
 NOT_STATE: Final = frozenset(
     ("config", "worker_index", "env_id", "trainer_pid", "_preprocess_fn", "_background")
 )

@@ -16,8 +16,6 @@ from rlightning_aio.trees import copied
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["RESTARTS", "adapted"]
-
 RESTARTS: Final = "RLIGHTNING_AIO_RESTARTS"
 """Environment variable that tells the code of an env, while it is made, how often it was before."""
 

@@ -11,8 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 if TYPE_CHECKING:
     import os
 
-__all__ = ["Config", "EnvConfig"]
-
 _NOT_VECTORIZED: Final = ("ale", "env_server", "mujoco", "piper")
 
 

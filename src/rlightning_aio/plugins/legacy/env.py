@@ -22,14 +22,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = [
-    "ALEEnv",
-    "BaseEnv",
-    "MujocoEnv",
-    "SimulatedEnv",
-    "default_env_preprocess_fn",
-]
-
 
 class BaseEnv(abc.ABC):
     """An env of RLightning's kind. Subclasses set ``self.env`` and define `reset` and `step`.

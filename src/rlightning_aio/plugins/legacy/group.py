@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["EnvGroup", "EnvStepCounter", "build_env_group"]
-
 _PATIENCE_SECONDS: Final = 60.0
 """How long a reset waits for a call of a method that was interrupted."""
 _log = logging.getLogger(__name__)

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio import PolicyResponse
 
-__all__ = ["ARGUMENTS", "SERVER", "EnvMaker", "HostedEnv", "entries_of", "off_device"]
-
 ARGUMENTS: Final = "rlightning"
 """Key in a reset's options for the arguments of RLightning's `reset`."""
 SERVER: Final = "env_server"

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from types import ModuleType
 
-__all__ = ["ALIASED", "is_rlightning_installed", "make_importable", "named"]
-
 _ROOT: Final = "rlightning"
 _HERE: Final = "rlightning_aio.plugins.legacy"
 

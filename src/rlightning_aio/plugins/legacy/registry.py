@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["ENVS", "InternalFlag", "Registry", "load_modules_from_config", "resolve_object"]
-
 T = TypeVar("T", bound="Callable[..., Any]")
 
 _FLAGS = ("DEBUG", "VERBOSE", "REMOTE_TRAIN", "REMOTE_EVAL", "REMOTE_STORAGE", "REMOTE_ENV")

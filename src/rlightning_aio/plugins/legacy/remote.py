@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["RemoteEnvClient"]
-
 _ANY_ACTION: Final = gym.spaces.Box(-np.inf, np.inf, (), np.float32)
 """Announced by an env without an action space."""
 

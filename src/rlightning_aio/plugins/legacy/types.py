@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-__all__ = ["BatchedData", "EnvMeta", "EnvRet", "PolicyResponse"]
-
 
 @dataclasses.dataclass
 class EnvRet:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from rlightning_aio.registry import Backend
 
-__all__ = ["BACKEND"]
-
 BACKEND = Backend(
     "openenv",
     "rlightning_aio.plugins.openenv.env:OpenEnv",

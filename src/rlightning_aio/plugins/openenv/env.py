@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from rlightning_aio import EnvConfig, PolicyResponse
     from rlightning_aio.envs.base import PreprocessFn
 
-__all__ = ["OpenEnv", "OpenEnvOptions"]
-
 
 class OpenEnvOptions(BaseModel):
     """``env_kwargs`` of the backend."""

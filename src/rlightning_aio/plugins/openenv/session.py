@@ -24,13 +24,6 @@ if TYPE_CHECKING:
 
     from websockets.asyncio.client import ClientConnection
 
-__all__ = [
-    "OpenEnvSession",
-    "ServerGone",
-    "ServerRefused",
-    "pauses",
-]
-
 _PAUSE_SECONDS: Final = (0.05, 1.0)
 """Between two attempts to get a session: the first, and the longest."""
 _CONNECT_SECONDS: Final = 10.0

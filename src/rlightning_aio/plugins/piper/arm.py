@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 # Optional and untyped, so imported by name.
 piper_sdk: Any = import_module("piper_sdk")
 
-__all__ = ["GRIPPER_RANGE", "JOINT_LIMITS", "CanFrame", "SimulatedArm"]
-
 GRIPPER_RANGE = (0.0, 0.07)
 """Opening in m."""
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from rlightning_aio.registry import Backend
 
-__all__ = ["BACKEND"]
-
 BACKEND = Backend(
     "piper",
     "rlightning_aio.plugins.piper.env:PiperEnv",

@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["Cameras"]
-
 
 class Cameras:
     """Calls a function of the user in a thread, always the same one.

@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from rlightning_aio import EnvConfig
     from rlightning_aio.envs.base import PreprocessFn
 
-__all__ = ["PiperEnv"]
-
 # The SDK drops feedback beyond these as garbage.
 MAX_LENGTH, MAX_ANGLE, MAX_GRIPPER = 1.0, math.radians(361), 0.15
 

@@ -14,8 +14,6 @@ import struct
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-__all__ = ["JOINT_LIMITS", "ArmGuard", "CanFrame", "SafeStop"]
-
 SafeStop = Literal["hold", "emergency_stop", "disable"]
 
 JOINT_LIMITS: Final = (

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 can: Any = import_module("can")
 piper_sdk: Any = import_module("piper_sdk")
 
-__all__ = ["GRIPPER_FRAMES", "JOINT_FRAMES", "POSE_FRAMES", "STATUS_FRAMES", "ArmLink", "InUse"]
-
 STATUS_FRAMES = frozenset({0x2A1})
 POSE_FRAMES = frozenset({0x2A2, 0x2A3, 0x2A4})
 JOINT_FRAMES = frozenset({0x2A5, 0x2A6, 0x2A7})

@@ -24,8 +24,6 @@ from rlightning_aio.plugins.piper.arm import CanFrame, SimulatedArm
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
 
-__all__ = ["FEEDBACK_HZ", "SlcanPort", "VirtualBus", "VirtualPort", "run", "running"]
-
 FEEDBACK_HZ = 100.0
 """Rate of reports of joints, pose and status; that of motors is a fifth of it."""
 

@@ -26,18 +26,6 @@ from rlightning_aio.plugins.piper.guard import ArmGuard, CanFrame
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-__all__ = [
-    "BITRATE",
-    "MESSAGE_BYTES",
-    "Bus",
-    "CanBus",
-    "Kind",
-    "feedback",
-    "main",
-    "packed",
-    "serve",
-]
-
 BITRATE: Final = 1_000_000
 MESSAGE_BYTES: Final = 1 << 16
 _FEEDBACK: Final = frozenset((*range(0x2A1, 0x2A9), *range(0x261, 0x267)))
