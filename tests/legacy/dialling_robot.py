@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from rlightning_aio.plugins.legacy.names import make_importable
 
@@ -39,10 +40,10 @@ class Robot(BaseEnv):
         return EnvRet(policy_resp.env_id, np.full(7, self.steps, np.float32), 1.0)
 
     def get_observation_space(self) -> Any:
-        return None
+        return spaces.Box(-np.inf, np.inf, (7,), np.float32)
 
     def get_action_space(self) -> Any:
-        return None
+        return spaces.Box(-1, 1, (7,), np.float32)
 
     def is_finish(self) -> bool:
         return self.steps >= 10

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from patience import HANG
 
 from rlightning_aio.errors import EnvRaised
@@ -31,7 +32,7 @@ STEPS = 3
 
 
 class Robot(BaseEnv):
-    """A robot without spaces that is finished after some steps."""
+    """It is finished after some steps."""
 
     resets = steps = 0
     fails_in = 0
@@ -50,10 +51,11 @@ class Robot(BaseEnv):
         return EnvRet(policy_resp.env_id, observation, 1.0, info={"gripper": "open"})
 
     def get_observation_space(self) -> Any:
-        return None
+        joints = spaces.Box(-np.inf, np.inf, (7,), np.float64)
+        return spaces.Dict({"joints": joints, "rgb": spaces.Box(0, 255, (4, 4, 3), np.uint8)})
 
     def get_action_space(self) -> Any:
-        return None
+        return spaces.Box(-1, 1, (7,), np.float64)
 
     def is_finish(self) -> bool:
         return self.steps >= STEPS

@@ -8,10 +8,7 @@ from __future__ import annotations
 import os
 import socket
 import uuid
-from typing import TYPE_CHECKING, Any, Final, cast
-
-import gymnasium as gym
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio import BaseEnv as OurEnv
 from rlightning_aio import EnvConfig, EnvRet, PolicyResponse
@@ -20,12 +17,7 @@ from rlightning_aio.remote import RemoteEnvClient as OurClient
 from rlightning_aio.trees import as_numpy
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-_ANY_ACTION: Final = gym.spaces.Box(-np.inf, np.inf, (), np.float32)
-"""Announced by an env without an action space."""
+    import gymnasium as gym
 
 
 class _DialledEnv(OurEnv):
@@ -37,28 +29,18 @@ class _DialledEnv(OurEnv):
         super().__init__(EnvConfig(name="rlightning", backend="callable"))
         self.env = env
         self.num_envs = env.num_envs
-        self._first: EnvRet | None = None
-        self._observation_space = env.get_observation_space()
-        if self._observation_space is None:
-            # A robot's env may know its space only after its cameras have sent something.
-            self._first = self.reset()
-            self._observation_space = _space_around(self._first.observation)
-        self._action_space = env.get_action_space() or _ANY_ACTION
 
     def get_observation_space(self) -> gym.Space[Any]:
-        return self._observation_space
+        return self.env.get_observation_space()
 
     def get_action_space(self) -> gym.Space[Any]:
-        return self._action_space
+        return self.env.get_action_space()
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
         given = {"seed": seed, "options": options}
         given = {name: value for name, value in given.items() if value is not None}
-        first, self._first = self._first, None
-        if first is not None and not given:
-            return first
         return self._as_ours(self.env._reset(**given))  # noqa: SLF001
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
@@ -89,22 +71,6 @@ class _DialledEnv(OurEnv):
         """Do nothing: RLightning's client leaves its env open, to serve again."""
 
 
-def _space_around(observation: Any) -> gym.Space[Any]:
-    """Return an unbounded space for observations like this one."""
-    if isinstance(observation, dict):
-        parts = cast("Mapping[str, Any]", observation).items()
-        return gym.spaces.Dict({key: _space_around(part) for key, part in parts})
-    if isinstance(observation, tuple):
-        return gym.spaces.Tuple([_space_around(part) for part in cast("Any", observation)])
-    array: NDArray[Any] = np.asarray(observation)
-    low, high = -np.inf, np.inf
-    if array.dtype.kind in "iu":
-        low, high = np.iinfo(array.dtype).min, np.iinfo(array.dtype).max
-    if array.dtype.kind == "b":
-        low, high = 0, 1
-    return gym.spaces.Box(low, high, array.shape, cast("Any", array.dtype.type))
-
-
 class RemoteEnvClient:
     """Serves an env of RLightning's kind to an env_server, once or more often.
 
@@ -122,8 +88,7 @@ class RemoteEnvClient:
     def connect(self) -> None:
         """Connect, and wait until the server has accepted the client.
 
-        An env without an observation space is reset before, to find one. The server gets the first
-        result in `run`, and its `reset` waits for that.
+        The env tells it its spaces, and moves nothing before the server asks for a reset.
         """
         if self._client is None:
             self._client = OurClient(
