@@ -99,7 +99,7 @@ async def test_rollouts_hold_lists_next_to_arrays() -> None:
     assert isinstance(rollout.action, list)
     after = rollout.next_observation["messages"]
     assert [messages[-1]["content"] for messages in after] == [a["content"] for a in rollout.action]
-    assert len(rollout.end_observation["messages"]) == len(rollout.at_ends("tokens"))
+    assert len(rollout.end_observation["messages"]) == len(rollout.ends)
     assert json.loads(json.dumps(seen)) == seen
     assert rollout.log_prob.shape == (24,)
     assert rollout.advantages(np.zeros(24), np.zeros(len(rollout.ends)), 0.9, 0.9).shape == (24,)

@@ -218,7 +218,7 @@ class EnvKind:
 OWN_NAMES: Final = frozenset(
     {"done", "end_observation", "ends", "env_ids", "episodes", "first", "index", "lag"}
     | {"num_chains", "observation", "policy_version", "reward", "shape", "terminated"}
-    | {"truncated", "advantages", "at_ends", "keys", "next_observation", "vtrace"}
+    | {"truncated", "advantages", "keys", "next_observation", "vtrace"}
 )
 """Names that neither a policy nor an info may give to a column of a rollout."""
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from rlightning_aio.collecting.advantages import Segments, gae, vtrace
 from rlightning_aio.collecting.trees import with_lists
-from rlightning_aio.protocol.columns import gather
-from rlightning_aio.trees import Tree, mapped, zipped
+from rlightning_aio.trees import Tree, zipped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -154,11 +153,6 @@ class Rollout:
             return self._chains().successors(flat, ends).reshape(leaf.shape)
 
         return with_lists(zipped(after, self._columns["observation"], self._end_observation))
-
-    def at_ends(self, name: str) -> Tree:
-        """Rows of a column at the ends, ``[k, *shape]``, in new arrays."""
-        column = self._columns[name] if name in self else self[name]
-        return with_lists(mapped(lambda leaf: gather(self._flat(leaf), self.ends), column))
 
     def _flat(self, leaf: NDArray[Any]) -> NDArray[Any]:
         return leaf.reshape(len(self), *leaf.shape[len(self.shape) :])
