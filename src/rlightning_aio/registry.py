@@ -301,21 +301,17 @@ def load(target: str) -> Any:
     return getattr(importlib.import_module(module_name), name)
 
 
-def plugins(kind: Literal["backends", "policies"]) -> EntryPoints:
-    """Return the entry points of a kind.
-
-    Each names, for ``backends``, a `Backend`; for ``policies``, a class of policies that takes the
-    ``ws://`` address of a server.
-    """
+def plugins() -> EntryPoints:
+    """Return the entry points of plug-ins; each names a `Backend`."""
     from importlib.metadata import entry_points  # noqa: PLC0415  # See `Backend`.
 
-    return entry_points(group=f"rlightning_aio.{kind}")
+    return entry_points(group="rlightning_aio.backends")
 
 
 @cache
 def _plugged_in(name: str) -> Backend | None:
     """Return the row of a plug-in, or None. Its module imports no simulator."""
-    for point in plugins("backends"):
+    for point in plugins():
         if point.name == name:
             return point.load()
     return None
@@ -415,7 +411,7 @@ class Registry:
 
     def names(self) -> list[str]:
         """Return the name of every backend that can be resolved, sorted."""
-        return sorted({*self._classes, *BACKENDS, *plugins("backends").names})
+        return sorted({*self._classes, *BACKENDS, *plugins().names})
 
     def resolve(self, name: str) -> type[Any]:
         """Import and return the class of backend `name`.

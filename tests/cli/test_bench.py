@@ -18,7 +18,6 @@ from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
 from rlightning_aio.cli import bench, settings
-from rlightning_aio.cli.measuring import Contender, Round, Rule
 
 STUB = {"name": "stub", "backend": "stub", "task": "any", "num_workers": 4}
 QUICK = ["--seconds", 0.01, "--rounds", 2]
@@ -304,20 +303,6 @@ def test_no_env_is_blamed_where_nobody_reads_the_table(tmp_path: Path) -> None:
     assert child.returncode == 1
     assert "error" not in stderr
     assert "Traceback" not in stderr
-
-
-def test_settings_that_may_be_as_fast_are_named() -> None:
-    """A round of theirs is as fast as the slowest of the best one."""
-
-    def contender(name: str, *rates: float) -> Contender:
-        place = settings.Setting((), name)
-        return Contender(place, Rule("step", None), [Round(rate, (1.0, 1.0)) for rate in rates])
-
-    contenders = [contender("a", 9, 12), contender("b", 8, 9), contender("c", 1, 8), contender("d")]
-    found = bench.as_fast(contenders, contenders[0])
-    assert [one.place.words for one in found] == ["b"]
-    assert "b, step; more --rounds" in bench.doubt(found)[0]
-    assert not bench.doubt([])
 
 
 def test_workers_that_were_replaced_are_counted(tmp_path: Path) -> None:

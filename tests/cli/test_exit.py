@@ -163,15 +163,3 @@ def test_the_largest_seed_is_taken(tmp_path: Path) -> None:
     for command, length in (("rollout", "--steps"), ("eval", "--episodes")):
         done = invoke(command, write_config(tmp_path, STUB), "--seed", 2**61, length, 2)
         assert done.exit_code == 0, done.stderr
-
-
-@pytest.mark.filterwarnings("ignore:close.. of env 'stuck-0' raised WorkerDied")
-def test_a_rollout_without_a_step_is_code_1(tmp_path: Path) -> None:
-    """The table says so, too."""
-    kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step", "steps": 0}
-    stuck = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
-    config = write_config(tmp_path, {**stuck, "close_timeout": 0.1})
-    done = invoke("rollout", config, "--seconds", 0.01)
-    assert done.exit_code == 1
-    assert done.stdout.startswith("0 steps in ")
-    assert "error: no step has ended in that time" in done.stderr

@@ -54,21 +54,6 @@ def test_stdout_is_one_json_document(tmp_path: Path) -> None:
     assert "collecting 500 steps" in done.stderr
 
 
-def test_a_rollout_can_have_a_time_limit(tmp_path: Path) -> None:
-    """It ends then even if results are missing; --steps may end it earlier."""
-    config = write_config(tmp_path, {**STUB, "num_workers": 2})
-    done = invoke("rollout", config, "--seconds", 0.05, "--min-results", 1, "--json")
-    assert json.loads(done.stdout)["interrupted"] is False
-    assert invoke_json("rollout", config, "--seconds", 1000, "--steps", 10)["steps"] == 10
-    kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step", "steps": 0}
-    stuck = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
-    with pytest.warns(UserWarning, match="did not close in time"):
-        done = invoke("rollout", write_config(tmp_path, stuck), "--seconds", 0.05, "--json")
-    document = json.loads(done.stdout)
-    assert (document["steps"], done.exit_code) == (0, 1)
-    assert document["seconds"] >= 0.05
-
-
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("episode_length", [1, 4, 1000])
 def test_resets_are_not_counted_as_steps(

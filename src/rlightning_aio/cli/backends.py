@@ -54,5 +54,5 @@ def _row(backend: Backend) -> _Row:
 
 
 def _plugged_in() -> list[Backend]:
-    points = sorted(plugins("backends"), key=attrgetter("name"))
+    points = sorted(plugins(), key=attrgetter("name"))
     return [point.load() for point in points if point.name not in BACKENDS]

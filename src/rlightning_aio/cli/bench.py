@@ -59,8 +59,6 @@ if TYPE_CHECKING:
     from rlightning_aio.cli.measuring import Place, Stand
     from rlightning_aio.config import EnvConfig
 
-_NAMED: Final = 3
-"""Number of settings that are named beside the fastest one."""
 _NOTE: Final = 1024
 """Bytes of the text that says what the child does."""
 
@@ -291,39 +289,16 @@ def _report(order: _Order, configs: Sequence[EnvConfig], *, interrupted: bool) -
                 **machine_facts(backend.module for backend in backends if backend is not None),
                 "contenders": [contender.as_json() for contender in contenders],
                 "best": best.as_json() if best.rounds else None,
-                "as_fast": [one.words for one in as_fast(contenders, best)],
             }
         )
     else:
         if best.rounds:
             assert isinstance(best.place, Setting)
-            words = f"Fastest: {best.place.overrides()}, {best.rule.call}{_times(order, best)}"
-            print_lines([words, *doubt(as_fast(contenders, best))])
+            call = f"{best.place.overrides()}, {best.rule.call}"
+            print_lines([f"Fastest: {call}{_times(order, best)}"])
         _print_table(order, interrupted=interrupted)
     if order.plot is not None:
         draw_contenders(str(order.path), contenders, order.plot)
-
-
-def as_fast(contenders: Sequence[Contender], best: Contender) -> list[Contender]:
-    """Return the other settings with a round that was as fast as the slowest of the best one."""
-    slowest = min((one.steps_per_second for one in best.rounds), default=0.0)
-    return [
-        one
-        for one in contenders
-        if one is not best
-        and isinstance(one.place, Setting)
-        and any(each.steps_per_second >= slowest for each in one.rounds)
-    ]
-
-
-def doubt(others: Sequence[Contender]) -> list[str]:
-    """Return a line that names settings which may be as fast as the best one, if there are any."""
-    if not others:
-        return []
-    named = "; ".join(one.words for one in others[:_NAMED])
-    more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-    words = f"Perhaps as fast, as rounds of both overlap: {named}{more}"
-    return [f"{words}; more --rounds or --seconds may tell them apart"]
 
 
 def _times(order: _Order, best: Contender) -> str:

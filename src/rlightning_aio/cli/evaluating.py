@@ -178,7 +178,7 @@ def evaluation(
         title = f"{named}: {counted(each, 'episode')} of each env"
         order = _Order(configs, each, seed, retries, video, "entry", title, facts)
     with contextlib.ExitStack() as stack:
-        chosen = load_policy(policy, stack) if policy else None
+        chosen = load_policy(policy) if policy else None
         _play(order, chosen, _resumed(order, resume, stack), plot, as_json=as_json)
 
 

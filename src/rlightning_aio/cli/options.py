@@ -20,9 +20,9 @@ Overrides: TypeAlias = Annotated[
 PolicyName: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        metavar="MODULE:NAME|openpi://HOST:PORT",
+        metavar="MODULE:NAME",
         help="A callable that takes a batch and returns actions, or a model with predict(), or a "
-        "dict with one for each entry; or the address of a policy server.",
+        "dict with one for each entry.",
         show_default="random actions",
     ),
 ]

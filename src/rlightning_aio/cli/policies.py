@@ -1,4 +1,4 @@
-"""What decides on actions in commands: chance, a policy of the user, or a policy server.
+"""What decides on actions in commands: chance, or a policy of the user.
 
 Here are the parts of every command's loop over a group: responses to results, and counts of steps.
 """
@@ -18,14 +18,11 @@ from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import ConfigError, RLightningError
-from rlightning_aio.policies import ActionChunks
 from rlightning_aio.policies.answers import answers_of
 from rlightning_aio.policies.predicting import PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
-from rlightning_aio.registry import plugins
 
 if TYPE_CHECKING:
-    import contextlib
     from collections.abc import Sequence
     from types import TracebackType
 
@@ -55,16 +52,12 @@ def servers_announced(group: EnvGroup, progress: Progress) -> bool:
     return found
 
 
-def load_policy(name: str, stack: contextlib.ExitStack) -> Policy | dict[str, Policy | None] | None:
-    """Return the policy that ``module:name`` or the address of a policy server names.
-
-    The working directory is on the path. The client of a server is closed by `stack`.
+def load_policy(name: str) -> Policy | dict[str, Policy | None] | None:
+    """Return the policy that ``module:name`` names. The working directory is on the path.
 
     Raises:
-        ConfigError: it can't be imported, is no policy, or a package is missing.
+        ConfigError: it can't be imported, or is no policy.
     """
-    if "://" in name:
-        return _served(name, stack)
     module_name, colon, path = name.partition(":")
     if not (module_name and colon and path):
         raise ConfigError(f"--policy {name!r}: should look like my_policies:greedy")
@@ -97,23 +90,6 @@ def _called(name: str, policy: Any) -> Policy:
         return PredictPolicy(policy)
     kind = type(policy).__name__
     raise ConfigError(f"--policy {name!r}: is a {kind}, neither a callable nor with a predict()")
-
-
-def _served(name: str, stack: contextlib.ExitStack) -> Policy:
-    """Return a client of the policy server at an address, as ``openpi://localhost:8000``.
-
-    The scheme is the name of an entry point.
-    """
-    scheme, _, place = name.partition("://")
-    found = plugins("policies").select(name=scheme)
-    if not found:
-        known = " or ".join(f"{kind}://" for kind in sorted(plugins("policies").names))
-        raise ConfigError(f"--policy {name}: should begin with {known}")
-    try:
-        client = found[scheme].load()(f"ws://{place}")
-    except (ImportError, ConfigError) as error:
-        raise ConfigError(f"--policy {name}: {error}") from error
-    return ActionChunks(stack.enter_context(client))
 
 
 class Responder:
@@ -164,7 +140,7 @@ class Responder:
             if inspect.isawaitable(answer):
                 answer = await answer
         except RLightningError:
-            raise  # Random actions can't be drawn, a policy server is missing, and the like.
+            raise  # Random actions can't be drawn, a policy's server is missing, and the like.
         except Exception as error:
             raise PolicyRaised(_raised(error)) from error
         return answers_of(batch, answer, lambda: self._space_of(batch.env_ids()[0]))

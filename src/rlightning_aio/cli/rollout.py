@@ -38,7 +38,6 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import load_config
-from rlightning_aio.errors import EnvFault, RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -46,9 +45,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.config import EnvConfig
 
-_ENDLESS: Final = 2**62
-_STEPS: Final = 10_000
-"""Default number of steps."""
 _LONG: Final = 1e15
 """Smallest whole number that is written with a power of ten."""
 _BIAS: Final = (
@@ -56,15 +52,7 @@ _BIAS: Final = (
     "to measure a policy, use rlightning-aio eval."
 )
 
-_Steps: TypeAlias = Annotated[
-    int | None,
-    typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
-]
-
-_Seconds: TypeAlias = Annotated[
-    float | None,
-    typer.Option(min=0.001, help="Seconds to collect for.", show_default="no limit"),
-]
+_Steps: TypeAlias = Annotated[int, typer.Option(min=1, help="Env steps to collect.")]
 
 _MinResults: TypeAlias = Annotated[
     int | None,
@@ -84,8 +72,7 @@ class _Rollout:
     """A rollout: what was asked for, and what was done."""
 
     configs: Sequence[EnvConfig]
-    most_steps: int | None
-    most_seconds: float | None
+    most_steps: int
     min_results: int | None
     seed: int | None
     steps: int = 0
@@ -102,20 +89,11 @@ class _Rollout:
         """Steps per second."""
         return self.steps / self.seconds if self.seconds else 0.0
 
-    def left(self) -> tuple[int, float | None] | None:
-        """Return the steps and seconds that are left, or None at the end."""
-        steps = _ENDLESS if self.most_steps is None else self.most_steps - self.steps
-        seconds = self.most_seconds
-        if seconds is not None:
-            seconds -= time.monotonic() - self.began
-        return None if steps <= 0 or (seconds is not None and seconds <= 0) else (steps, seconds)
-
 
 def rollout(
     config: Config,
     overrides: Overrides = None,
-    steps: _Steps = None,
-    seconds: _Seconds = None,
+    steps: _Steps = 10_000,
     policy: PolicyName = None,
     seed: Seed = None,
     min_results: _MinResults = None,
@@ -140,25 +118,20 @@ def rollout(
     """
     check_seed(seed)
     configs = load_config(config, overrides or ())
-    limit = _STEPS if steps is None and seconds is None else steps
-    done = _Rollout(configs, limit, seconds, min_results, seed)
+    done = _Rollout(configs, steps, min_results, seed)
+    chosen = load_policy(policy) if policy else None
     group = rlightning_aio.build_env_group(list(configs), mixed_actions=True)
-    interrupted = completed = False
-    with contextlib.ExitStack() as stack:
-        chosen = load_policy(policy, stack) if policy else None
-        try:
-            with Progress() as progress, connections_logged():
-                run_interruptible(_collect(group, done, chosen, trace, progress))
-            completed = True
-        except KeyboardInterrupt:
-            interrupted = True
-            raise
-        finally:
-            # After an error, too: the numbers until then may be useful.
-            if completed or interrupted or done.steps:
-                _report(str(config), group, done, interrupted=interrupted, as_json=as_json)
-    if not done.steps:
-        raise RLightningError("no step has ended in that time; allow more with --seconds")
+    interrupted = False
+    try:
+        with Progress() as progress, connections_logged():
+            run_interruptible(_collect(group, done, chosen, trace, progress))
+    except KeyboardInterrupt:
+        interrupted = True
+        raise
+    finally:
+        # After an error, too: the numbers until then may be useful.
+        if interrupted or done.steps:
+            _report(str(config), group, done, interrupted=interrupted, as_json=as_json)
 
 
 async def _collect(
@@ -172,9 +145,7 @@ async def _collect(
             progress.begin("first reset")
             batch, _ = await group.reset(seed=done.seed)
             respond = Responder(group, policy, done.seed)
-            limits = [] if done.most_steps is None else [counted(done.most_steps, "step")]
-            limits += [] if done.most_seconds is None else [f"for {done.most_seconds:g} s"]
-            progress.begin(f"collecting {' '.join(limits)}", done.most_steps or done.most_seconds)
+            progress.begin(f"collecting {counted(done.most_steps, 'step')}", done.most_steps)
             done.began = done.ended = time.monotonic()
             with ensure_auto_reset(group):
                 await respond_to_all(group, respond, batch)
@@ -188,20 +159,12 @@ async def _go_on(group: EnvGroup, done: _Rollout, respond: Responder, progress: 
     def words() -> str:
         return f"{count(done.steps)} steps, {count(done.rate)} steps/s"
 
-    while (left := done.left()) is not None:
-        most, seconds = -(-left[0] // sub_envs), left[1]
-        try:
-            batch, _ = await group.collect_async(
-                min_results=min(wanted, most), max_results=most, deadline=seconds
-            )
-        except EnvFault:
-            raise  # Among them those of envs that raised `TimeoutError`.
-        except TimeoutError:
-            done.ended = time.monotonic()  # The time limit has passed while waiting.
-            return
+    while (left := done.most_steps - done.steps) > 0:
+        most = -(-left // sub_envs)
+        batch, _ = await group.collect_async(min_results=min(wanted, most), max_results=most)
         done.steps, done.ended = done.steps + steps_in(batch), time.monotonic()
         await respond_to_all(group, respond, batch)
-        await progress.show(done.steps if done.most_steps else done.seconds, words)
+        await progress.show(done.steps, words)
 
 
 def _report(
