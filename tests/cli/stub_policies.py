@@ -1,4 +1,4 @@
-"""Policies that tests name on the command line; they record their batches."""
+"""Policies that tests name on the command line."""
 
 from __future__ import annotations
 
@@ -6,16 +6,7 @@ from typing import Any
 
 import numpy as np
 
-names_seen: list[frozenset[str]] = []
-
 not_callable = 3
-
-
-def names(batch: Any) -> list[int]:
-    """Record the envs of a batch, whose results must be stackable."""
-    assert len(batch.observation) == len(batch)
-    names_seen.append(frozenset(id_.partition("-")[0] for id_ in batch.ids()))
-    return [0] * len(batch)
 
 
 def respond(batch: Any) -> Any:

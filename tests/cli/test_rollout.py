@@ -6,7 +6,6 @@ import json
 from typing import TYPE_CHECKING
 
 import pytest
-from cli import stub_policies
 from cli.command import CARTPOLE, invoke, invoke_json, run, write_config
 from cli.stub_envs import Stub
 
@@ -111,21 +110,6 @@ def test_printing_of_other_code_goes_to_stderr(tmp_path: Path, placement: str) -
     assert printed <= set(done.stderr.splitlines())
 
 
-@pytest.mark.parametrize("differing", [{"observation_size": 2}, {"actions": 3}])
-def test_a_policy_gets_a_batch_for_each_entry_if_spaces_differ(
-    tmp_path: Path, differing: dict[str, int]
-) -> None:
-    """The results of each call can be stacked."""
-    other = {**STUB, "name": "other", "env_kwargs": differing}
-    config = write_config(tmp_path, {**STUB, "num_workers": 2}, {**other, "num_workers": 3})
-    stub_policies.names_seen.clear()
-    invoke_json(
-        *("rollout", config, "--steps", 40, "--min-results", 5),
-        *("--policy", "cli.stub_policies:names"),
-    )
-    assert set(stub_policies.names_seen) == {frozenset({"stub"}), frozenset({"other"})}
-
-
 @pytest.mark.parametrize("name", ["model", "by_entry"])
 def test_a_policy_may_be_what_evaluate_takes(tmp_path: Path, name: str) -> None:
     """A model with `predict`, or a dict with one policy for each entry."""
@@ -141,4 +125,4 @@ def test_an_entry_without_a_policy_is_named(tmp_path: Path) -> None:
     config = write_config(tmp_path, {**CARTPOLE, "name": "other", "placement": "inline"})
     done = invoke("rollout", config, "--policy", "cli.stub_policies:by_entry")
     assert done.exit_code == 2
-    assert "the dict has no policy for entry 'other'" in done.stderr
+    assert "no policy was given for the envs of entry 'other'" in done.stderr

@@ -18,15 +18,12 @@ from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import ConfigError, RLightningError
-from rlightning_aio.policies.answers import answers_of
+from rlightning_aio.policies.answers import answers_of, check_policies, parts_by_policy
 from rlightning_aio.policies.predicting import PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from types import TracebackType
-
-    import gymnasium as gym
 
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.cli.terminal import Progress
@@ -93,30 +90,31 @@ def _called(name: str, policy: Any) -> Policy:
 
 
 class Responder:
-    """Makes the responses to a batch, with one call of the policy if results can be stacked.
+    """Makes the responses to a batch, with one call of each policy.
 
     Args:
         group: an initialised group.
         policy: called with a batch, or such by entry; None draws random actions.
         seed: of the random actions.
+
+    Raises:
+        ConfigError: an entry has no policy.
     """
 
     def __init__(
         self, group: EnvGroup, policy: Policy | dict[str, Policy | None] | None, seed: int | None
     ) -> None:
-        known = {meta.env_id: meta.action_space for meta in group.metas}
-        self._space_of = known.get
+        self._space_of = {meta.env_id: meta.action_space for meta in group.metas}.get
         self._group = group
         by_chance = RandomPolicy(self._space_of, seed)
-        self._any: Policy | None = None
-        self._policies: dict[str, Policy] = {}
-        if isinstance(policy, dict):
-            for entry, one in cast("dict[str, Policy | None]", policy).items():
-                self._policies[entry] = by_chance if one is None else one
-        else:
-            self._any = by_chance if policy is None else policy
-        self._separate = isinstance(policy, dict) or _differ(group.get_action_spaces())
-        self._separate |= policy is not None and _differ(group.get_observation_spaces())
+        self._by_entry: dict[str, Any] | None = policy if isinstance(policy, dict) else None
+        if self._by_entry is not None:
+            try:
+                check_policies((one["entry"] for one in group.get_workers()), self._by_entry)
+            except ValueError as error:
+                raise ConfigError(f"--policy: {error}") from error
+        given: dict[str, Any] = {"": policy} if self._by_entry is None else self._by_entry
+        self._policies = {name: one or by_chance for name, one in given.items()}
 
     async def __call__(self, batch: BatchedData) -> list[BatchedData]:
         """Return batches of responses that together answer `batch`.
@@ -124,17 +122,13 @@ class Responder:
         Raises:
             PolicyRaised: the policy raised an exception that is none of this package.
         """
-        parts = batch.by_entry() if self._separate else {"": batch}
         found: list[BatchedData] = []
         with self._group.span("policy"):
-            for entry, part in parts.items():
-                found += await self._respond(entry, part)
+            for name, part in parts_by_policy(batch, self._by_entry):
+                found += await self._answers(self._policies[name], part)
         return found
 
-    async def _respond(self, entry: str, batch: BatchedData) -> list[BatchedData]:
-        policy = self._policies.get(entry, self._any)
-        if policy is None:
-            raise ConfigError(f"--policy: the dict has no policy for entry {entry!r}")
+    async def _answers(self, policy: Policy, batch: BatchedData) -> list[BatchedData]:
         try:
             answer = policy(batch)
             if inspect.isawaitable(answer):
@@ -144,10 +138,6 @@ class Responder:
         except Exception as error:
             raise PolicyRaised(_raised(error)) from error
         return answers_of(batch, answer, lambda: self._space_of(batch.env_ids()[0]))
-
-
-def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
-    return any(space != spaces[0] for space in spaces[1:])
 
 
 def _raised(error: Exception) -> str:

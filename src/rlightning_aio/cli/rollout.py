@@ -103,9 +103,8 @@ def rollout(
     """Collect steps from a config's envs and print the numbers of the group.
 
     Actions are sampled at random from the envs' action spaces, or come from the policy that
-    --policy names. It gets a BatchedData (one for each entry, if their spaces differ) and
-    returns actions, one row for each result, or a dict of columns with 'action', or a batch made
-    with its respond() method.
+    --policy names. It gets a BatchedData and returns actions, one row for each result, or a dict
+    of columns with 'action', or a batch made with its respond() method.
     Ctrl-C ends the collection early and prints the numbers so far.
 
     For example:
