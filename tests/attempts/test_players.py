@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from kit.counting import ClientThread, CountingEnv, look
+from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 
 from rlightning_aio import sync
@@ -51,8 +51,7 @@ def until_it_is(state: str, group: Any) -> None:
 @pytest.fixture
 def group() -> Iterator[sync.EnvGroup]:
     """A place for one client."""
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
-    with sync.build_env_group(server) as group:
+    with sync.build_env_group(served()) as group:
         yield group
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from attempts.room import AwaitedRoom
 from attempts.rooms import PLACES, rooms
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread, CountingEnv, served
 from patience import HANG
 
 import rlightning_aio as rl
@@ -368,11 +368,6 @@ async def cut_off_and_play_on(group: rl.EnvGroup, deed: str) -> None:
     assert (attempt.outcome.kind, attempt.reward) == ("terminated", 5.0)
 
 
-def served(*names: str) -> dict[str, Any]:
-    kwargs = {"clients": list(names), "connect_timeout": HANG}
-    return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
-
-
 async def test_clients_of_an_env_server_play() -> None:
     """Also one that comes while others play."""
 
@@ -384,7 +379,7 @@ async def test_clients_of_an_env_server_play() -> None:
         return episode.env_id
 
     playing = set[str]()
-    async with rl.build_env_group(served("c0", "c1", "c2")) as group:
+    async with rl.build_env_group(served(clients=["c0", "c1", "c2"])) as group:
         handle: Any = group["robots-0"]
         address: str = handle.address
         clients = [ClientThread(address, "c0", CountingEnv(0))]
@@ -414,7 +409,7 @@ async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() 
     order = [*["robots"] * 4, *["here"] * 3]
     specs = [EpisodeSpec("", k, entry=name) for k, name in enumerate(order)]
     found: list[str] = []
-    async with rl.build_env_group([local, served("c0")]) as group:
+    async with rl.build_env_group([local, served(clients=["c0"])]) as group:
         handle: Any = group["robots-0"]
         async with asyncio.timeout(HANG):
             async for attempts in play(group, specs, agent, size=2):

@@ -6,18 +6,14 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from cli.command import CARTPOLE, start, write_config
-from kit.counting import ClientThread
+from kit.counting import ClientThread, served
 from patience import HANG
 
 if TYPE_CHECKING:
     import subprocess
     from pathlib import Path
 
-SERVER = {
-    "name": "robots",
-    "backend": "env_server",
-    "env_kwargs": {"min_clients": 2, "connect_timeout": HANG},
-}
+SERVER = served(min_clients=2)
 
 
 def address(child: subprocess.Popen[str]) -> str:

@@ -76,6 +76,12 @@ def look(group: Any, seconds: float = 0.02, server: str = "robots-0") -> None:
     group._core.intake.apply_completions()  # noqa: SLF001
 
 
+def served(**env_kwargs: Any) -> dict[str, Any]:
+    """Fields of an env_server whose first env is robots-0; its calls wait long for clients."""
+    kwargs = {"connect_timeout": HANG, **env_kwargs}
+    return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+
+
 class ClientThread:
     """A client in a thread of the test's process; it ends with its server."""
 

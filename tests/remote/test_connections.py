@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 import zmq
-from kit.counting import ClientThread, CountingEnv, look
+from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 
 from rlightning_aio import sync
@@ -23,11 +23,7 @@ from rlightning_aio.remote import RemoteEnvClient
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-ENTRY: dict[str, Any] = {
-    "name": "robots",
-    "backend": "env_server",
-    "env_kwargs": {"clients": ["arm", "greedy"], "heartbeat": 60.0, "connect_timeout": HANG},
-}
+ENTRY = served(clients=["arm", "greedy"], heartbeat=60.0)
 
 
 def dial(address: str, count: int) -> list[socket.socket]:

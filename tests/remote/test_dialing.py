@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import zmq
-from kit.counting import CountingEnv
+from kit.counting import CountingEnv, served
 from patience import HANG
 
 from rlightning_aio import sync
@@ -116,8 +116,7 @@ def test_a_client_takes_a_gymnasium_env_or_a_callable(made: str) -> None:
         def stop(self) -> None:
             stops.append("stop")
 
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
-    with sync.build_env_group(server) as group:
+    with sync.build_env_group(served()) as group:
         given: Any = Robot() if made == "env" else Robot
         with RemoteEnvClient(given, group["robots-0"].address, name="arm") as client:
             client._env.is_finish = lambda: len(stops) == 2  # noqa: SLF001

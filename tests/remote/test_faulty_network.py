@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kit.counting import served
 from patience import HANG
 from remote.faulty_proxy import Faults, FaultyProxy
 from remote.recording import HEARTBEAT
@@ -20,16 +21,8 @@ from rlightning_aio import BatchedData, PolicyResponse, sync
 
 
 def make_config(num_clients: int) -> dict[str, Any]:
-    return {
-        "name": "robots",
-        "backend": "env_server",
-        "max_restarts": 1_000_000,
-        "env_kwargs": {
-            "clients": [f"c{k}" for k in range(num_clients)],
-            "heartbeat": HEARTBEAT,
-            "connect_timeout": HANG,
-        },
-    }
+    names = [f"c{k}" for k in range(num_clients)]
+    return served(clients=names, heartbeat=HEARTBEAT) | {"max_restarts": 1_000_000}
 
 
 def check(ends: dict[int, tuple[str, str]], folder: Path, proxy: FaultyProxy) -> dict[str, int]:

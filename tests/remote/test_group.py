@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread, CountingEnv, served
 from patience import HANG
 
 import rlightning_aio
@@ -41,8 +41,7 @@ CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_
 
 def entry(count: int = 1, **env_kwargs: Any) -> dict[str, Any]:
     names = [f"c{k}" for k in range(count)]
-    kwargs = {"clients": names, "connect_timeout": HANG, **env_kwargs}
-    return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    return served(clients=names, **env_kwargs)
 
 
 @contextmanager

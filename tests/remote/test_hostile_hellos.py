@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread, CountingEnv, served
 from patience import HANG
 from remote.random_spaces import any_space
 from remote.unreliable import Recorder
@@ -168,9 +168,7 @@ def test_numbers_of_clients_raise_nothing_in_a_trainer_with_strict_arithmetic() 
     """An error of the env is shown without control characters."""
     with (
         np.errstate(all="raise"),
-        sync.build_env_group(
-            {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
-        ) as group,
+        sync.build_env_group(served()) as group,
     ):
         friend = ClientThread(group["robots-0"].address, "arm", _Hostile())
         batch, _ = group.reset()

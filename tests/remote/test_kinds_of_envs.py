@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
-from kit.counting import ClientThread
+from kit.counting import ClientThread, served
 from kit.driven import without_times
 from patience import HANG
 from remote.random_spaces import same, sampled
@@ -222,11 +222,10 @@ def test_a_robot_whose_wrapper_stops_it_says_what_a_step_returns(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Its step is refused, so that it stops; the words are those of a local env."""
-    entry = {"name": "s", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
     robot = Braked(FourValues())
-    with sync.build_env_group(entry) as group:
+    with sync.build_env_group(served()) as group:
         outer: Any = gym.wrappers.TimeLimit(robot, 9)
-        client = ClientThread(group["s-0"].address, "one", outer)
+        client = ClientThread(group["robots-0"].address, "one", outer)
         batch, _ = group.reset()
         with pytest.raises(EnvRaised, match="GymV21CompatibilityV0"):
             group.step(batch.respond(action=[0]))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from kit.counting import ClientThread, CountingEnv, look
+from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 from remote.faulty_proxy import Faults, FaultyProxy
 
@@ -25,14 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _TESTS = Path(__file__).parents[1]
-
-
-def entry(**env_kwargs: Any) -> dict[str, Any]:
-    return {
-        "name": "robots",
-        "backend": "env_server",
-        "env_kwargs": {"connect_timeout": HANG, **env_kwargs},
-    }
 
 
 class ArmProcess:
@@ -92,7 +84,7 @@ def wait_for(group: Any, condition: Any) -> None:
 @pytest.mark.parametrize("fault", ["killed", "stopped", "cut off"])
 def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_path: Path) -> None:
     """Whatever is lost meanwhile, and whoever dials in."""
-    with sync.build_env_group(entry()) as group, arms() as started:
+    with sync.build_env_group(served()) as group, arms() as started:
         address = group["robots-0"].address
         proxy = FaultyProxy(address, Faults())
         with proxy:
@@ -139,7 +131,7 @@ def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_pa
 
 def test_a_held_reset_that_is_taken_back_moves_nothing(tmp_path: Path) -> None:
     """By an abort, or because the call was interrupted."""
-    with sync.build_env_group(entry()) as group, arms() as started:
+    with sync.build_env_group(served()) as group, arms() as started:
         address = group["robots-0"].address
         group.reset_async(seed=1)
         assert group.pending == ["robots-0/0"]
@@ -175,7 +167,7 @@ def mixed(**env_kwargs: Any) -> Any:
         "task": "Pendulum-v1",
         "num_workers": 4,
     }
-    return sync.build_env_group([local, entry(**env_kwargs)], mixed_actions=True)
+    return sync.build_env_group([local, served(**env_kwargs)], mixed_actions=True)
 
 
 @pytest.mark.parametrize("when", ["idle", "in flight", "uncollected"])
@@ -288,7 +280,7 @@ def test_an_arm_at_work_is_stopped_when_its_session_is_over(
 ) -> None:
     """Somebody watches the session while the env moves, however long that takes."""
     with contextlib.ExitStack() as stack:
-        group = stack.enter_context(sync.build_env_group(entry(heartbeat=1)))
+        group = stack.enter_context(sync.build_env_group(served(heartbeat=1)))
         proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
         arm = ArmProcess(proxy.address, tmp_path / "first")
         stack.callback(arm.end)
@@ -320,7 +312,7 @@ def test_an_arm_at_work_is_stopped_when_its_session_is_over(
 def test_a_client_misses_a_silent_server_as_soon_as_that_would_miss_it() -> None:
     """In its first session, too, however patient it is itself."""
     with contextlib.ExitStack() as stack:
-        group = stack.enter_context(sync.build_env_group(entry(heartbeat=1)))
+        group = stack.enter_context(sync.build_env_group(served(heartbeat=1)))
         proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
         client = ClientThread(proxy.address, "one", heartbeat=86400)
         group.reset()
@@ -343,7 +335,7 @@ def test_a_client_misses_a_silent_server_as_soon_as_that_would_miss_it() -> None
 @pytest.mark.parametrize("action", [None, np.full((1, 2), 3.0), np.zeros((2, 2)), np.zeros((1, 3))])
 def test_a_clients_arm_stops_when_an_action_is_refused(tmp_path: Path, action: Any) -> None:
     """By the group, which sends it away, or by the client itself; a reset moves it again."""
-    with sync.build_env_group(entry()) as group, arms() as started:
+    with sync.build_env_group(served()) as group, arms() as started:
         arm = ArmProcess(group["robots-0"].address, tmp_path / "first")
         started.append(arm)
         batch, _ = group.reset()

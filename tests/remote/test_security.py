@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import zmq
-from kit.counting import ClientThread, CountingEnv, look
+from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 from remote.random_spaces import mutation
 from zmq.utils.monitor import recv_monitor_message
@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 
 def entry(**env_kwargs: Any) -> dict[str, Any]:
-    kwargs = {"clients": ["arm"], "connect_timeout": HANG, **env_kwargs}
-    return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    return served(**{"clients": ["arm"], **env_kwargs})
 
 
 # Keys

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zmq
-from kit.counting import ClientThread, CountingEnv, look
+from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 
 from rlightning_aio import sync
@@ -46,12 +46,7 @@ def test_spurious_readiness_disturbs_neither_side(
 
     for module in (listener, authenticator):
         monkeypatch.setattr(module, "is_readable", lying(module.is_readable))
-    config = {
-        "name": "robots",
-        "backend": "env_server",
-        "env_kwargs": {"connect_timeout": HANG, "heartbeat": 60.0},
-    }
-    with sync.build_env_group(config) as group:
+    with sync.build_env_group(served(heartbeat=60.0)) as group:
         thread = ClientThread(group["robots-0"].address, "c0", CountingEnv())
         batch, _ = group.reset()
         thread.client._poller = LyingPoller(thread.client)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from kit.counting import ClientThread, CountingEnv
+from kit.counting import ClientThread, CountingEnv, served
 from patience import HANG
 from timelines import Seen
 
@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 def test_clients_have_tracks_by_their_names(tmp_path: Path) -> None:
     """With their requests."""
-    kwargs = {"clients": ["left", "right"], "connect_timeout": HANG}
-    entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
-    with sync.build_env_group(entry) as group:
+    with sync.build_env_group(served(clients=["left", "right"])) as group:
         address = group["robots-0"].address
         threads = [ClientThread(address, name, CountingEnv()) for name in ("left", "right")]
         with group.trace(tmp_path / "run.json"):
