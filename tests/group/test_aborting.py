@@ -65,23 +65,6 @@ async def test_an_aborted_env_is_free_and_begins_an_episode(
     assert batch.observation[1, 2] == 1
 
 
-async def test_an_aborted_env_can_be_reset(
-    start: Any, entry: dict[str, Any], tmp_path: Path
-) -> None:
-    """Plainly: the loss is moot."""
-    group = await start(entry)
-    await group.reset(seed=3)
-    Gate(str(tmp_path), IDS[1]).make()
-    group.step_async(steps(IDS[1]))
-    await group.abort([IDS[1]])
-    (tmp_path / IDS[1]).unlink()
-    batch, _ = await group.reset(seed={IDS[1]: 11}, env_ids=[IDS[1]])
-    assert batch.restarted.tolist() == [False]
-    assert batch.observation[0, 2:].tolist() == [0, 11]
-    batch, _ = await group.step(steps(IDS[1]))
-    assert batch.observation[0, 2:].tolist() == [1, 11]
-
-
 async def test_results_that_were_not_collected_are_dropped(start: Any, entry: Any) -> None:
     """Of the envs that are named; those of others stay."""
     group = await start(entry)
@@ -97,30 +80,6 @@ async def test_results_that_were_not_collected_are_dropped(start: Any, entry: An
     assert not batch.restarted.any()
     batch, _ = await group.step(steps(*IDS))
     assert batch.restarted.tolist() == [env_id == dropped for env_id in IDS]
-
-
-@pytest.mark.one_driver_for_each_place
-async def test_idle_envs_are_left_as_they_are(start: Any, entry: Any) -> None:
-    group = await start(entry)
-    await group.reset(seed=3)
-    await group.step(steps(*IDS))
-    await group.abort()
-    await group.abort([])
-    batch, _ = await group.step(steps(*IDS))
-    assert not batch.restarted.any()
-    assert batch.observation[:, 2].tolist() == [2] * 4
-
-
-async def test_a_reset_can_be_aborted(start: Any, entry: Any) -> None:
-    """Whoever steps the env has it reset."""
-    group = await start(entry)
-    await group.reset(seed=3)
-    group.reset_async(env_ids=IDS[:2])
-    await group.abort(IDS[1:2])
-    batch, _ = await group.collect_async(wait_all=True)
-    assert batch.ids() == IDS[:1]
-    batch, _ = await group.step(steps(*IDS))
-    assert batch.restarted.tolist() == [False, True, False, False]
 
 
 async def test_a_call_can_be_aborted(entry: dict[str, Any]) -> None:

@@ -71,15 +71,6 @@ async def test_only_the_agent_with_a_bad_action_gets_an_error(place: dict[str, A
         assert [ret.info["count"] for ret in found] == [3, 1, 3, 3]
 
 
-@pytest.mark.parametrize("place", PLACES, ids=["inline", "workers"])
-async def test_an_error_of_an_env_is_that_of_its_agent(place: dict[str, Any]) -> None:
-    async with rl.build_env_group(Counter, num_workers=4, **place) as group:
-        playing = await episodes(group)
-        found = await stepped(playing, [GO, RAISE, GO, RAISE])
-        assert [one.env_id for one in found] == group.env_ids
-        assert [isinstance(one, EnvRaised) for one in found] == [False, True, False, True]
-
-
 async def test_two_steps_of_one_env_are_one_too_many() -> None:
     """The second one is refused, and nobody else notices."""
     async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
@@ -289,20 +280,6 @@ async def test_tasks_that_use_handles_have_their_own_results_values_and_errors(
         assert isinstance(found[4], ValueError)
         assert found[5].info["count"] == 1
         assert group.pending == []
-
-
-async def test_a_handle_whose_task_is_cancelled_leaves_its_result_to_collect() -> None:
-    """The others get theirs."""
-    async with rl.build_env_group(Long, num_workers=3, placement="loop") as group:
-        await group.reset()
-        steps = [asyncio.ensure_future(group[env_id].step(0)) for env_id in group.env_ids]
-        while len(group.pending) < 3:  # noqa: ASYNC110
-            await asyncio.sleep(0)
-        steps[0].cancel()
-        rets = await asyncio.gather(*steps[1:])
-        assert [ret.env_id for ret in rets] == group.env_ids[1:]
-        assert group.pending == group.env_ids[:1]
-        assert (await group.collect_async())[0].ids() == group.env_ids[:1]
 
 
 @pytest.mark.parametrize("action", [GO, RAISE], ids=["result", "error"])

@@ -11,16 +11,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from remote.random_spaces import any_space, same, sampled
 
-from rlightning_aio.protocol.columns import Misfit, gather, leaves, row_reader, row_writer
+from rlightning_aio.protocol.columns import Misfit, leaves, row_reader, row_writer
 from rlightning_aio.protocol.slab import (
-    IS_RESET,
-    OVER,
-    TERMINATED,
-    TRUNCATED,
     RowLayout,
     Slab,
 )
-from rlightning_aio.trees import index, mapped
+from rlightning_aio.trees import index
 
 fixed_space = any_space.filter(lambda space: leaves(space) is not None)
 HEADS = st.sampled_from([((), ()), ((3,), ()), ((2,), ("a", "b")), ((2, 3), ("a", "b"))])
@@ -63,28 +59,6 @@ def test_values_go_through_rows_unchanged(
         assert (ours.episode_return[row] == row / 2).all()
         assert (ours.episode_length[row] == row).all()
         assert (ours.info[row] == row).all()
-
-
-@given(space=fixed_space, rows=st.integers(2, 5), data=st.data())
-@settings(deadline=None)
-def test_gathered_rows_are_a_copy_in_the_requested_order(
-    space: Any, rows: int, data: st.DataObject
-) -> None:
-    """Also for a contiguous range, which could be a view."""
-    layout = RowLayout(space, spaces.Discrete(2), (), ())
-    slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
-    values = [sampled(space, row) for row in range(rows)]
-    for row, value in enumerate(values):
-        row_writer(slab.observation, row, "observation")(value)
-    chosen = data.draw(st.lists(st.integers(0, rows - 1), min_size=1))
-    picked = gather(slab.observation, np.array(chosen, np.intp))
-    ranged = gather(slab.observation, slice(0, rows))
-    for row in range(rows):
-        row_writer(slab.observation, row, "observation")(sampled(space, 77))
-    for k, row in enumerate(chosen):
-        assert same(index(picked, k), values[row])
-    for row in range(rows):
-        assert same(index(ranged, row), values[row])
 
 
 @given(space=fixed_space)
@@ -166,32 +140,3 @@ def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
     slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
     assert slab.observation is None
     assert slab.action is not None
-
-
-@given(head=HEADS, rows=st.integers(1, 3), data=st.data())
-def test_the_flags_are_columns_of_one_array(head: Any, rows: int, data: st.DataObject) -> None:
-    """One copy reads all flags; each is written separately."""
-    layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), *head)
-    slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
-    names = ("terminated", "truncated", "is_reset", "over")
-    expected = np.zeros((rows, *head[0], 4), bool)
-    assert [TERMINATED, TRUNCATED, IS_RESET, OVER] == [0, 1, 2, 3]
-    for place, name in enumerate(names):
-        row = data.draw(st.integers(0, rows - 1))
-        getattr(slab, name)[row] = expected[row, ..., place] = data.draw(st.booleans())
-    assert (slab.flags == expected).all()
-
-
-def test_a_seed_is_used_for_one_reset() -> None:
-    """The next reset finds none; 0 is a seed."""
-    layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), (), ())
-    slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
-    slab.seed[1] = 0 + 1
-    assert [slab.take_seed(0), slab.take_seed(1), slab.take_seed(1)] == [None, 0, None]
-
-
-def test_mapping_a_tree_keeps_its_structure() -> None:
-    """Dicts stay dicts and tuples tuples."""
-    tree = {"a": (np.ones(2), np.zeros(2)), "b": np.ones(2)}
-    found = mapped(lambda array: array.sum(), tree)
-    assert found == {"a": (2.0, 0.0), "b": 2.0}
