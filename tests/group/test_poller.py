@@ -48,7 +48,7 @@ class Server(Worker):
         raise AssertionError
 
     start = attach = packed = submit = close = release = _not_asked
-    check_step = check_reset = admit = forget = _not_asked
+    check_step = check_reset = admit = drop_reset = _not_asked
 
 
 class Scene:

@@ -35,4 +35,4 @@ def test_the_checked_table_refuses_an_illegal_event_and_a_change_without_one() -
     assert table.state[1] == State.BUSY
     table.state[1] = State.IDLE
     with pytest.raises(RuntimeError, match="slot 1 became IDLE for COLLECTOR without"):
-        table.take_back(slots)
+        table.drop(slots)

@@ -64,11 +64,11 @@ def _asked(slots: NDArray[np.intp], owner: int) -> Changes:
     return [(Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL, slots)]
 
 
-def _given_up(requests: Requests, ticket: Ticket) -> Changes:
+def _left(requests: Requests, ticket: Ticket) -> Changes:
     slots = ticket.own_slots(requests.owner)
     slots = slots[requests.state[slots] != State.IDLE]  # An interrupt came before it was sent.
     values = slots[ANSWERS_WITH_VALUE[requests.numbering.ops(slots)]]
-    return [(Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, np.setdiff1d(slots, values))]
+    return [(Event.METHOD_LEFT, values), (Event.LEFT, np.setdiff1d(slots, values))]
 
 
 _OF_REQUESTS: Final[Rules] = {
@@ -78,14 +78,13 @@ _OF_REQUESTS: Final[Rules] = {
     "deliver": lambda _, args: [(Event.RESULT, args[0])],
     "set_value": lambda it, args: [(Event.VALUE, it.alone(args[0]))],
     "fail": lambda _, args: [(Event.FAULT, args[0])],
-    "take_back": lambda _, args: [(Event.TAKEN_BACK, args[0])],
     "hand_out": lambda _, args: [(Event.HANDED_OUT, args[0])],
     "abort": lambda _, args: [(Event.ABORTED, args[0])],
     "drop_unwanted": lambda it, args: [(Event.DROPPED, args[0][it.owner[args[0]] == NOBODY])],
     "drop": lambda _, args: [(Event.DROPPED, args[0])],
-    "settle": lambda _, args: [(Event.SETTLED, args[0].slots)],
-    "settle_ended": lambda _, args: [(Event.SETTLED, slots) for slots in args[0].ended],
-    "give_up": lambda it, args: _given_up(it, *args),
+    "close": lambda _, args: [(Event.CLOSED, args[0].slots)],
+    "take_ended": lambda _, args: [(Event.CLOSED, slots) for slots in args[0].ended],
+    "leave": lambda it, args: _left(it, *args),
 }
 """The changes that each method makes, by its arguments."""
 _OF_QUEUE: Final[Rules] = {

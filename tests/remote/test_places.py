@@ -182,7 +182,7 @@ def test_a_place_changes_hands_in_mid_run(when: str) -> None:
         def leave() -> None:
             env.finished = True
             if when == "in flight":
-                gone.client._hang_up()
+                gone.client._close_connection()
 
         env.on_step, env.finished = leave, when == "idle"
         wait_for(group, lambda: len(group["robots-0"].clients) == 1)

@@ -288,7 +288,7 @@ class RemoteEnvClient:
         if "[" in self._address:
             dealer.set(zmq.IPV6, 1)
 
-    def _hang_up(self, linger_ms: int = _LINGER_MS) -> None:
+    def _close_connection(self, linger_ms: int = _LINGER_MS) -> None:
         """End the attempt or the connection, and set the time of the next attempt."""
         if self._dealer is not None:
             with _signals_held_back():
@@ -314,7 +314,7 @@ class RemoteEnvClient:
         self._read(wait_ms)
         is_late = self._dealer is not None and time.monotonic() >= self._due
         if is_late and self._session.phase is Phase.AWAY:
-            self._lose(f"no server answers at {self._address}")
+            self._end(f"no server answers at {self._address}")
         self._flush()
         self._log_state()
 
@@ -356,18 +356,18 @@ class RemoteEnvClient:
             while self._session.phase is not Phase.AWAY and self._receive():
                 pass
             is_new = self._session.phase is Phase.AWAY
-            self._lose(self._trouble if is_new else "the connection to the server broke")
+            self._end(self._trouble if is_new else "the connection to the server broke")
         elif event == zmq.EVENT_CLOSED:
-            self._lose(f"no server answers at {self._address}")
+            self._end(f"no server answers at {self._address}")
         elif event != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL or not self._trouble:
             # Handshakes that fail for one reason may end with it or without any.
             self._trouble = _REFUSED_HANDSHAKES.get(event, self._trouble)
 
-    def _lose(self, cause: str) -> None:
+    def _end(self, cause: str) -> None:
         """Process the end of an attempt or a connection."""
         self._trouble = cause
         event = self._session.disconnected(cause)
-        self._hang_up(linger_ms=0)
+        self._close_connection(linger_ms=0)
         self._apply(event)
 
     def _flush(self) -> None:
@@ -382,7 +382,7 @@ class RemoteEnvClient:
     def _leave(self, reason: str) -> None:
         self._session.leave(reason)
         self._flush()
-        self._hang_up()
+        self._close_connection()
 
     # -- env ------------------------------------------------------------------------
 
@@ -400,7 +400,7 @@ class RemoteEnvClient:
             self._heartbeat = self._own_heartbeat or event.heartbeat
         elif isinstance(event, Refused):
             self._flush()
-            self._hang_up()
+            self._close_connection()
             self._trouble = event.text
             if not event.retry:
                 raise ClientRefused(
@@ -409,7 +409,7 @@ class RemoteEnvClient:
         elif event is not None:
             self._request = None
             self._flush()
-            self._hang_up()
+            self._close_connection()
             self._trouble = ""
             LOG.warning("%s: session over: %s", self.name, event.cause)
             self._asks_if_finished = True

@@ -290,7 +290,7 @@ class SelfStarting(Host, Protocol):
         """Note that the group has applied a `Taken`: what it submits now is for that client."""
         ...
 
-    def forget(self) -> None:
+    def drop_reset(self) -> None:
         """Don't repeat the reset that was lost with the last client."""
         ...
 

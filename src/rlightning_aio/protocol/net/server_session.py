@@ -269,7 +269,7 @@ class ServerSessions:
             if session is None:
                 self._warn(f"dropped a message: {text}")
             else:
-                self._dismiss(session, f"a message of it is malformed: {text}")
+                self._drop(session, f"a message of it is malformed: {text}")
 
     def _warn(self, text: str) -> None:
         """Log a warning, unless it repeats the last one."""
@@ -345,7 +345,7 @@ class ServerSessions:
         """
         if isinstance(message, Bye):
             cause = f"it left: {in_one_line(message.reason) or 'no reason given'}"
-            self._lose(session, cause, in_order=True)
+            self._end(session, cause, in_order=True)
             return
         if isinstance(message, ClientHello):
             raise WireError("a second hello")
@@ -372,12 +372,12 @@ class ServerSessions:
     def disconnected(self, route: bytes) -> None:
         """Record that a connection is gone, after all of its messages have been received."""
         if (session := self._by_route.get(route)) is not None:
-            self._lose(session, "its connection broke")
+            self._end(session, "its connection broke")
 
-    def dismiss(self, place: ClientPlace, cause: str) -> None:
+    def drop(self, place: ClientPlace, cause: str) -> None:
         """Send the client at a place away, with the reason."""
         if place.session is not None:
-            self._dismiss(place.session, cause)
+            self._drop(place.session, cause)
 
     def close(self, reason: str) -> None:
         """End all sessions and send every client the reason. No place hears of that."""
@@ -386,12 +386,12 @@ class ServerSessions:
             self._post(route, Bye(reason=reason))
         self._by_route.clear()
 
-    def _dismiss(self, session: ServerSession, cause: str) -> None:
+    def _drop(self, session: ServerSession, cause: str) -> None:
         """End a session and send its client the reason."""
         self._post(session.route, Bye(reason=cause))
-        self._lose(session, cause)
+        self._end(session, cause)
 
-    def _lose(self, session: ServerSession, cause: str, *, in_order: bool = False) -> None:
+    def _end(self, session: ServerSession, cause: str, *, in_order: bool = False) -> None:
         """End a session."""
         level = logging.INFO if in_order else logging.WARNING
         LOG.log(level, "%s: lost the client %r: %s", self._server_id, session.name, cause)

@@ -133,7 +133,7 @@ class Facade:
         self._steps = self._core.steps
         self._driver.completions = self._core.tables.completions
         self._driver.apply_completions = self._core.apply_completions
-        self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
+        self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.release)
         self._disowned = False
         self._traces: list[Trace] = []
         _groups.add(self)
@@ -406,7 +406,7 @@ class Facade:
     def _disown(self) -> None:
         """Release this group in a forked child, and leave it intact in the parent."""
         self._disowned = True
-        self._driver.forget()
+        self._driver.disown()
         self._core.supervisor.shutdown.disown()
 
     def _after_close(self) -> None:

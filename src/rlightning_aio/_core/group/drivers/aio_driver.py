@@ -196,7 +196,7 @@ class AioDriver:
     def read(self) -> None:
         """Do nothing: the loop reads."""
 
-    def forget(self) -> None:
+    def disown(self) -> None:
         self._descriptors.clear()
         self._writing.clear()
 

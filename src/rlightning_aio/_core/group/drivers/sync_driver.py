@@ -105,7 +105,7 @@ class SyncDriver:
     def read(self) -> None:
         self._block(0.0)
 
-    def forget(self) -> None:
+    def disown(self) -> None:
         if self._epoll is not None:
             self._epoll.close()
             self._epoll = None

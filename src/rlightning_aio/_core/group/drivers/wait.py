@@ -78,7 +78,7 @@ class GroupDriver(Driver, Protocol):
         """Call a function that only looks at the group, after `check_caller`."""
         ...
 
-    def forget(self) -> None:
+    def disown(self) -> None:
         """Forget all sources without unregistering them, as the parent still watches them."""
         ...
 

@@ -53,10 +53,10 @@ class Aborts:
         ready = ready[self._requests.owner[ready] == COLLECTOR]
         if len(ready):
             self._requests.drop(ready)
-            self._results.let_go(ready)
+            self._results.drop(ready)
             self._sums.note_failures(ready, _WHY.kind)
         failed = self._requests.collector.free(slots.tolist())
-        self._abandon(np.concatenate((ready, failed)))
+        self._lose(np.concatenate((ready, failed)))
 
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.
@@ -69,8 +69,8 @@ class Aborts:
         wanted = new[requests.owner[new] != NOBODY]
         requests.abort(wanted, [self._fault(slot) for slot in wanted.tolist()])
         self._sums.note_failures(new, _WHY.kind)
-        self._abandon(new)
-        self._supervisor.places.withdraw(new)
+        self._lose(new)
+        self._supervisor.places.drop_unwanted(new)
         for host_id, entry in self._supervisor.detector.abort(new, now):
             requests.end(host_id, entry)
         self._waiting.poll()
@@ -95,7 +95,7 @@ class Aborts:
         fault.outcome = _WHY.outcome(env_id)
         return fault
 
-    def _abandon(self, slots: NDArray[np.intp]) -> None:
+    def _lose(self, slots: NDArray[np.intp]) -> None:
         """Note that episodes are over; only its user resets what moves something real."""
         chosen: list[int] = slots.tolist()
         for slot in chosen:

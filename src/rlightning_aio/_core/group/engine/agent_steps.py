@@ -274,7 +274,7 @@ class AgentSteps:
             if not (reply := self._ended(slot)).done():
                 reply.set_result(value)
         ticket.values.clear()
-        slots = self._requests.settle_ended(ticket)
+        slots = self._requests.take_ended(ticket)
         if len(slots):
             batch, _ = self._steps.hand_out(slots)
             self._resolve(batch, slots)

@@ -222,7 +222,7 @@ class Results:
             (slab.episode_return, slab.episode_length), rows
         )
 
-    def let_go(self, slots: NDArray[np.intp]) -> None:
+    def drop(self, slots: NDArray[np.intp]) -> None:
         """The results of `slots` are handed out: what is kept for them beside their rows goes."""
         if self._any_restarted:
             self._restarted[slots] = False

@@ -394,7 +394,7 @@ class Steps:
             self._sums.add(parts)
         finally:
             if self._conditions.unusual & BESIDE_ROWS:
-                results.let_go(slots)
+                results.drop(slots)
             self._requests.hand_out(slots)
         if observer is not None:
             observer.note_results(parts)

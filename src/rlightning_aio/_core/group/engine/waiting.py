@@ -261,7 +261,7 @@ class Waiting:
     ) -> Procedure[tuple[Ticket, float]]:
         """Send requests, and wait for all replies; return them in their ticket, and the time.
 
-        After an error or cancellation, `collect_async` gets what `Requests.give_up` leaves to it.
+        After an error or cancellation, `collect_async` gets what `Requests.leave` leaves to it.
 
         Args:
             now: monotonic seconds.
@@ -277,9 +277,9 @@ class Waiting:
                 now = yield from self.turn(ticket.remaining, None)
                 self.poll()
         except BaseException:
-            self._give_up(ticket)
+            self._leave(ticket)
             raise
-        self._requests.settle(ticket)
+        self._requests.close(ticket)
         return ticket, now
 
     def serve(self, now: float, work: Callable[[Ticket, float], Wait | None]) -> Procedure[None]:
@@ -304,22 +304,22 @@ class Waiting:
                         self.check(now)
                 self.poll()
         except BaseException:
-            self._give_up(ticket)
+            self._leave(ticket)
             raise
         finally:
             self._served = None
-        self._requests.settle(ticket)
+        self._requests.close(ticket)
 
     def leave(self, slot: int) -> None:
-        """Give up one request of the call of `serve`, whose caller was cancelled."""
+        """Leave one request of the call of `serve`, whose caller was cancelled."""
         if self._served is not None:
-            self._give_up(self._requests.split(self._served, slot))
+            self._leave(self._requests.split(self._served, slot))
 
-    def _give_up(self, ticket: Ticket) -> None:
+    def _leave(self, ticket: Ticket) -> None:
         """Close a ticket whose call no longer waits; what is held for clients is never sent."""
         if self._supervisor.places.num_held:
-            self._supervisor.places.take_back(ticket.owner)
-        self._requests.give_up(ticket)
+            self._supervisor.places.drop_of(ticket.owner)
+        self._requests.leave(ticket)
         self.wake()
 
 

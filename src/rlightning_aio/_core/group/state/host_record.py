@@ -234,18 +234,18 @@ class HostRecord:
         """Its worker executes the requests of several envs at the same time."""
         return len(self.started) > 1 and any(env.is_awaitable for env in self.started)
 
-    def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
+    def drop_held(self, entries: NDArray[np.int64]) -> list[int]:
         """Hold some requests no longer; return those that it has held."""
-        withdrawn: list[int] = []
+        dropped: list[int] = []
         kept: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = []
         for held, arguments in self.held:
             stays = ~np.isin(held, entries)
             own: list[int] = stays.nonzero()[0].tolist()
             if own:
                 kept.append((held[stays], arguments and [arguments[k] for k in own]))
-            withdrawn += held[~stays].tolist()
+            dropped += held[~stays].tolist()
         self.held = kept
-        return withdrawn
+        return dropped
 
     def give_time(self, now: float) -> None:
         """Count the time of its start from now on."""

@@ -34,23 +34,21 @@ class Event(Enum):
     SENT = auto()
     SENT_FOR_CALL = auto()
     DROPPED = auto()
-    """Nobody wants what it has led to."""
+    """Nobody wants what it has led to; or it was held for a client, and never sent."""
     RESULT = auto()
     VALUE = auto()
     FAULT = auto()
-    TAKEN_BACK = auto()
-    """It was held for a client, and its caller wants no reply."""
     ABORTED = auto()
     """Its caller wants no reply."""
     ASKED_AGAIN = auto()
     FREED = auto()
     """The error that it ended in is raised, or its caller doesn't wait for that."""
     HANDED_OUT = auto()
-    SETTLED = auto()
+    CLOSED = auto()
     """Its call has all replies that it waited for."""
-    GIVEN_UP = auto()
+    LEFT = auto()
     """Its call no longer waits."""
-    METHOD_GIVEN_UP = auto()
+    METHOD_LEFT = auto()
     """The same for a method call, whose value no other call can use."""
 
 
@@ -63,8 +61,8 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_SPENT, _C),
-    (_BUSY, _C, Event.TAKEN_BACK): (_IDLE, _C),
-    (_BUSY, _T, Event.TAKEN_BACK): (_IDLE, _C),
+    (_BUSY, _C, Event.DROPPED): (_IDLE, _C),
+    (_BUSY, _T, Event.DROPPED): (_IDLE, _C),
     (_BUSY, _C, Event.ABORTED): (_BUSY, _N),
     (_BUSY, _C, Event.ASKED_AGAIN): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
@@ -75,13 +73,13 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _T, Event.FAULT): (_SPENT, _T),
     (_BUSY, _T, Event.ABORTED): (_BUSY, _N),
     (_BUSY, _T, Event.ASKED_AGAIN): (_BUSY, _T),
-    (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
-    (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
-    (_READY, _T, Event.GIVEN_UP): (_READY, _C),
-    (_SPENT, _T, Event.GIVEN_UP): (_SPENT, _C),
-    (_SPENT, _T, Event.METHOD_GIVEN_UP): (_IDLE, _C),
-    (_READY, _T, Event.SETTLED): (_READY, _C),
-    (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
+    (_BUSY, _T, Event.LEFT): (_BUSY, _C),
+    (_BUSY, _T, Event.METHOD_LEFT): (_BUSY, _N),
+    (_READY, _T, Event.LEFT): (_READY, _C),
+    (_SPENT, _T, Event.LEFT): (_SPENT, _C),
+    (_SPENT, _T, Event.METHOD_LEFT): (_IDLE, _C),
+    (_READY, _T, Event.CLOSED): (_READY, _C),
+    (_SPENT, _T, Event.CLOSED): (_IDLE, _C),
     (_BUSY, _N, Event.DROPPED): (_IDLE, _C),
 }
 """State and owner after each possible event. A combination that is missing can't happen."""

@@ -46,7 +46,7 @@ class Ticket(msgspec.Struct):
     """A call that waits for its own requests, independently of `collect`.
 
     Attributes:
-        slots: whose requests; of a ticket that is `apart`, only once it is given up.
+        slots: whose requests; of a ticket that is `apart`, only once its call has left.
         remaining: number of its requests that have not ended.
         apart: each of its requests is somebody else's, and has an error of its own. It stays open
             while requests come and go.
@@ -113,12 +113,6 @@ class Tickets:
         ticket.remaining -= count
         return ticket
 
-    def forget(self, owner: int, slots: NDArray[np.intp]) -> None:
-        """Take requests that are over without an outcome out of the ticket of a call."""
-        ticket = self.waiting[owner]
-        ticket.remaining -= len(slots)
-        ticket.slots = ticket.slots[~np.isin(ticket.slots, slots)]
-
 
 class CollectorQueue:
     """The results and errors that wait for the collector, in the order of their arrival.
@@ -166,11 +160,6 @@ class CollectorQueue:
         found = taken[0].copy() if len(taken) == 1 else np.concatenate(taken)
         found.sort()
         return found
-
-    def remove(self, slots: NDArray[np.intp]) -> None:
-        """Remove results that the collector does not get."""
-        self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
-        self.num_ready -= len(slots)
 
     def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
         """Keep an error; the envs of `slots` are busy until it is raised."""
@@ -398,13 +387,32 @@ class Requests:
             return None
         return slot
 
-    def drop_unwanted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        """End those of `slots` that belong to nobody, none of them in flight; return the others."""
-        is_dropped = self.owner[slots] == NOBODY
-        dropped = slots[is_dropped]
-        self.unwanted.difference_update(dropped.tolist())
-        self._forget(dropped)
+    def drop(self, slots: NDArray[np.intp]) -> None:
+        """End requests of `slots` without an outcome; none is in flight, and nobody waits for it.
+
+        Results that the collector has not taken are dropped, too.
+        """
+        is_ready = self.state[slots] == _READY_CODE
+        collector, owners = self.collector, self.owner[slots]
+        if np.count_nonzero(is_ready):
+            gone = slots[is_ready]
+            collector.ready = deque(
+                kept for q in collector.ready if len(kept := q[~np.isin(q, gone)])
+            )
+            collector.num_ready -= len(gone)
+        collector.num_awaited -= int(np.count_nonzero((owners == COLLECTOR) & ~is_ready))
+        for owner in {*owners[owners > 0].tolist()}:
+            mine = slots[owners == owner]
+            ticket = self.tickets.note_ended(owner, len(mine))
+            ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
+        self.unwanted.difference_update(slots[owners == NOBODY].tolist())
+        self._free(slots)
         self.anything_ended = True
+
+    def drop_unwanted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Drop those of `slots` that belong to nobody, none in flight; return the others."""
+        is_dropped = self.owner[slots] == NOBODY
+        self.drop(slots[is_dropped])
         return slots[~is_dropped]
 
     def abort(self, slots: NDArray[np.intp], faults: Sequence[EnvFault]) -> None:
@@ -483,13 +491,7 @@ class Requests:
             self.collector.num_awaited -= len(slots)
             self.collector.keep(slots, fault)
 
-    def take_back(self, slots: NDArray[np.intp]) -> None:
-        """End requests of a call that no longer waits, or of the collector: none was sent."""
-        self.collector.num_awaited -= int(np.count_nonzero(self.owner[slots] == COLLECTOR))
-        self._forget(slots)
-        self.anything_ended = True
-
-    def _forget(self, slots: NDArray[np.intp]) -> None:
+    def _free(self, slots: NDArray[np.intp]) -> None:
         self.state[slots] = _IDLE_CODE
         self.owner[slots] = COLLECTOR
 
@@ -499,21 +501,16 @@ class Requests:
         """Record that results were returned: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
 
-    def drop(self, slots: NDArray[np.intp]) -> None:
-        """Drop results of the collector."""
-        self.collector.remove(slots)
-        self.state[slots] = _IDLE_CODE
-
     # -- calls that wait for their own replies ------------------------------------
 
-    def settle(self, ticket: Ticket) -> None:
+    def close(self, ticket: Ticket) -> None:
         """Close a ticket that has all replies: results may be returned, the rest is idle."""
         del self.tickets.waiting[ticket.owner]
         self.owner[ticket.slots] = COLLECTOR
         if ticket.values or ticket.errors:
-            self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
+            self._free(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
 
-    def settle_ended(self, ticket: Ticket) -> NDArray[np.intp]:
+    def take_ended(self, ticket: Ticket) -> NDArray[np.intp]:
         """Take what has ended out of a ticket that stays open; return the slots of the results."""
         if not ticket.ended:
             return self._each[:0]
@@ -521,7 +518,7 @@ class Requests:
         ticket.ended.clear()
         self.owner[ended] = COLLECTOR
         states = self.state[ended]
-        self._forget(ended[states == _SPENT_CODE])
+        self._free(ended[states == _SPENT_CODE])
         return ended[states == _READY_CODE]
 
     def split(self, ticket: Ticket, slot: int) -> Ticket:
@@ -536,14 +533,14 @@ class Requests:
                 its[slot] = found.pop(slot)
         return own
 
-    def give_up(self, ticket: Ticket) -> None:
+    def leave(self, ticket: Ticket) -> None:
         """Close a ticket that no longer waits: its steps and resets go to the collector.
 
         Values of methods are for nobody else.
         """
         slots = ticket.slots = ticket.own_slots(self.owner)
         calls = ANSWERS_WITH_VALUE[self.numbering.ops(slots)]
-        self.settle(ticket)
+        self.close(ticket)
         called = self.owed(slots[calls])
         self.owner[called] = NOBODY
         self.unwanted.update(called.tolist())

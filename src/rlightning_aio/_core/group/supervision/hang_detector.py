@@ -67,7 +67,7 @@ class HangDetector:
             record, is_own = self._records[host_id], hosts == host_id
             own = entries[is_own]
             if record.is_down:
-                no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
+                no_longer_held += [(host_id, entry) for entry in record.drop_held(own)]
                 continue
             record.host.abort(own)
             if record.killable is not None:

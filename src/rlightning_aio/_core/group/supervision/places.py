@@ -169,22 +169,19 @@ class Places:
             self.num_held -= sum(len(entries) for entries, _ in record.held)
             record.held = []
             if record.place is not None:
-                record.place.forget()
+                record.place.drop_reset()
         slots = np.array([record.slots.start for record in records], np.intp)
         for slot in slots.tolist():
             self._tables.episodes.ended_without_result(slot)
         return slots
 
-    def withdraw(self, slots: NDArray[np.intp]) -> None:
+    def drop_unwanted(self, slots: NDArray[np.intp]) -> None:
         """End those of the held requests of `slots` that belong to nobody."""
         records = [record for record in self._records_of(slots) if record.held]
         if records:
             self._requests.drop_unwanted(self.drop(records))
 
-    def take_back(self, owner: int) -> None:
-        """End the held requests of an owner that no longer waits for them."""
+    def drop_of(self, owner: int) -> None:
+        """Drop the held requests of an owner that no longer waits for them."""
         if records := self.held().get(owner):
-            slots = self.drop(records)
-            if owner > 0:
-                self._requests.tickets.forget(owner, slots)
-            self._requests.take_back(slots)
+            self._requests.drop(self.drop(records))

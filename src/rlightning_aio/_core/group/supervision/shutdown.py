@@ -1,4 +1,4 @@
-"""`Shutdown`: the end of a group's hosts: closed in order, disowned after a fork, or abandoned.
+"""`Shutdown`: the end of a group's hosts: closed in order, or released; disowned after a fork.
 
 Rule: it waits only by yielding a `Wait`. Left out: single deaths, which `Supervisor` handles.
 """
@@ -49,7 +49,7 @@ class Shutdown:
             yield from self._until_closed(alive, now)
         finally:
             stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._tables.records)
-            self._let_go(times.GRACE if stuck else times.CLOSE)
+            self._release(times.GRACE if stuck else times.CLOSE)
         if interrupt is not None:
             raise interrupt
 
@@ -74,7 +74,7 @@ class Shutdown:
                 return
             now = yield Wait(until)
 
-    def _let_go(self, seconds: float) -> None:
+    def _release(self, seconds: float) -> None:
         for record in self._tables.records:
             record.host.release()
         for shared in self._tables.resources.values():
@@ -91,14 +91,14 @@ class Shutdown:
         for shared in self._tables.resources.values():
             shared.disown()
 
-    def abandon(self) -> None:
+    def release(self) -> None:
         """Release everything immediately: the group was garbage-collected without a close."""
         if self._tables.lifetime.closed:
             return
         self._tables.lifetime.end()
         started = any(r.stage is not Stage.NEW for r in self._tables.records)
         seconds = max((record.close_seconds for record in self._tables.records), default=0.0)
-        self._let_go(seconds + times.GRACE)
+        self._release(seconds + times.GRACE)
         if started:
             # The garbage collector calls this, so no caller's line would help.
             warnings.warn(

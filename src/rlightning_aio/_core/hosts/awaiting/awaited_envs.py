@@ -299,7 +299,7 @@ class AwaitedEnvs:
     ) -> None:
         record = self._records[env.index]
         if isinstance(error, EnvAway) and op_of(entry) == Operation.STEP:
-            self._put_away(record, env)
+            self._end_env(record, env)
             why = Loss(str(error), "env_away", "infrastructure", record.name)
             self._report_loss(record, why, f"env {record.name!r} {error}")
             return
@@ -323,7 +323,7 @@ class AwaitedEnvs:
         raised = completion.error if isinstance(completion, Raised) and self._renews else None
         is_ended = raised is not None and raised.ends_env(op_of(record.entry))
         if by is not None and record.env is by and (is_ended or by.runner.is_spent):
-            self._put_away(record, by)
+            self._end_env(record, by)
         if self._ending:
             return
         entry = record.answered = self._take_request(record)
@@ -359,7 +359,7 @@ class AwaitedEnvs:
             if record.rebuilding is not None:
                 record.rebuilding.cancel()
             if record.env is not None:
-                self._put_away(record, record.env)
+                self._end_env(record, record.env)
             self._finish(record, aborted)
             return
         queued = [one for one in self._queue if one[1] != entry]
@@ -403,7 +403,7 @@ class AwaitedEnvs:
         )
         if waits_in := awaited_calls(env.answering):
             message += f" while it waited in {waits_in}"
-        self._put_away(record, env)
+        self._end_env(record, env)
         why = hung(f"hung in a {doing} and was cancelled", op, record.name)
         self._report_loss(record, why, message)
 
@@ -445,7 +445,7 @@ class AwaitedEnvs:
         # No task of ours waits for that: perhaps the event loop ends.
         env.task.add_done_callback(closed)
 
-    def _put_away(self, record: _EnvRecord, env: AwaitedEnv) -> None:
+    def _end_env(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Cancel what an env is doing, and close it. What it still does goes nowhere."""
         if self._order.is_hardware:
             begin_stops([env.runner.env])

@@ -221,7 +221,7 @@ class EnvServerHost(Host):
     def admit(self) -> None:
         self._num_admitted += 1
 
-    def forget(self) -> None:
+    def drop_reset(self) -> None:
         self._lost_reset = (None, None)
 
     def check_step(self, action: Any, extras: dict[str, Any]) -> None:
@@ -259,7 +259,7 @@ class EnvServerHost(Host):
     def stop(self, index: int, number: int) -> None:
         """Send the client away, which stops its env, whatever that does now."""
         del index, number
-        self.server.sessions.dismiss(self._place, "an action was refused, or a call ended early")
+        self.server.sessions.drop(self._place, "an action was refused, or a call ended early")
         self.server.flush()
 
     # -- events of the place -------------------------------------------------------------
@@ -334,7 +334,7 @@ class EnvServerHost(Host):
     def kill(self, *, dump: bool) -> None:
         """Send the client away; its env has stopped, or will when it hears of that."""
         del dump
-        self.server.sessions.dismiss(self._place, "the trainer no longer waits for its answer")
+        self.server.sessions.drop(self._place, "the trainer no longer waits for its answer")
         self.server.flush()
 
     def destroy(self) -> None:

@@ -359,13 +359,13 @@ class ProcessHost(Host):
             self._wiring.completions.append(Closed(self.host_id, []))
 
     def release(self) -> None:
-        self._hang_up()
+        self._close_link()
         self._rings = None
 
-    def _hang_up(self) -> None:
+    def _close_link(self) -> None:
         self._alive = False
         if self._link is not None:
-            self._link.hang_up()
+            self._link.close()
             self._link = None
 
     def on_exit(self, exit_code: int, stderr_tail: str) -> None:
@@ -391,7 +391,7 @@ class ProcessHost(Host):
             return
         link.poll()
         requests = link.last_requests()
-        self._hang_up()
+        self._close_link()
         self.pid = None
         if not self._closing:
             post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests, refused)))

@@ -61,12 +61,12 @@ class Link:
         assert self._socket is not None
         return self._socket.fileno()
 
-    def hang_up(self) -> None:
+    def close(self) -> None:
         """Take the ring away, and close the channel; unread data is lost. To be called once."""
         self._all_rings[self._host_id] = None
-        self._close()
+        self._close_channel()
 
-    def _close(self) -> None:
+    def _close_channel(self) -> None:
         if self._socket is not None:
             self._driver.unwatch(self)
             self._socket.close()
@@ -155,7 +155,7 @@ class Link:
             if not data:
                 # The fork server keeps the other end open until it has handled the exit, and it
                 # reports the cause. Until that is read, the ring takes further requests.
-                self._close()
+                self._close_channel()
                 return
             self.traffic += len(data)
             if data == BELL and self._frames.is_empty:
