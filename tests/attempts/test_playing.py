@@ -308,6 +308,21 @@ async def test_tasks_are_read_as_envs_become_free() -> None:
     assert len(asyncio.all_tasks()) == 1
 
 
+@pytest.mark.parametrize("place", [place for place in PLACES if place != "ray"])
+async def test_an_iterator_that_is_left_open_logs_no_error(
+    place: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its group closes before it does, while agents play."""
+    for _ in range(3):
+        async with rooms(PLACES[place], num_workers=6) as group:
+            async for _ in play(group, tasks(40), earner, size=2):
+                break
+    while left := asyncio.all_tasks() - {asyncio.current_task()}:
+        await asyncio.wait(left)
+    gc.collect()
+    assert not [text for text in caplog.messages if "raised" in text or "retrieved" in text]
+
+
 async def test_an_iterator_that_is_left_does_not_wait_for_an_env_that_closes() -> None:
     """It has raised, and another takes its place; the group waits for that, when it asks next."""
     closing, closed = asyncio.Event(), asyncio.Event()

@@ -15,7 +15,7 @@ import numpy as np
 from rlightning_aio.attempts.connections import is_connections
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import all_agents
-from rlightning_aio.errors import EnvFault
+from rlightning_aio.errors import EnvFault, GroupClosed
 from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
 from rlightning_aio.trees import copied
 
@@ -234,6 +234,8 @@ class Try:
             self.error = playing.exception()
         if self._view.fault is not None:
             return self._view.fault
+        if isinstance(self.error, GroupClosed):
+            raise self.error  # It is not the agent's, and ends all attempts.
         if self.error is not None:
             return self._raised(self.error)
         if self._view.is_over:

@@ -138,10 +138,10 @@ class EnvEpisode:
         if any(step.is_outstanding for step in self._open_steps):
             abort: Any = self._group.abort([self.env.env_id])
             aborting = asyncio.ensure_future(abort)
+            # Read, so that asyncio doesn't log its error.
+            aborting.add_done_callback(lambda task: task.cancelled() or task.exception())
             # However often this is cancelled, it continues, and the env is idle in the end.
             await asyncio.wait([aborting])
-            # Read, so that asyncio doesn't log its error.
-            _ = aborting.cancelled() or aborting.exception()
 
     async def _asked(self, what: PolicyResponse | EpisodeStart | MethodCall) -> Any:
         step, reply = self._agents.ask(self.env.env_id, what)
