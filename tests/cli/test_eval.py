@@ -178,8 +178,8 @@ def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
     done = run("eval", config, "envs.0.num_workers=2", *asked)
     assert done.returncode == 0, done.stderr
     assert "playing 12 episodes, 6 of them played before" in done.stderr
-    table = {line.split()[0]: line.split()[1:3] for line in done.stdout.splitlines()[3:]}
-    assert table == {**{task: ["4", "50.0%"] for task in "abc"}, "all": ["12", "50.0%"]}
+    table = {line.split()[0]: line.split()[1:3] for line in done.stdout.splitlines()[2:]}
+    assert table == {**{task: ["4", "0.50"] for task in "abc"}, "all": ["12", "0.50"]}
     document = invoke_json("eval", config, *asked)
     assert [(one["name"], one["episodes"]) for one in document["parts"]] == [
         (task, 4) for task in "abc"
@@ -198,7 +198,7 @@ def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
     assert "by the kind of their outcome: 4 not_started" in done.stdout
     assert "failed: task 'raises', seed 1, on env 'many-0': not_started: " in done.stdout
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("a ")]
-    assert line.split()[1:3] == ["2", "50.0%"]
+    assert line.split()[1:3] == ["2", "0.50"]
 
 
 def test_a_film_that_cannot_be_kept_ends_it_with_one_message(tmp_path: Path) -> None:

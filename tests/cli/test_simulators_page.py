@@ -51,7 +51,7 @@ def test_metaworld_ends_in_a_table_of_success(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     table = {words[0]: words[1:3] for words in map(str.split, done.stdout.splitlines()) if words}
     for task in ("reach-v3", "push-v3", "door-open-v3"):
-        assert table[task] == ["2", "100.0%"]
+        assert table[task] == ["2", "1.00"]
     assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 1 + 6
 
 

@@ -31,29 +31,24 @@ from rlightning_aio.cli.terminal import (
     connections_logged,
     count,
     counted,
-    named_columns,
     number,
     print_json,
     print_lines,
-    print_table,
     run_interruptible,
 )
 from rlightning_aio.config import MADE_BY_GYMNASIUM, load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, evaluate
-from rlightning_aio.evaluation.evaluation import parts_of
+from rlightning_aio.evaluation.evaluation import parts_of, table_of
 from rlightning_aio.json_text import finite
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rich.table import Table
-
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.attempts import Attempt
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.evaluation import Estimate
 
 _RANDOM: Final = "random"
 _NAMED: Final = 5
@@ -321,37 +316,10 @@ def _report(order: _Order, plot: Path | None, ended: _End | None, *, as_json: bo
         if ended is not None:
             known = counted(len(found.attempts), "episode")
             title = f"{ended} after {known}, so short ones are favoured: {title} were to be played"
-        print_table(_table(title, order.by, parts, found))
-        print_lines(notes)
+        print_lines([title, table_of(found, order.by), *notes])
     if plot is not None and found.played:
         figures = [(name, own, own.returns) for name, own in parts.items() if own.played]
         draw_evaluation(order.facts["config"], figures, plot)
-
-
-def _table(title: str, by: _By, parts: dict[str, Evaluation], found: Evaluation) -> Table:
-    table = named_columns(
-        title, by, "episodes", "success\nrate", "\n95 %  ", "mean\nreturn", "\n95 %",
-        "mean\nlength", "\n95 % ", "failed",
-    )  # fmt: skip
-    for name, own in [*parts.items()] if len(parts) < 2 else [*parts.items(), ("all", found)]:
-        table.add_row(
-            name or "-",
-            count(len(own.attempts)),
-            *_with_interval(own.success, lambda share: f"{share:.1%}"),
-            *_with_interval(own.total_reward, number),
-            *_with_interval(own.length, number),
-            count(len(own.failed)),
-        )
-    return table
-
-
-def _with_interval(one: Estimate | None, words: Callable[[float], str]) -> tuple[str, str]:
-    """Return the texts of an estimate and of its interval."""
-    if one is None:
-        return "-", "-"
-    if one.low is None or one.high is None:
-        return words(one.mean), "-"
-    return words(one.mean), f"{words(one.low)} to {words(one.high)}"
 
 
 def _figures(found: Evaluation) -> dict[str, Any]:

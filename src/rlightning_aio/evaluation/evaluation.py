@@ -108,16 +108,21 @@ class Evaluation:
 
     def __str__(self) -> str:
         """A table with a line for each task, and the `remarks`."""
-        by_task = self.by_task()
-        parts = [*by_task.items()] if len(by_task) == 1 else [*by_task.items(), ("all", self)]
-        head = ("task", "episodes", "success", "return", "length", "failed")
-        rows = [head, *(_row(task, part) for task, part in parts)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = (
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-            for row in rows
-        )
-        return "\n".join([*(line.rstrip() for line in lines), *self.remarks])
+        return "\n".join([table_of(self, "task"), *self.remarks])
+
+
+def table_of(found: Evaluation, name: Literal["entry", "task"]) -> str:
+    """Return a table with a line for each part by a field of the episodes' specs, and for all."""
+    parts = [*parts_of(found, name).items()]
+    parts += [("all", found)] if len(parts) != 1 else []
+    head = (name, "episodes", "success", "return", "length", "failed")
+    rows = [head, *(_row(own_name, part) for own_name, part in parts)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = (
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        for row in rows
+    )
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def parts_of(found: Evaluation, name: Literal["entry", "task"]) -> dict[str, Evaluation]:
