@@ -30,7 +30,7 @@ from rlightning_aio._core.hosts.process.host import ending
 from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
 from rlightning_aio.cli.measurement import in_turns, machine_facts
 from rlightning_aio.cli.measuring import Contender, Rule, opened_group
-from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, Seed, check_seed
+from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, Seed
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.settings import Setting, possible_settings, swept_settings
 from rlightning_aio.cli.terminal import (
@@ -115,7 +115,6 @@ def bench(
         rlightning-aio bench configs/hopper.yaml --plot hopper.png --json > hopper.json
         rlightning-aio bench configs/hopper.yaml --sweep num_workers=8,16 --sweep min_results=1,4
     """
-    check_seed(seed)
     check_plot(plot)
     order = _Order(
         config, overrides or (), sweep or (), rounds, seconds, seed, plot, as_json=as_json

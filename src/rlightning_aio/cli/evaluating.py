@@ -22,7 +22,6 @@ from rlightning_aio.cli.options import (
     PlotFile,
     PolicyName,
     Seed,
-    check_seed,
 )
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import Responder, load_policy, servers_announced
@@ -31,7 +30,6 @@ from rlightning_aio.cli.terminal import (
     connections_logged,
     count,
     counted,
-    number,
     print_json,
     print_lines,
     run_interruptible,
@@ -154,7 +152,6 @@ def evaluation(
         rlightning-aio eval configs/hopper.yaml --policy my_policies:greedy --seeds 0:50
         rlightning-aio eval configs/halfcheetah.yaml --policy my_policies:model --video films
     """
-    check_seed(seed)
     check_plot(plot)
     configs = load_config(config, overrides or ())
     named = policy or _RANDOM
@@ -284,7 +281,7 @@ def _with_progress(
         found = order.found
         parts = [counted(len(found.attempts), "episode")]
         parts += [] if found.success is None else [f"success {found.success.mean:.0%}"]
-        parts += [] if found.total_reward is None else [f"return {number(found.total_reward.mean)}"]
+        parts += [] if found.total_reward is None else [f"return {found.total_reward.mean:,.2f}"]
         return ", ".join([*parts, *([f"{count(len(found.failed))} failed"] * bool(found.failed))])
 
     async def answer(batch: BatchedData) -> list[BatchedData]:

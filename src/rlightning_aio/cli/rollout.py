@@ -18,7 +18,7 @@ import typer
 
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
-from rlightning_aio.cli.options import AsJson, Config, Overrides, PolicyName, Seed, check_seed
+from rlightning_aio.cli.options import AsJson, Config, Overrides, PolicyName, Seed
 from rlightning_aio.cli.policies import (
     Responder,
     load_policy,
@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.api.aio import EnvGroup
     from rlightning_aio.config import EnvConfig
 
-_LONG: Final = 1e15
-"""Smallest whole number that is written with a power of ten."""
 _BIAS: Final = (
     "Mean return and length are those of the episodes that ended first, which favours short ones; "
     "to measure a policy, use rlightning-aio eval."
@@ -115,7 +113,6 @@ def rollout(
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
     """
-    check_seed(seed)
     configs = load_config(config, overrides or ())
     done = _Rollout(configs, steps, min_results, seed)
     chosen = load_policy(policy) if policy else None
@@ -213,4 +210,4 @@ def _print_numbers(numbers: Mapping[str, float], entries: Sequence[str]) -> None
 def _text(value: float | None) -> str:
     if value is None or not math.isfinite(value):
         return "-"
-    return count(value) if float(value).is_integer() and abs(value) < _LONG else f"{value:,.6g}"
+    return count(value) if float(value).is_integer() else f"{value:,.6g}"

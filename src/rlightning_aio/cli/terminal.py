@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import functools
 import logging
-import math
 import re
 import signal
 import sys
@@ -34,8 +33,6 @@ INTERRUPTED: Final = 130
 """Exit code after Ctrl-C, as in shells."""
 _WIDE: Final = 160
 """Width of a table in a file, whose readers wrap lines themselves."""
-_LONG: Final = 1e12
-"""Smallest number that is written with a power of ten."""
 _REFRESH_SECONDS: Final = 0.25
 
 _results: list[TextIO] = []
@@ -242,13 +239,6 @@ def counted(how_many: int, what: str) -> str:
     """Return a text such as "1 env", "16 envs" or "0 worker processes"."""
     plural = "es" if what.endswith("s") else "s"
     return f"{count(how_many)} {what}{'' if how_many == 1 else plural}"
-
-
-def number(value: float | None) -> str:
-    """Return the text of any other figure, or a dash if it is missing or not finite."""
-    if value is None or not math.isfinite(value):
-        return "-"
-    return f"{value:,.2f}" if abs(value) < _LONG else f"{value:.4g}"
 
 
 def duration(microseconds: float | None) -> str:
