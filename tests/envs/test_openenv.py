@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from cli.command import invoke, start, write_config
 from envs.misbehaving_openenv import ERRORS, Misbehaving, numbers
+from gymnasium import spaces
 from patience import HANG
 
 import rlightning_aio as rl
@@ -262,6 +263,8 @@ def test_a_server_that_is_not_there_is_named_by_check(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
+        ({"columns": {"a": {"shap": [3]}}}, "columns.a"),
+        ({"columns": {"a": 5}, "observation_field": "b"}, "exclude each other"),
         ({"url": "x"}, "Known fields: urls"),
     ],
     ids=str,
@@ -269,6 +272,15 @@ def test_a_server_that_is_not_there_is_named_by_check(tmp_path: Path) -> None:
 async def test_wrong_options_are_named(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises((StartFailed, ValueError), match=message):
         await rl.build_env_group(entry("http://127.0.0.1:1", env_kwargs=kwargs)).init()
+
+
+async def test_fields_become_columns_of_their_spaces() -> None:
+    config = entry("http://127.0.0.1:1", env_kwargs={"columns": {"a": 5, "b": {"shape": [2, 2]}}})
+    async with rl.build_env_group(config) as group:
+        space = group.get_observation_spaces()[0]
+    assert isinstance(space, spaces.Dict)
+    assert space["a"] == spaces.Discrete(5)
+    assert space["b"] == spaces.Box(-np.inf, np.inf, (2, 2), np.float32)
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def served(kind: str, sessions: int) -> Generator[tuple[str, subprocess.Popen[by
         process.wait()
 
 
-CUT = {"truncated_field": "late"}
+CUT = {"truncated_field": "late", "columns": {"total": 1000}}
 
 
 @pytest.mark.parametrize("kind", ["dice", "echo", "tools"])
@@ -108,7 +108,8 @@ def rows_of(batch: Any) -> list[list[Any]]:
     rows: list[list[Any]] = []
     for ret in batch.values():
         observation, metadata = ret.observation, dict(ret.info)
-        if "roll" in observation:  # Of the dice.
+        if "rest" in observation:
+            observation = {"total": observation["total"].item(), **observation["rest"]}
             assert ret.last_truncated == metadata.get("late", False)
         done = ret.last_terminated or ret.last_truncated
         assert done == ("episode" in metadata)

@@ -12,13 +12,15 @@ import math
 import time
 import uuid
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+import numpy as np
+from gymnasium import spaces
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from rlightning_aio import Anything, BaseEnv, EnvAway, EnvRet
 from rlightning_aio.envs.options import read_options
-from rlightning_aio.errors import BadAction
+from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.plugins.openenv.session import (
     OpenEnvSession,
     ServerGone,
@@ -35,10 +37,13 @@ if TYPE_CHECKING:
 class OpenEnvOptions(BaseModel):
     """``env_kwargs`` of the backend."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
     urls: tuple[str, ...] = ()
     """Further servers of the same environment; sessions are spread over all of them."""
+    columns: dict[str, Any] = Field(default_factory=dict)
+    """Fields of the observation that become columns: a Gymnasium space, a number n for
+    ``Discrete(n)``, or ``{shape: […], dtype: …, low: …, high: …}`` for a ``Box``."""
     observation_field: str | None = None
     """The only field of the observation that counts: its value is the observation."""
     action_field: str | None = None
@@ -62,12 +67,19 @@ class OpenEnvOptions(BaseModel):
                 raise ValueError(f"the value of {name} has characters that are none of a header")
         return headers
 
+    @model_validator(mode="after")
+    def _check_fields(self) -> Self:
+        if self.columns and self.observation_field is not None:
+            raise ValueError("columns and observation_field exclude each other")
+        return self
+
 
 class OpenEnv(BaseEnv):
     """One session; see the module and docs/openenv.md.
 
-    An observation is a dict of the fields that the server sends, an action a dict of the action's
-    fields. With ``observation_field`` or ``action_field`` it is the value of that field.
+    An observation is a dict of the fields that the server sends. With ``columns`` it is a dict of
+    these, and of all other fields as ``rest``. An action is a dict of the action's fields. With
+    ``observation_field`` or ``action_field`` it is the value of that field.
     """
 
     def __init__(
@@ -80,6 +92,9 @@ class OpenEnv(BaseEnv):
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
         options = read_options(OpenEnvOptions, self.env_id, config.env_kwargs)
         self._options = options
+        self._columns = {
+            name: _space_of(self.env_id, name, given) for name, given in options.columns.items()
+        }
         self._urls = (config.task_name, *options.urls)
         self._url = worker_index % len(self._urls)
         self._session = self._new_session()
@@ -89,8 +104,10 @@ class OpenEnv(BaseEnv):
         return OpenEnvSession(self._urls[self._url], self._options.headers)
 
     def get_observation_space(self) -> gym.Space[Any]:
-        """Dicts of an observation's fields, or values of its only one."""
-        return Anything()
+        """A value for each row, or columns with the ``rest``."""
+        if not self._columns:
+            return Anything()
+        return spaces.Dict({**self._columns, "rest": Anything()})
 
     def get_action_space(self) -> gym.Space[Any]:
         """Dicts of an action's fields, or values of its only one."""
@@ -178,6 +195,11 @@ class OpenEnv(BaseEnv):
         fields: dict[str, Any] = dict(data.get("observation") or {})
         inner = fields.pop("metadata", None)
         info: dict[str, Any] = dict(data.get("metadata") or inner or {})
+        if self._columns:
+            columns = {
+                name: _value_in(space, fields.pop(name)) for name, space in self._columns.items()
+            }
+            return {**columns, "rest": fields}, info
         field = self._options.observation_field
         return (fields if field is None else fields[field]), info
 
@@ -206,6 +228,33 @@ class OpenEnv(BaseEnv):
     async def close(self) -> None:
         """Close the session, and give its slot at the server back."""
         await self._session.close()
+
+
+def _space_of(env_id: str, name: str, given: Any) -> gym.Space[Any]:
+    if isinstance(given, spaces.Space):
+        return cast("gym.Space[Any]", given)
+    try:
+        if isinstance(given, int):
+            return spaces.Discrete(given)
+        box: dict[str, Any] = {"low": -np.inf, "high": np.inf, "dtype": "float32", **given}
+        dtype: Any = np.dtype(box.pop("dtype"))
+        if dtype.kind in "iu":  # An integer has no infinity.
+            limits = np.iinfo(dtype)
+            box["low"] = max(box["low"], limits.min)
+            box["high"] = min(box["high"], limits.max)
+        return spaces.Box(dtype=dtype.type, **box)
+    except (TypeError, ValueError, AssertionError) as error:
+        raise ConfigError(
+            f"{env_id}: env_kwargs: columns.{name}: {given!r} makes no space ({error}); give a "
+            "number for Discrete, or shape, dtype, low and high for a Box"
+        ) from None
+
+
+def _value_in(space: gym.Space[Any], value: Any) -> Any:
+    """A field as an array of its column's shape and dtype; pixels may come flattened."""
+    if space.shape is None or isinstance(space, Anything):
+        return value
+    return np.asarray(value, space.dtype).reshape(space.shape)
 
 
 def _plain(value: Any) -> Any:
