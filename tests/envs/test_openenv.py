@@ -23,6 +23,7 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import StartFailed
+from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerGone
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -105,6 +106,28 @@ async def test_a_reply_that_nobody_waits_for_answers_no_other_request() -> None:
         batch, _ = await group.step(steps)
         assert batch.observation[0]["answers"] == steps.values()[0].action["number"]
         assert set(server.executed.values()) == {1}
+
+
+@pytest.mark.parametrize("fate", ["never", "no JSON", "another type"])
+def test_a_session_is_over_once_nobody_waits_for_a_reply(fate: str) -> None:
+    """Whatever its env does: the next frame would be taken for the reply to another request."""
+    asyncio.run(_stop_waiting(fate))
+
+
+async def _stop_waiting(fate: str) -> None:
+    async with Misbehaving(capacity=1) as server:
+        session = OpenEnvSession(server.url)
+        await session.open({"type": "reset", "data": {"episode_id": None}})
+        server.fates.append(fate)
+        step = {"type": "step", "data": {"number": next(numbers)}}
+        asking = asyncio.create_task(session.ask(step))
+        if fate == "never":
+            await server.asked.wait()
+            asking.cancel()
+        await asyncio.wait({asking})
+        assert asking.cancelled() or isinstance(asking.exception(), ServerGone)
+        with pytest.raises(ServerGone, match="no session is open"):
+            await session.ask(step)
 
 
 @pytest.mark.parametrize("code", ERRORS)
