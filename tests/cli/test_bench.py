@@ -328,11 +328,12 @@ def test_without_any_measurement_the_exit_code_is_1(tmp_path: Path) -> None:
     ("entry", "words"),
     [
         ({"name": "robots", "backend": "env_server"}, "'robots'"),
+        ({"name": "arm", "backend": "piper", "task": "any"}, "envs move something real"),
         ({**STUB, "num_worker": 2}, "did you mean 'num_workers'"),
     ],
 )
 def test_a_wrong_config_is_code_2(tmp_path: Path, entry: dict[str, Any], words: str) -> None:
-    """Clients of an env_server choose where their envs live."""
+    """Clients of an env_server choose where their envs live; a plain loop can't stop hardware."""
     done = run("bench", write_config(tmp_path, entry))
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()

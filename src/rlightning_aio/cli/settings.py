@@ -100,7 +100,7 @@ def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
     Raises:
         ConfigError: an entry's placement can't be chosen.
     """
-    _check_here(configs)
+    _check_choosable(configs)
     settings: dict[tuple[object, ...], Setting] = {}
     for setting in _candidates(configs, num_cores()):
         sizes = tuple(config.num_workers for config in setting.configs)
@@ -119,7 +119,7 @@ def swept_settings(
         sweeps: the values of each field. Without ``envs.0.`` it is that of all entries.
 
     Raises:
-        ConfigError: a combination is no config, or an entry's envs live elsewhere.
+        ConfigError: a combination is no config, or an entry's placement can't be chosen.
     """
     num_entries = len(load_config(path, overrides))
     settings: list[Setting] = []
@@ -136,18 +136,23 @@ def swept_settings(
                 ),
             ],
         )
-        _check_here(configs)
+        _check_choosable(configs)
         words = ", ".join(f"{name}={value}" for name, value in chosen.items())
         settings.append(Setting(tuple(configs), words or "as configured"))
     return settings
 
 
-def _check_here(configs: Sequence[EnvConfig]) -> None:
+def _check_choosable(configs: Sequence[EnvConfig]) -> None:
     for config in configs:
         if config.backend == "env_server" or config.placement == "ray":
             raise ConfigError(
                 f"entry {config.name!r}: its envs live elsewhere, so there is nothing to choose; "
                 "use rollout to measure it"
+            )
+        if config.is_hardware:
+            raise ConfigError(
+                f"entry {config.name!r}: its envs move something real, and not all that bench "
+                "compares would stop them; use rollout to measure it"
             )
 
 
