@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from kit.counting import ClientThread
 from patience import HANG
 
 from rlightning_aio import (
@@ -29,6 +31,7 @@ from rlightning_aio import (
     build_env_group,
     sync,
 )
+from rlightning_aio.attempts import EpisodeSpec, play
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.errors import (
     BadAction,
@@ -37,6 +40,7 @@ from rlightning_aio.errors import (
     EnvRaised,
     RLightningError,
 )
+from rlightning_aio.evaluation import evaluate
 from rlightning_aio.protocol.entries import RENEW
 
 if TYPE_CHECKING:
@@ -69,6 +73,8 @@ class Arm(BaseEnv):
         return gym.spaces.Box(-1, 1, (2,), np.float32)
 
     def _ret(self, observation: Any) -> EnvRet:
+        if observation is OSError:
+            raise OSError("the cable broke")
         return EnvRet(env_id=self.env_id, observation=observation)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:
@@ -77,7 +83,7 @@ class Arm(BaseEnv):
         if options:
             self.is_stopped.wait(HANG)
             raise RuntimeError("stopped on its way")
-        return self._ret({"joints": np.zeros(2, np.float32)})
+        return self._ret(self.kwargs.get("first", {"joints": np.zeros(2, np.float32)}))
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         with self.stopping:  # A stop that is in the log has been carried out.
@@ -167,18 +173,39 @@ def test_what_a_preprocess_function_makes_is_looked_at(arm: Any, log: Path, plac
     assert lines(log) == ["reset", "step [0.5, 1.0]", "stop"]
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
+@contextlib.contextmanager
+def driven(entry: dict[str, Any]) -> Iterator[Any]:
+    """A group of the arm of an entry, or of a client that has it, which is no placement."""
+    if entry["placement"] != "client":
+        with sync.build_env_group(entry) as group:
+            yield group
+        return
+    env, is_over = Arm(EnvConfig(**entry | {"placement": "inline"})), Event()
+    env.on_disconnect, env.is_finish = is_over.set, is_over.is_set
+    with sync.build_env_group(name="arm", backend="env_server") as group:
+        client = ClientThread(group["arm-0"].address, "c", env)
+        yield group
+    client.join()
+
+
+@pytest.mark.parametrize("placement", [*PLACEMENTS, "client"])
+@pytest.mark.parametrize("call", ["reset", "step"])
 @pytest.mark.parametrize(
-    "result", [None, {}, {"joints": None}, {"joints": [1.0, 2.0, 3.0]}, {"joints": "two"}]
+    "result",
+    [OSError, None, {}, {"joints": None}, {"joints": [1.0, 2.0, 3.0]}, {"joints": "two"}],
 )
-def test_an_arm_whose_result_is_refused_stops(
-    arm: Any, log: Path, placement: str, result: Any
+def test_an_arm_that_raises_or_whose_result_is_refused_stops(
+    arm: Any, log: Path, placement: str, call: str, result: Any
 ) -> None:
     """A missing picture, say, is an error of the env that it does not raise itself."""
-    with sync.build_env_group(arm(placement, result=result)) as group:
-        batch, _ = group.reset()
-        with pytest.raises(EnvRaised):
-            group.step(batch.respond(action=np.zeros((1, 2))))
+    with driven(arm(placement, **{"first" if call == "reset" else "result": result})) as group:
+        if call == "reset":
+            with pytest.raises(EnvRaised):
+                group.reset()
+        else:
+            batch, _ = group.reset()
+            with pytest.raises(EnvRaised):
+                group.step(batch.respond(action=np.zeros((1, 2))))
         wait_for(log, "stop")
 
 
@@ -449,13 +476,47 @@ def test_after_the_death_of_the_trainer_a_line_says_why_the_arm_stands(log: Path
     assert lines(log) == ["reset", "stop"]
 
 
-def test_an_aborted_reset_stops_the_arm(arm: Any, log: Path) -> None:
+@pytest.mark.parametrize("end", ["abort", "close"])
+def test_a_reset_that_is_ended_stops_the_arm(arm: Any, log: Path, end: str) -> None:
     """Before its worker is killed."""
     with sync.build_env_group(arm("process")) as group:
         group.reset_async(options={"slow": True})
         wait_for(log, "reset")
-        group.abort()
+        getattr(group, end)()
         assert "stop" in lines(log)
+
+
+async def test_an_evaluation_that_ends_early_stops_the_arm_before_it_waits_for_it(
+    arm: Any, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rlightning_aio.evaluation.playing._PATIENCE_SECONDS", HANG)
+    async with build_env_group(arm("process")) as group:
+        slow = EpisodeSpec("", 0, {"slow": True})
+        evaluating = asyncio.ensure_future(evaluate(group, None, [slow]))
+        await asyncio.to_thread(wait_for, log, "reset")
+        evaluating.cancel()
+        await asyncio.to_thread(wait_for, log, "stop")
+        with pytest.raises(asyncio.CancelledError):
+            await evaluating
+
+
+async def test_play_that_ends_early_stops_the_arm_before_its_agent_ends(
+    arm: Any, log: Path
+) -> None:
+    """Which was cancelled, and may take some time."""
+
+    async def agent(episode: Any) -> None:
+        try:
+            await asyncio.sleep(HANG)
+        finally:
+            await asyncio.to_thread(wait_for, log, "stop")
+
+    async with build_env_group(arm("process")) as group:
+        playing = asyncio.ensure_future(anext(play(group, [("", 0)], agent, 1)))
+        await asyncio.to_thread(wait_for, log, "reset")
+        playing.cancel()
+        await asyncio.wait({playing})
+        wait_for(log, "stop")
 
 
 class InHalves(Arm):

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, cast
 from weakref import WeakSet
 
-from rlightning_aio._core.group.api.facade import is_resettable
+from rlightning_aio._core.group.api.facade import is_resettable, stop_hardware
 from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
@@ -244,6 +244,8 @@ class _Engine:
     async def _end_all(self) -> None:
         """Read no more tasks, and end what plays."""
         self._source.close()
+        if self._playing:
+            stop_hardware(self._group)
         for _, one in self._playing.values():
             one.stop("the iterator of play() was closed")
         await surely({*self._playing})

@@ -7,7 +7,11 @@ from contextlib import closing
 from operator import index
 from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, cast, overload
 
-from rlightning_aio._core.group.api.facade import default_min_results, ensure_auto_reset
+from rlightning_aio._core.group.api.facade import (
+    default_min_results,
+    ensure_auto_reset,
+    stop_hardware,
+)
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
@@ -163,6 +167,7 @@ def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
         except GeneratorExit:  # It is abandoned.
             raise
         except BaseException:  # Ctrl-C and a cancellation, too.
+            stop_hardware(group)
             yield from play.abandon()
             raise
 

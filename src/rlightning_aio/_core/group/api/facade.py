@@ -108,6 +108,13 @@ def is_resettable(group: Any, env_id: str) -> bool:
     return not core.tables.record_of(core.envs.find_one(env_id)).is_hardware
 
 
+def stop_hardware(group: Any) -> None:
+    """Stop all envs that move something real, as what plays on them ends early."""
+    core: Core = group._core  # noqa: SLF001
+    if core.lifetime.open:
+        core.tables.stop_hardware(core.envs.all.tolist())
+
+
 def is_lost(group: Any, env_id: str) -> bool:
     """Return True if an env moves something real whose client was lost since its last result."""
     core = group._core  # noqa: SLF001
