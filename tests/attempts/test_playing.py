@@ -791,7 +791,8 @@ async def test_it_is_said_once_if_all_resets_fail(caplog: pytest.LogCaptureFixtu
     async with rooms(PLACES["loop"]) as group:
         found = await played(group, tasks(5, reset="raise"), once, 1, Rules(retries=0))
     assert [attempts[0].outcome.kind for attempts in found] == ["not_started"] * 5
-    (said,) = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+    # On a busy machine asyncio's debug mode warns of slow callbacks.
+    (said,) = [one.getMessage() for one in caplog.records if one.name != "asyncio"]
     assert "most attempts fail (3 not_started, such as on env 'room-" in said
 
 
