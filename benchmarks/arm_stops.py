@@ -5,8 +5,9 @@
 
 Three simulated Piper arms, one for each kind of safe stop, are moving to a far target, by steps or
 by a reset, when a process gets a signal (the trainer of workers, the workers, a trainer whose arms
-are inline, `rollout` with such, clients, or their trainer), or an action or a picture is wrong. The
-arms are on pseudo-terminals; their clocks give the times. Needs ``rlightning-aio[piper]``.
+are inline, `rollout` and `eval` with either, clients, or their trainer), or an action or a picture
+is wrong. Ctrl-C and Ctrl-Z reach all processes of a terminal's foreground. The arms are on
+pseudo-terminals; their clocks give the times. Needs ``rlightning-aio[piper]``.
 """
 
 from __future__ import annotations
@@ -35,11 +36,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOPS = ("hold", "emergency_stop", "disable")
-SIGNALS = ("HUP", "INT", "TERM", "QUIT", "KILL", "STOP")
+SIGNALS = ("HUP", "INT", "TERM", "QUIT", "SEGV", "KILL", "STOP")
+TERMINAL = {"Ctrl-C": "INT", "Ctrl-Z": "TSTP"}
 EVENTS = ("beyond", "none", "raises", "no picture", "hangs")
 """Of a step: an action outside its space, no action; a camera that raises, returns None, hangs."""
-PLACES = ("trainer", "worker", "inline", "rollout", "client", "server")
+COMMANDS = {"rollout": ["--steps", "100000"], "eval": ["--episodes", "1000"]}
 DURING = ("step", "reset")
+ROWS = [
+    *itertools.product(("trainer", "worker", "inline", "client", "server"), SIGNALS, DURING),
+    *itertools.product(("trainer", "inline", "client", "server"), TERMINAL, DURING),
+    *itertools.product(("trainer", "inline", "server"), EVENTS, DURING[:1]),
+    *itertools.product(
+        [f"{name}{of}" for name in COMMANDS for of in ("", " of workers")],
+        ("INT", "TERM", "KILL", *TERMINAL),
+        DURING,
+    ),
+]
+"""Where something happens, what, and during what."""
 FAR = [2.5, 3.0, -2.9, 1.7, 1.2, 2.0]
 PATIENCE = 60.0
 TROUBLE = Path(os.environ.get("ARM_STOPS_TROUBLE", "/nowhere"))
@@ -145,10 +158,9 @@ class Stopped:
     its fastest joint in degrees, and after a stopped process was continued.
     """
 
-    event: str
     place: str
+    event: str
     during: str
-    stop: str
     seconds: float
     degrees: float
     moved_again: float
@@ -176,28 +188,25 @@ def measure(place: str, event: str, during: str = "step", speed: int = 10) -> li
                 before.append((arm.clock, arm.travelled))
         if event in EVENTS:
             trouble.write_text(event)
-        for target in targets if event not in EVENTS else ():
-            os.kill(target, getattr(signal, f"SIG{event}"))
+        else:
+            send(event, f"SIG{TERMINAL.get(event, event)}", targets)
         for arm in moving:
             arm.wait_until(lambda arm=arm: arm.stopped_at is not None)
         ends = [arm.travelled for arm in moving]
-        if event == "STOP":
-            for target in targets:
-                os.kill(target, signal.SIGCONT)
+        if event in ("STOP", "Ctrl-Z"):
+            send(event, "SIGCONT", targets)
             for arm in moving:
                 arm.wait_until(lambda arm=arm: arm.clock > arm.stopped_at + 1.0)
         return [
-            Stopped(
-                event,
-                place,
-                during,
-                stop,
-                round(arm.stopped_at - clock, 3),
-                round(end - travelled, 2),
-                round(arm.travelled - end, 2),
-            )
-            for stop, arm, (clock, travelled), end in zip(STOPS, moving, before, ends, strict=True)
+            Stopped(place, event, during, arm.stopped_at - at, end - begin, arm.travelled - end)
+            for arm, (at, begin), end in zip(moving, before, ends, strict=True)
         ]
+
+
+def send(event: str, name: str, targets: list[int]) -> None:
+    """Send a signal to processes; what a terminal sends goes to the groups that they lead."""
+    for target in targets:
+        os.kill(-target if event in TERMINAL else target, getattr(signal, name))
 
 
 def children(pid: int) -> list[int]:  # Incomplete while processes come and go.
@@ -216,8 +225,8 @@ def launched(
         run = "from rlightning_aio.cli import main; main()"
         return start("-c", run, name, str(config), *options)
 
-    if place == "rollout":
-        return [], [command("rollout", one, "--steps", "100000") for one in entries]
+    if (name := place.removesuffix(" of workers")) in COMMANDS:
+        return [], [command(name, one, *COMMANDS[name]) for one in entries]
     groups = [entries]
     if place == "inline":  # A reset moves one arm of a group after the other.
         groups = [[one] for one in entries]
@@ -240,7 +249,7 @@ def started(
     """Have arms driven; yield the ids of the processes that get the signal."""
     own = {"CAN_CONFIG": '{"sleep_after_open": 0.0}', "ARM_STOPS_TROUBLE": str(trouble)}
     environment = {**os.environ, **own, "PYTHONPATH": str(Path(__file__).parent)}
-    placement = "inline" if place in ("inline", "rollout") else "process"
+    placement = "inline" if place in ("inline", *COMMANDS) else "process"
     entries = [entry(*pair, placement, during, speed) for pair in zip(STOPS, channels, strict=True)]
     processes: list[subprocess.Popen[str]] = []
     drained: list[threading.Thread] = []
@@ -253,7 +262,7 @@ def started(
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             text=True,
-            start_new_session=True,
+            process_group=0,  # In this session: Ctrl-Z does nothing to a group without a shell.
             # The parent may ignore some of these signals, as nohup does.
             preexec_fn=_default_signals,  # noqa: PLW1509  # Sets signals only.
         )
@@ -286,21 +295,21 @@ def started(
 
 
 def table(found: list[Stopped]) -> str:
-    """Return a Markdown table with the travel of each arm after the event."""
-    lines = ["| event | where | during a | `hold` | `emergency_stop` | `disable` |"]
+    """Return a Markdown table with the travel of each arm after the event, by its kind of stop."""
+    lines = ["| where | event | during a | `hold` | `emergency_stop` | `disable` |"]
     lines.append("|---|---|---|---|---|---|")
-    cells = {(one.event, one.place, one.during, one.stop): one for one in found}
-    for key in dict.fromkeys((one.event, one.place, one.during) for one in found):
-        ways = [f"{cells[*key, s].degrees:.1f}° in {cells[*key, s].seconds:.2f} s" for s in STOPS]
-        lines.append(f"| {' | '.join((*key, *ways))} |")
+    for first in range(0, len(found), len(STOPS)):
+        arms = found[first : first + len(STOPS)]
+        ways = [f"{one.degrees:.1f}° in {one.seconds:.2f} s" for one in arms]
+        lines.append(f"| {' | '.join((arms[0].place, arms[0].event, arms[0].during, *ways))} |")
     return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--events", nargs="+", choices=SIGNALS + EVENTS, default=SIGNALS + EVENTS)
-    parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES)
-    parser.add_argument("--during", nargs="+", choices=DURING, default=DURING)
+    parser.add_argument("--events", nargs="+", choices=(*SIGNALS, *TERMINAL, *EVENTS))
+    parser.add_argument("--places", nargs="+", choices=sorted({place for place, *_ in ROWS}))
+    parser.add_argument("--during", nargs="+", choices=DURING)
     parser.add_argument("--speed", type=int, default=10, help="percent: 10 is 17 degrees a second")
     parser.add_argument("--drive", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -308,9 +317,10 @@ def main() -> None:
         drive(json.loads(given.drive[1]), given.drive[0])
         return
     found: list[Stopped] = []
-    for place, event, during in itertools.product(given.places, given.events, given.during):
-        if event in SIGNALS or (during == "step" and place in ("trainer", "inline", "server")):
-            found += measure(place, event, during, given.speed)
+    for row in ROWS:
+        wanted = zip((given.places, given.events, given.during), row, strict=True)
+        if all(one in (chosen or [one]) for chosen, one in wanted):
+            found += measure(*row, given.speed)
             print(table(found[-len(STOPS) :]).splitlines()[-1], file=sys.stderr, flush=True)
     print(table(found))
 

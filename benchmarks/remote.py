@@ -120,13 +120,9 @@ def as_jpeg(picture: Any) -> Any:
 def received_bytes() -> int:
     """Return how much has come over the TCP connections that this process has."""
     found = 0
-    for descriptor in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # It is no socket, another kind of socket, or closed by now.
-            one = socket.socket(fileno=int(descriptor.name))
-            try:
-                info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 136)
-            finally:
-                one.detach()
+    for descriptor in filter(Path.is_socket, Path("/proc/self/fd").iterdir()):
+        with suppress(OSError), socket.socket(fileno=os.dup(int(descriptor.name))) as one:
+            info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 136)
             found += struct.unpack_from("Q", info, 128)[0]  # tcpi_bytes_received
     return found
 
@@ -305,7 +301,6 @@ def name(what: str, clients: int, encrypted: bool) -> str:
 
 
 OURS, BARE = "rlightning_aio", "bare pyzmq echo"
-PACED = "64 clients, 20 Hz"
 QUESTIONS = (
     Question(
         name="remote",
@@ -345,8 +340,8 @@ QUESTIONS = (
         unit=TRAINER,
         columns=(TRAINER, TRIP, MEMORY),
         contenders=[
-            Ours(f"{OURS}, {PACED}", 64, env=Paced),
-            Echo(f"{BARE}, {PACED}", 64, env=Paced),
+            Ours(f"{OURS}, 64 clients, 20 Hz", 64, env=Paced),
+            Echo(f"{BARE}, 64 clients, 20 Hz", 64, env=Paced),
         ],
     ),
 )

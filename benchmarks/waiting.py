@@ -41,12 +41,7 @@ class Waits:
 
 
 class Awaiting(Waits):
-    """An awaitable one.
-
-    Args:
-        mean: seconds of a step.
-        length: steps of an episode.
-    """
+    """An awaitable one, whose steps take `mean` seconds, and episodes `length` steps."""
 
     def __init__(self, mean: float = MEAN, length: float = math.inf) -> None:
         self.share, self.length = mean / MEAN, length
