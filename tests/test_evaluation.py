@@ -195,6 +195,17 @@ def test_episodes_of_an_env_that_always_ends_its_worker_fail(
     assert "exited with code 3" in said[0]
 
 
+def test_what_was_lost_before_it_costs_no_episode() -> None:
+    """The first reset of each env is marked, as an abort has ended what it did, and is used."""
+    with group_of(*[scripted(lambda seed: seed % 2 == 0)] * 2) as group:
+        group.reset_async()
+        group.abort()
+        found = evaluated(group, 2)
+        assert [one.failures for one in found.attempts] == [()] * 4
+        assert not found.failed
+        assert group.metrics()["envs/results"] == sum(one.length + 1 for one in found.attempts)
+
+
 def test_entries_may_differ() -> None:
     """In their observations and their number of sub-environments; a policy may answer with several
     batches.

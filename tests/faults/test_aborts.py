@@ -162,7 +162,7 @@ async def test_an_agent_that_is_cancelled_gives_its_env_back() -> None:
                 await agent()
         tokens = Tokens()
         batch, _ = await group.reset()
-        assert not batch.restarted.any()
+        assert batch.restarted.tolist() == [True, False]
         tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
 
 

@@ -238,6 +238,21 @@ def test_a_killed_worker_is_counted() -> None:
             assert found.outcomes_truncated == found.outcomes_terminated == 0
 
 
+def test_a_loss_that_an_error_has_told_of_is_counted_once() -> None:
+    """By that error, and not by the reset that is marked for it."""
+    task = {"backend": "gymnasium", "task": "kit.scripted:Scripted-v0", "placement": "inline"}
+    rules = {"on_env_error": "restart", "max_restarts": 0}
+    with sync.build_env_group({"name": "f", **task, **rules}) as group:
+        batch, _ = group.reset()
+        with pytest.raises(EnvRaised):
+            group.step(
+                batch.respond(action=np.full((1, *group.get_action_spaces()[0].shape), RAISE))
+            )
+        batch, _ = group.reset()
+        assert (batch.restarted.all(), batch.outcome[0].kind) == (True, "env_raised")
+        assert numbers(group).outcomes_env_raised == 1
+
+
 @pytest.mark.parametrize("fields", [{"envs_per_process": 2}, {"num_envs": 2}], ids=repr)
 def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None:
     """In batches and in errors, of every kind; steps that are aborted are cancelled."""
@@ -262,8 +277,8 @@ def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None
                 except EnvRaised as error:
                     note(error.results)
                     counted.update(one.outcome.kind for one in (error, *error.others))
-                    group.reset(env_ids=[one.env_id for one in (error, *error.others)])
-        group.reset()
+                    note(group.reset(env_ids=[one.env_id for one in (error, *error.others)])[0])
+        note(group.reset()[0])
         group.step_async(BatchedData(group.env_ids, values))
         group.abort()
         found = vars(numbers(group))

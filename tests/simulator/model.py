@@ -294,6 +294,7 @@ class Env:
         exceptions: how often it may have raised, where it is then rebuilt.
         errors: of these since it last completed a step: at least and at most as many.
         put_away: it has raised, and is rebuilt before it does anything else.
+        lost: its episode surely is, which its next result says, unless that is a restore's.
         seen: `deaths` that its results have shown.
         loose: states of which it may have one, because a call was given up; torn: the same of a
             restore that failed, after which only a marked result, or one of a reset or a restore,
@@ -318,6 +319,7 @@ class Env:
     exceptions: int = 0
     errors: tuple[int, int] = (0, 0)
     put_away: bool = False
+    lost: bool = False
     seen: int = 0
     loose: list[State] = field(default_factory=list)
     torn: list[State] = field(default_factory=list)
@@ -365,6 +367,7 @@ class Env:
         if self.client is not None:
             self.client.befores.clear()
         self.state, self.dirty, self.torn = state, False, []
+        self.put_away = self.lost = False
         self.loose = [other for other in others if other.scripts.subs[0].mark != mark]
 
     def possible(self) -> list[State]:
@@ -482,6 +485,7 @@ class Model:
             env.loose[-1].play(request)
         if env.request is not None:
             env.kept.append(env.request)
+            env.lost = env.client is None or env.client.is_shown
         env.request, env.limbo, env.dirty, env.deadly = None, False, True, True
         env.errors = 0, env.errors[1] + 1
         env.host.aborted = True
@@ -510,7 +514,7 @@ class Model:
             self.counts["results"] += 1
 
     def _judge(self, env: Env, request: Request, row: Row) -> None:
-        restarted = row.restarted
+        restarted, was_shown = row.restarted, env.client is None or env.client.is_shown
         if restarted is None:
             restarted = [bool(row.info.keys() & MARKS)] * len(row.words)
         require(len(set(restarted)) == 1, "restarted in part")
@@ -531,9 +535,10 @@ class Model:
         if restarted[0]:
             self._judge_marked(env, request, row)
             return
-        require(not env.put_away or request.kind != "step", "a step of an env that has raised")
-        is_reset = request.kind == "reset"
-        states = env.possible() if is_reset else [env.state, *env.loose]
+        require(not (env.lost or env.put_away), "lost, and not marked")
+        states = [env.state, *env.loose]
+        if not was_shown:  # It had nothing to lose.
+            states = env.possible()
         marks = {state.scripts.subs[0].mark for state in states}
         if request.resets and env.host.renewed and UNLOADABLE in marks:
             states.append(env.fresh())  # Its next worker can't take its generators over.
@@ -547,12 +552,9 @@ class Model:
         found = [k for k in found if not acts[k] & endless]
         require(found, "a result where there is none")
         compare(env, played[found[0]], row)
-        if found[0]:
-            env.seen = request.deaths
         env.adopt(*[now[k] for k in found])
         if request.kind == "step" and not request.due:
             env.errors = 0, 0
-        env.put_away = False
         expected = played[found[0]]
         env.episodes += [episode for episode in expected.episodes if episode is not None]
 
@@ -564,7 +566,6 @@ class Model:
         require(found, "another state than was saved", [state.scripts.words for state in states])
         compare(env, played[found[0]], row)
         env.adopt(*[states[k] for k in found])
-        env.put_away = False
         if self.context is None:
             env.state.cut = False
         self.counts["restored"] += 1
@@ -609,11 +610,13 @@ class Model:
             require(self._raising(env, request), "restarted, and nothing has raised")
             env.errors = env.errors[0] + 1, env.errors[1] + 1
             require(env.errors[0] <= env.entry.max_restarts, "restarted once too often")
-        state = env.fresh()
-        state.play(self._begun_again(env, request))
-        require(state.scripts.words == row.words, "not as rebuilt", state.scripts.words)
-        env.adopt(state)
-        env.put_away = False
+        again = [self._begun_again(env, request)]
+        if env.put_away and request.kind == "reset":
+            again.append(request)
+        states = [env.state, *env.loose] if env.put_away else [env.fresh()]
+        found = _shown(states, again, row)
+        require(found, "not as rebuilt", again)
+        env.adopt(found[0])
         self.counts["restarted after an exception"] += 1
 
     def _put_away(self, env: Env, request: Request) -> None:
@@ -641,7 +644,7 @@ class Model:
         require("episode" not in row.info, "an episode that was lost")
 
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
-        if not env.torn:
+        if not (env.torn or env.lost):
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
             is_replaced = env.entry.on_death != "raise" or env.host.aborted
             require(is_replaced, "marked, where a death is to be raised")
@@ -652,21 +655,16 @@ class Model:
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
-        if env.client is not None and request.kind == "reset":  # Whoever comes gets all of it.
-            again.append(Request("reset", seed=request.seed, options=request.options))
+        if request.kind == "reset":  # What was lost was lost before it.
+            again.append(request)
         raised = self._may_be_rebuilt(env, request)  # Before that.
         env.errors = env.errors[0], self._most_errors(env)
-        found = [
-            state
-            for one in again
-            for state in (*env.after_loss(), *[env.fresh()] * raised)
-            if state.play(one).outcome.words == row.words
-        ]
+        found = _shown([*env.after_loss(), *[env.fresh()] * raised], again, row)
         require(found, "marked, in no state that it may have")
         was_idle = request.deaths > env.seen
-        env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
+        known = env.torn or env.lost
+        env.seen = min(max(env.seen + (not known), request.deaths), env.deaths)
         env.adopt(*found)
-        env.put_away = False
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
         self.counts["hung"] += row.info[cause].startswith("hung")
@@ -678,7 +676,7 @@ class Model:
         if at_fault is not None:
             own = at_fault in self.envs and self.envs[at_fault].host is host
             require(own, "a stranger is blamed", at_fault)
-        if self.calm and host.knows and not (host.struck or env.torn):
+        if self.calm and host.knows and not (host.struck or env.torn or env.lost):
             waits = env.entry.form == "awaitable" and len(together) > 1
             deadly = waits if at_fault is None else self.envs[at_fault].deadly
             require(deadly, "an innocent env is blamed, or none", at_fault)
@@ -738,7 +736,7 @@ class Model:
         marks = [state.scripts.subs[0].mark for state in request.saved]
         require(interrupted or UNLOADABLE in marks, "an error of nobody", repr(fault))
         states = (env.state, *env.loose, *env.torn, *request.saved)
-        env.torn = [*map(State.copy, states), env.fresh()]
+        env.torn, env.lost = [*map(State.copy, states), env.fresh()], True
         self.counts["not restored"] += 1
 
     def _judge_raised(self, env: Env, request: Request, fault: EnvRaised) -> None:
@@ -821,6 +819,13 @@ class Model:
             for other in self.envs.values():
                 if other is env or (other.host is host and not host.renewed):
                     other.gone = True
+
+
+def _shown(states: Sequence[State], requests: Sequence[Request], row: Row) -> list[State]:
+    """What each of these states becomes by each of these resets, if a result shows that."""
+    found = [state.copy() for state in states for _ in requests]
+    each = zip(found, [*requests] * len(states), strict=True)
+    return [state for state, one in each if state.play(one).outcome.words == row.words]
 
 
 def raised_text(effect: str, token: int) -> str:

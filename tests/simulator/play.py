@@ -563,6 +563,7 @@ class Play(Session):
             if env.limbo or env.request is not None:
                 self.model.abort(env)
                 env.kept.clear()
+                env.lost = False  # What has come may have said so.
                 self.unseen.add(env.env_id)
         self.counts["dropped by a reset"] += 1
         await self.reset(envs, rng, drops=True)
@@ -1040,6 +1041,7 @@ class Play(Session):
         effects = [effect for effect, _ in env.request.acts]
         grudges = [sub.grudge for sub in env.state.scripts.subs]
         later = [e for e in effects if e.endswith(" next") or e == "keep state"]
+        later += ["rubbish"] * ("rubbish" in effects and env.entry.on_error == "restart")
         return not (later or any(grudges))
 
     def note_aborted(self, envs: Iterable[Env]) -> None:

@@ -301,9 +301,6 @@ class Vectors(Session):
             self.counts["died"] += 1
             may_be = env.exceptions > 0 or (env.host.mortal and env.deaths > 0)
             require(may_be, "marked, and nothing is lost", info)
-            # Where workers are renewed, the reset in a step is a request of its own: its loss is
-            # none of the episode that ended in the step.
-            died = not env.host.renewed or "worker_restarted" in info.get("final_info", info)
         was_over, stays = self.over[k], self.mode == "disabled" and not died
         self.over[k] = any(ends) or (was_over and stays)
         self.shown[k], self.lost[k] = now, False

@@ -71,13 +71,17 @@ def ended_episodes(
 
 
 def are_over(batch: BatchedData) -> list[bool]:
-    """Return for each result whether it ends the episodes of all agents and sub-environments."""
+    """Return for each result whether it ends the episodes of all agents and sub-environments.
+
+    A marked one begins an episode.
+    """
     return column_of_parts(parts_of(batch), _over_of_rows).tolist()
 
 
 def _over_of_rows(part: ResultColumns) -> NDArray[np.bool_]:
     done = part.done
-    return done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
+    over = done if done.ndim == 1 else np.logical_and.reduce(done.reshape(len(part), -1), 1)
+    return over & ~part.by_env(part.restarted)
 
 
 def values_or_faults(batch: BatchedData) -> list[Any]:

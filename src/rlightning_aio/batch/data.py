@@ -248,7 +248,7 @@ class BatchedData:
 
     @property
     def restarted(self) -> NDArray[np.bool_]:
-        """True if the previous episode was lost with its worker or client; shaped like `is_reset`.
+        """True if the previous episode was lost; shaped like `is_reset`.
 
         A learner that stores transitions must cut the env's chain there.
         """

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio._core.group.api.facade import request_number
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import Attempt, success_of
-from rlightning_aio.batch.contents import all_agents, readable, summed_rewards
+from rlightning_aio.batch.contents import all_agents, lost_rows, readable, summed_rewards
 from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
@@ -90,8 +91,8 @@ class PolicyPlay:
         self._has_clients = len(group) > group.size()
         self._pending: set[str] = set()
         """Envs with a request in flight."""
-        self._begun: set[str] = set()
-        """Those of them that a reset begins."""
+        self._begun: dict[str, int] = {}
+        """Those of them that a reset begins, with the number of that."""
         self._ended: deque[tuple[Job, Attempt]] = deque()
         """Episodes that the last results ended, to be noted."""
         self._has_warned = False
@@ -179,7 +180,7 @@ class PolicyPlay:
         seeds = None if seed is None else {env_id: seed - job.sub_env}
         self._group.reset_async(seed=seeds, options=options, env_ids=[env_id])
         self._pending.add(env_id)
-        self._begun.add(env_id)
+        self._begun[env_id] = request_number(self._group, env_id)
         if self._films is not None:
             self._films.begin(env_id, job)
 
@@ -225,7 +226,8 @@ class PolicyPlay:
             yield from self._film(self._films, env_ids)
         for part in batch.by_entry().values() if self._separate else (batch,):
             self._record(part)
-        self._begun.difference_update(env_ids)
+        for env_id in env_ids:
+            self._begun.pop(env_id, None)
         self._begin_episodes()
         rows = [
             row
@@ -269,8 +271,9 @@ class PolicyPlay:
     def _record(self, batch: BatchedData) -> None:
         """Add results to their episodes."""
         env_ids = batch.env_ids()
-        if batch.restarted.any():
-            self._note_losses(batch)
+        lost = [row for row in lost_rows(batch) if not self._is_begun_as_asked(env_ids[row])]
+        if lost:
+            self._note_losses(batch, lost)
         places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
         stepped = self._counts[places] & ~begins
         rewards = np.where(stepped, summed_rewards(batch.reward).reshape(-1), 0.0)
@@ -282,9 +285,16 @@ class PolicyPlay:
         if ended.any():
             self._note_ends(batch, ended.reshape(len(batch), -1))
         begins |= self._begun_again(env_ids, done).reshape(-1)
-        begins &= ~batch.restarted.reshape(-1)  # They are reset once more.
+        begins = begins.reshape(len(batch), -1)
+        begins[lost] = False  # They are reset once more.
         if begins.any():
-            self._note_begins(env_ids, begins.reshape(len(batch), -1))
+            self._note_begins(env_ids, begins)
+
+    def _is_begun_as_asked(self, env_id: str) -> bool:
+        """Return True if an env answers a reset that was asked for once: it may have lost what it
+        did before that, and nothing since.
+        """
+        return self._begun.get(env_id) == request_number(self._group, env_id)
 
     def _begun_again(self, env_ids: list[str], done: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask of sub-environments that have begun the next episode in the step that ended one."""
@@ -347,9 +357,8 @@ class PolicyPlay:
 
     # -- faults -----------------------------------------------------------------------
 
-    def _note_losses(self, batch: BatchedData) -> None:
+    def _note_losses(self, batch: BatchedData, rows: list[int]) -> None:
         """Note what envs have lost whose workers were replaced."""
-        rows = np.flatnonzero(batch.restarted.reshape(len(batch), -1).any(axis=1)).tolist()
         env_ids = batch.env_ids()
         for row, info in zip(rows, batch.take(rows).info(), strict=True):
             self._lose(env_ids[row], info["outcome"])
@@ -379,7 +388,7 @@ class PolicyPlay:
             outcome = replace(fault.outcome, env_id=env_id)
             if is_named and env_id != fault.env_id:
                 outcome = bystanders(outcome.cause, fault.env_id, env_id)
-            self._begun.discard(env_id)
+            self._begun.pop(env_id, None)
             self._lose(env_id, outcome)
         for env_id in gone:
             self._queue.free.pop(env_id, None)

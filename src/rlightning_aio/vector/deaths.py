@@ -29,6 +29,13 @@ _CAUSE: Final = ("worker_restarted", "env_at_fault", "outcome")
 """Keys of an info that say why its env was restarted, and who was at fault."""
 
 
+def without_cause(info: dict[str, Any]) -> dict[str, Any]:
+    """Return the info of a reset, without what was lost since the episode before had ended."""
+    if "worker_restarted" not in info:
+        return info
+    return {key: value for key, value in info.items() if key not in _CAUSE}
+
+
 class Stepped(NamedTuple):
     """Results of one step of all envs; observations as columns."""
 

@@ -28,7 +28,7 @@ from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.trees import index
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
-from rlightning_aio.vector.deaths import Stepped, with_deaths
+from rlightning_aio.vector.deaths import Stepped, with_deaths, without_cause
 from rlightning_aio.vector.interface import (
     CalledEnvs,
     check_free,
@@ -371,7 +371,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         each = listed(last.infos, self.num_envs)
         for k, info in zip(chosen.tolist(), reported_info_list(batch), strict=True):
             final = copying.deepcopy(index(last.observations, k))
-            each[k] = {**info, "final_info": each[k], "final_obs": final}
+            each[k] = {**without_cause(info), "final_info": each[k], "final_obs": final}
         observations = merged(last.observations, batch.observation, chosen, self.num_envs)
         return last._replace(observations=observations, infos=vector_infos(each))
 

@@ -121,6 +121,12 @@ def is_lost(group: Any, env_id: str) -> bool:
     return core.tables.record_of(core.envs.find_one(env_id)).lost_client
 
 
+def request_number(group: Any, env_id: str) -> int:
+    """Return the number of an env's newest request; what is asked again gets another one."""
+    core = group._core  # noqa: SLF001
+    return core.requests.numbering.number(core.envs.find_one(env_id))
+
+
 def numbers_of_attempts(group: Any) -> dict[str, float]:
     """Return what `metrics` of a group has besides its own numbers, to be written to."""
     return group._core.sums.of_attempts  # noqa: SLF001

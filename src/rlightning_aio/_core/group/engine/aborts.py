@@ -106,3 +106,4 @@ class Aborts:
                 record.needs_reset = record.place is not None
             else:
                 self._episodes.lose([slot], _WHY)
+        self._episodes.note_counted(chosen)

@@ -50,7 +50,8 @@ class StepEnd(NamedTuple):
     Attributes:
         ret: the result.
         is_over: it ends the episodes of all agents and sub-environments.
-        lost: the batch of that result, if the episode before was lost with its worker or client.
+        lost: the batch of that result, if it begins an episode in place of what was asked, as the
+            one before was lost.
     """
 
     ret: EnvRet | MultiAgentEnvRet
@@ -95,11 +96,12 @@ class AgentStep:
 
     Attributes:
         env_id, what, reply: as given.
+        number: of its request, as it was sent, if it is a reset.
         is_outstanding: it was sent, and has not ended.
         is_collectable: if its caller is cancelled, its result is for the collector.
     """
 
-    __slots__ = ("env_id", "is_collectable", "is_outstanding", "reply", "what")
+    __slots__ = ("env_id", "is_collectable", "is_outstanding", "number", "reply", "what")
 
     def __init__(
         self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall, reply: _Reply
@@ -107,6 +109,7 @@ class AgentStep:
         self.env_id = env_id
         self.what = what
         self.reply = reply
+        self.number = 0
         self.is_outstanding = self.is_collectable = False
 
     @property
@@ -240,6 +243,9 @@ class AgentSteps:
             step.is_outstanding = True
         ticket.remaining += len(slots)
         send(ticket)
+        if isinstance(asked[0].what, EpisodeStart):
+            for slot, step in zip(slots.tolist(), asked, strict=True):
+                step.number = self._requests.numbering.number(slot)
 
     def _prepared(
         self, asked: Sequence[AgentStep], now: float
@@ -284,13 +290,20 @@ class AgentSteps:
         lost = lost_rows(batch)
         rows = zip(slots.tolist(), values_or_faults(batch), are_over(batch), strict=True)
         for row, (slot, ret, is_over) in enumerate(rows):
+            step = self._sent[slot]
             if (reply := self._ended(slot)).done():
                 continue
             if isinstance(ret, EnvFault):
                 reply.set_exception(ret)
             else:
-                loss = batch.take([row]) if row in lost else None
+                is_lost = row in lost and not self._is_begun_as_asked(slot, step)
+                loss = batch.take([row]) if is_lost else None
                 reply.set_result(StepEnd(ret, is_over, loss))
+
+    def _is_begun_as_asked(self, slot: int, step: AgentStep) -> bool:
+        """Return True for a reset that was asked for once: what was lost was lost before it."""
+        number = self._requests.numbering.number(slot)
+        return isinstance(step.what, EpisodeStart) and step.number == number
 
     def _ended(self, slot: int) -> _Reply:
         step = self._sent.pop(slot)

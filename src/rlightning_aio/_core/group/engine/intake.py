@@ -270,7 +270,8 @@ class Intake:
         """End requests that are no longer in flight, with one error for each caller."""
         for owner, mine in self._requests.owners(slots):
             fault = error_for(mine)
-            self._sums.note_failures(mine, fault.outcome.kind)
+            counted = self._sums.note_failures(mine, fault.outcome.kind)
+            self._episodes.note_counted(counted.tolist())
             self._requests.fail(mine, owner, fault)
 
     def _on_died(self, completion: Died) -> None:
@@ -320,6 +321,8 @@ class Intake:
         if self._episodes.exceptional:
             for report in self._episodes.take_answers(slots):
                 self._results.mark_restarted(report)
+                if not report.is_counted:
+                    self._sums.note_loss(report.slot, report.why)
         if self._supervisor.any_deaths:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:

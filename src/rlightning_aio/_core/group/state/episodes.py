@@ -75,18 +75,23 @@ class Position(NamedTuple):
 
 
 class Report(NamedTuple):
-    """A loss that the result of a slot reports."""
+    """A loss that the result of a slot reports; `is_counted`: an error has told of it before."""
 
     slot: int
     why: Loss
+    is_counted: bool
 
 
 @dataclass(slots=True)
 class _Loss:
-    """The phase of one env that is not intact, and why its episode was lost."""
+    """The phase of one env that is not intact, and why its episode was lost.
+
+    `is_counted`: it is among the failures already, by the error of a request.
+    """
 
     phase: LossPhase
     why: Loss
+    is_counted: bool = False
 
 
 class Episodes:
@@ -233,18 +238,25 @@ class Episodes:
             self._restored.pop(slot, None)
 
     def take_answers(self, slots: NDArray[np.intp]) -> list[Report]:
-        """Record that results of `slots` arrived, and return the losses that they report."""
+        """Record that results of `slots` arrived, and return the losses that they report.
+
+        A restore has put a saved state in place of the episode, and reports nothing.
+        """
         reports: list[Report] = []
         for slot in slots.tolist():
             loss = self._losses.get(slot)
             if loss is None:
                 continue
-            # A reset that the user has asked of a client reports what was lost with the last one.
-            is_told = slot >= self._envs.num_local and loss.why.blame != "caller"
-            if is_told or loss.phase is LossPhase.REPORTING:
-                reports.append(Report(slot, loss.why))
+            if slot not in self._restored:
+                reports.append(Report(slot, loss.why, loss.is_counted))
             self._move(slot, LossEvent.ANSWERED)
         return reports
+
+    def note_counted(self, slots: Iterable[int]) -> None:
+        """Record that errors have ended requests of `slots`, which count what was lost, if any."""
+        for slot in slots:
+            if slot in self._losses:
+                self._losses[slot].is_counted = True
 
     def ended_without_result(self, slot: int) -> Loss | None:
         """Record that the request of `slot` ended without a result; return the loss that it would
@@ -276,7 +288,7 @@ class Episodes:
         if known is None or after is LossPhase.INTACT:
             self._losses.pop(slot, None)
         else:
-            self._losses[slot] = _Loss(after, known)
+            self._losses[slot] = _Loss(after, known, loss is not None and loss.is_counted)
         self._note_losses()
 
     def _note_losses(self) -> None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.outcomes import Loss
 
 _MOST_ROWS: Final = 1 << 12
 """The number of results that are added at once: their columns still fit into a core's cache."""
@@ -98,10 +99,19 @@ class Sums:
             if self._room <= 0:
                 self._settle()
 
-    def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> None:
-        """Count steps and resets of `slots` that end without a result; other requests don't."""
+    def note_failures(self, slots: NDArray[np.intp], kind: OutcomeKind) -> NDArray[np.intp]:
+        """Count steps and resets that end without a result, of all requests of `slots`.
+
+        Returns the slots of those.
+        """
         own = slots[~self._requests.numbering.awaits_value(slots)]
         self._sums[_FIRST_OUTCOME + _CODE_OF[kind]] += self._counted(own)
+        return own
+
+    def note_loss(self, slot: int, why: Loss) -> None:
+        """Count the lost episodes of an env, which no error has told of."""
+        code = _CODE_OF[why.outcome(self._envs.env_ids[slot]).kind]
+        self._sums[_FIRST_OUTCOME + code, slot] += self._envs.num_sub_envs[slot]
 
     def _settle(self) -> None:
         """Add what is kept to the sums."""
@@ -175,25 +185,20 @@ class Sums:
         resets = part.is_reset.reshape(len(part), -1).sum(axis=1)
         self._sums[_STEPS] -= self._counted(part.slots, resets)
         over, codes = _ended(part.flags, lengths)
-        if part.restarted is not None:
+        if part.restarted is not None:  # `note_loss` counts them.
             over[part.restarted] = False
-        elif not np.count_nonzero(over):
+        if not np.count_nonzero(over):
             return
         self._add_episodes(part.slots, over, returns, lengths)
         if part.agents:  # An episode has ended with that of its last agent.
             over = np.logical_or.reduce(over, 1) & part.has_ended
             codes = np.maximum.reduce(codes, 1)
-        if part.restarted is not None:
-            over[part.restarted] = True
         for row in dict.fromkeys(over.nonzero()[0].tolist()):
             if part.may_hold(row, ("outcome",)):
                 with suppress(Exception):  # The info may be malformed; its reader gets it.
                     reported: Any = part.reported_info_of(row).get("outcome")
                     if isinstance(reported, Outcome):
                         codes[row] = _CODE_OF[reported.kind]
-                        is_lost = part.restarted is not None and part.restarted[row]
-                        # If the caller has ended it, `note_failures` has counted it.
-                        over[row] &= not (is_lost and reported.kind == "cancelled")
         self._add_outcomes(part.slots[over.nonzero()[0]], codes[over])
 
     # -- what is asked ----------------------------------------------------------------
