@@ -352,10 +352,10 @@ def test_a_window_ends_for_results_that_joined_before_the_minimum(world: World) 
     with built(entry(8)) as group:
         group.reset()
         ask(group, e0=1.0, e1=1.5, e2=1.5, **{f"e{k}": 99.0 for k in range(3, 8)})
-        with takes(world, 2.0, 2.5):
+        with takes(world, 1.9, 2.5):
             batch, _ = group.collect_async(timeout=1.0, min_results=3)
         assert batch.ids() == ["e-0", "e-1", "e-2"]
-        with takes(world, 97.0, 98.0):
+        with takes(world, 96.5, 98.0):
             assert len(group.collect_async(timeout=1.0)[0]) == 5
 
 
