@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.columns import ResultColumns
-from rlightning_aio.batch.contents import reported_info_list, slots_of
-from rlightning_aio.batch.data import batch_of_results, columns_of_responses, parts_of
+from rlightning_aio.batch.contents import reported_info_list
+from rlightning_aio.batch.data import batch_of_results, columns_of_responses, parts_of, slots_of
 from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig

@@ -20,19 +20,12 @@ import numpy as np
 
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.base import Host
-from rlightning_aio._core.hosts.messages import (
-    Built,
-    Closed,
-    Death,
-    Died,
-    ErrorText,
-    NotBuilt,
-    Reported,
-)
+from rlightning_aio._core.hosts.messages import Built, Closed, Death, Died, NotBuilt, Reported
 from rlightning_aio._core.hosts.running.build_env import built_envs
 from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import slot_of
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:

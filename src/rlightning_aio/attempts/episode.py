@@ -7,7 +7,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.batch.contents import summed_rewards
+from rlightning_aio.batch.parts import summed_rewards
 from rlightning_aio.errors import BadAction, EnvFault, EnvRaised, RLightningError
 from rlightning_aio.outcomes import Outcome
 from rlightning_aio.protocol.entries import RENEW

@@ -14,7 +14,7 @@ import numpy as np
 
 from rlightning_aio.attempts.connections import is_connections
 from rlightning_aio.attempts.records import Attempt, success_of
-from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.batch.parts import all_agents
 from rlightning_aio.errors import EnvFault, GroupClosed
 from rlightning_aio.outcomes import BLAMES, Outcome, TimeSpent, own_end
 from rlightning_aio.trees import copied

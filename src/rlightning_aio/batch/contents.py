@@ -9,19 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.batch.data import (
-    columns_of_responses,
-    names_of,
-    parts_of,
-    slots_of,
-)
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.batch.parts import (
-    all_agents,
     column_of_parts,
     infos_of_parts,
     reported_infos_of_parts,
     rows_in_order,
-    summed_rewards,
 )
 from rlightning_aio.errors import EnvFault
 
@@ -32,19 +25,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.batch.data import BatchedData
-
-__all__ = [
-    "all_agents",
-    "are_over",
-    "columns_of_responses",
-    "ended_episodes",
-    "lost_rows",
-    "names_of",
-    "reported_info_list",
-    "reported_infos",
-    "slots_of",
-    "summed_rewards",
-]
 
 
 def reported_infos(batch: BatchedData) -> dict[str, Any]:

@@ -22,7 +22,7 @@ import typer
 import rlightning_aio
 from rlightning_aio._core.group.api.facade import ensure_auto_reset
 from rlightning_aio._core.hosts.processes import resident_mb
-from rlightning_aio.batch.contents import all_agents, summed_rewards
+from rlightning_aio.batch.parts import all_agents, summed_rewards
 from rlightning_aio.cli.options import AsJson, Config, Overrides
 from rlightning_aio.cli.policies import Responder, respond_to_all
 from rlightning_aio.cli.terminal import (

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rlightning_aio._core.hosts.messages import ErrorText
 from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.cli.terminal import (
     connections_logged,
@@ -23,6 +22,7 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, RLightningError, env_raised
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote.client import is_address
 from rlightning_aio.remote.keys import make_keys

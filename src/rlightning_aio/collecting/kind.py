@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 
 from rlightning_aio.batch import BatchedData, joined
-from rlightning_aio.batch.contents import columns_of_responses
+from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.collecting.results import ResultRows, columns_of_episodes, result_rows
 from rlightning_aio.collecting.rollout import Ends, Rollout
 from rlightning_aio.collecting.staging import Staging

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.batch.contents import all_agents, ended_episodes
+from rlightning_aio.batch.contents import ended_episodes
 from rlightning_aio.batch.data import plain_columns
 from rlightning_aio.batch.infos import infos_of_each, listed
+from rlightning_aio.batch.parts import all_agents
 from rlightning_aio.collecting.trees import rows_of, scattered
 from rlightning_aio.trees import Tree, mapped
 

@@ -21,7 +21,8 @@ import numpy as np
 from rlightning_aio._core.group.api.facade import request_number
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import Attempt, success_of
-from rlightning_aio.batch.contents import all_agents, lost_rows, readable, summed_rewards
+from rlightning_aio.batch.contents import lost_rows, readable
+from rlightning_aio.batch.parts import all_agents, summed_rewards
 from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.batch.parts import all_agents
 
 if TYPE_CHECKING:
     import numpy as np

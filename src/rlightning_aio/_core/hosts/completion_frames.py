@@ -11,14 +11,8 @@ from __future__ import annotations
 import pickle
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.hosts.messages import (
-    Built,
-    ErrorText,
-    NotBuilt,
-    Raised,
-    Result,
-    Value,
-)
+from rlightning_aio._core.hosts.messages import Built, NotBuilt, Raised, Result, Value
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.frames import Frame, FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 

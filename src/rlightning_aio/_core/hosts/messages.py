@@ -14,8 +14,6 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
-from rlightning_aio.protocol.error_text import ErrorText
-
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -24,38 +22,10 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.outcomes import Loss
+    from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import RowLayout, Slab
     from rlightning_aio.types import ClientTraits, EnvMeta
-
-__all__ = [
-    "STEP_IN_ROW",
-    "AttachOrder",
-    "Attached",
-    "Built",
-    "Closed",
-    "Completion",
-    "Completions",
-    "Death",
-    "Died",
-    "EnvStarted",
-    "EnvState",
-    "ErrorText",
-    "Lost",
-    "Moved",
-    "NewSchema",
-    "NotBuilt",
-    "OutOfBand",
-    "Raised",
-    "Reported",
-    "Result",
-    "StartOrder",
-    "Taken",
-    "Value",
-    "Withdrawn",
-    "WorkerPlace",
-]
-
 
 STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (None, {})
 """The action and the extras of a step that has no arguments out of band."""

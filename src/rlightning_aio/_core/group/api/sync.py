@@ -7,7 +7,7 @@ works in a script, in a thread, and in a notebook cell whose loop is running.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Self, TypeVar, TypeVarTuple
+from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio._core.group.api.facade import only_result, steps_of
 from rlightning_aio._core.group.api.interface import (
@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "due_for_reset"]
-
-T = TypeVar("T")
-A = TypeVarTuple("A")
 
 
 class EnvGroup(GroupInterface):

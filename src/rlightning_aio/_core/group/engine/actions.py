@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio._core.group.state.slab_layout import rows_in
-from rlightning_aio.batch.contents import columns_of_responses
+from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.batch.stacking import plain_numbers
 from rlightning_aio.errors import BadAction

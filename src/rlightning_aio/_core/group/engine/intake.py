@@ -18,7 +18,6 @@ from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     Died,
-    ErrorText,
     Lost,
     Moved,
     NewSchema,
@@ -46,6 +45,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.errors import EnvFault, EnvRaised
     from rlightning_aio.outcomes import Blame
+    from rlightning_aio.protocol.error_text import ErrorText
 
 _ASKED_AGAIN: Final = (int(Operation.STEP), int(Operation.RESET))
 

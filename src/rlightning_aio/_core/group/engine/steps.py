@@ -27,8 +27,7 @@ from rlightning_aio._core.group.engine.actions import (
 from rlightning_aio._core.group.state.conditions import BESIDE_ROWS, UNLIKE_ENVS
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.hosts.base import Executing
-from rlightning_aio.batch.contents import slots_of
-from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
+from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results, slots_of
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,

@@ -23,15 +23,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Host
-    from rlightning_aio._core.hosts.messages import (
-        AttachOrder,
-        Death,
-        EnvStarted,
-        ErrorText,
-    )
+    from rlightning_aio._core.hosts.messages import AttachOrder, Death, EnvStarted
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.outcomes import Loss
+    from rlightning_aio.protocol.error_text import ErrorText
 
 
 class Stage(Enum):

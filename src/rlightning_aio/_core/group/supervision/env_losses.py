@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.supervision.fault_messages import CrashLog
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.messages import ErrorText
     from rlightning_aio.errors import EnvRaised
     from rlightning_aio.outcomes import Loss
+    from rlightning_aio.protocol.error_text import ErrorText
 
 _ERRORS: Final[dict[str, type[EnvFault]]] = {"env_hung": EnvHung, "env_away": EnvAway}
 """By the kind of an outcome; others are `WorkerDied`."""

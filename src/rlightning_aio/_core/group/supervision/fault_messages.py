@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
-    from rlightning_aio._core.hosts.messages import Death, ErrorText
+    from rlightning_aio._core.hosts.messages import Death
     from rlightning_aio.errors import EnvFault
+    from rlightning_aio.protocol.error_text import ErrorText
 
 _LINES: Final = 3
 _EVERY: Final = 100

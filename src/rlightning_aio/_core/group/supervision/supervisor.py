@@ -46,10 +46,10 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Death,
     Died,
-    ErrorText,
     NotBuilt,
 )
 from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:

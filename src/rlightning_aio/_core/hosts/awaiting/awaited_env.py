@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
-from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Collection, Coroutine

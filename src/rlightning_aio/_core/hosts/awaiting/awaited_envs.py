@@ -33,7 +33,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     watched,
 )
 from rlightning_aio._core.hosts.limits import hung, limits_of
-from rlightning_aio._core.hosts.messages import ErrorText, Lost, NotBuilt, Raised
+from rlightning_aio._core.hosts.messages import Lost, NotBuilt, Raised
 from rlightning_aio._core.hosts.running.build_env import built_env, check_distinct
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
@@ -42,6 +42,7 @@ from rlightning_aio.errors import EnvAway
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
+from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, MutableSequence

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, MutableSequence
 
-    from rlightning_aio._core.hosts.messages import Completion, ErrorText, StartOrder
+    from rlightning_aio._core.hosts.messages import Completion, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
     from rlightning_aio._core.hosts.running.runner import EnvRunner
+    from rlightning_aio.protocol.error_text import ErrorText
 
 
 class Awaiting:

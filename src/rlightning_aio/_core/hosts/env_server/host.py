@@ -22,7 +22,6 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Death,
     Died,
-    ErrorText,
     Raised,
     Result,
     Taken,
@@ -30,6 +29,7 @@ from rlightning_aio._core.hosts.messages import (
 from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_of_band
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation, op_of
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessions
 from rlightning_aio.protocol.slab import RowLayout, Slab
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
-from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
+from rlightning_aio._core.hosts.messages import Closed, Death, Died, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
     CloseLimit,
@@ -39,6 +39,7 @@ from rlightning_aio._core.hosts.process.spares import RunningForkServer
 from rlightning_aio._core.hosts.processes import processor_ns, resident_mb
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.entries import number_of, slot_of
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.rings import rings_size

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Wiring
-    from rlightning_aio._core.hosts.messages import ErrorText, WorkerPlace
+    from rlightning_aio._core.hosts.messages import WorkerPlace
+    from rlightning_aio.protocol.error_text import ErrorText
 
 
 class Link:

@@ -38,16 +38,11 @@ from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, ri
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio._core.hosts.messages import (
-        AttachOrder,
-        Completion,
-        ErrorText,
-        StartOrder,
-        WorkerPlace,
-    )
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder, WorkerPlace
     from rlightning_aio._core.hosts.running.row_writer import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.protocol.error_text import ErrorText
 
 
 class TrainerGone(Exception):

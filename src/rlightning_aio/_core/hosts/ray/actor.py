@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
-from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema
+from rlightning_aio._core.hosts.messages import Built, NewSchema
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Completion, StartOrder
     from rlightning_aio._core.hosts.ray.row_table import Columns
     from rlightning_aio._core.hosts.running.runner import EnvRunner
+    from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.frames import Frame
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rlightning_aio._core.hosts.messages import ErrorText, NotBuilt
+from rlightning_aio._core.hosts.messages import NotBuilt
 from rlightning_aio._core.hosts.running.known_tasks import register_tasks
 from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
@@ -18,6 +18,7 @@ from rlightning_aio.envs.adapted.makers import RESTARTS
 from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions, says_hardware
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:

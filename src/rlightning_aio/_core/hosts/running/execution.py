@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio._core.hosts.messages import ErrorText, Moved, Raised, Result, Value
+from rlightning_aio._core.hosts.messages import Moved, Raised, Result, Value
 from rlightning_aio._core.hosts.running.renewal import HandedOn
 from rlightning_aio.envs.results import explained
 from rlightning_aio.protocol.entries import answers_with_value, op_of
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:

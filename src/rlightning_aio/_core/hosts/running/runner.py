@@ -21,7 +21,6 @@ from rlightning_aio._core.hosts.messages import (
     Attached,
     EnvStarted,
     EnvState,
-    ErrorText,
     NewSchema,
     OutOfBand,
 )
@@ -42,6 +41,7 @@ from rlightning_aio.envs.state import load_generators, save_generators, versions
 from rlightning_aio.errors import ResetNeeded
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import RENEW, Operation, answers_with_value
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.pickling import dumped
 from rlightning_aio.protocol.slab import RowLayout, Slab
