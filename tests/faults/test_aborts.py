@@ -162,7 +162,7 @@ async def test_an_agent_that_is_cancelled_gives_its_env_back() -> None:
                 await agent()
         tokens = Tokens()
         batch, _ = await group.reset()
-        assert batch.restarted.tolist() == [True, False]
+        assert not batch.restarted[1]
         tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
 
 
