@@ -90,6 +90,10 @@ def _cancel_again(task: asyncio.Task[Any] | None) -> None:
         task.cancel()
 
 
+def _read(ended: asyncio.Future[Any]) -> None:
+    _ = ended.cancelled() or ended.exception()
+
+
 class EnvEpisode:
     """What `EnvGroup.episode` returns; an asynchronous context manager.
 
@@ -137,9 +141,8 @@ class EnvEpisode:
                 step.reply.cancel()  # It will not be sent.
         if any(step.is_outstanding for step in self._open_steps):
             abort: Any = self._group.abort([self.env.env_id])
-            aborting = asyncio.ensure_future(abort)
-            # Read, so that asyncio doesn't log its error.
-            aborting.add_done_callback(lambda task: task.cancelled() or task.exception())
+            aborting: asyncio.Future[Any] = asyncio.ensure_future(abort)
+            aborting.add_done_callback(_read)  # Else asyncio logs its error.
             # However often this is cancelled, it continues, and the env is idle in the end.
             await asyncio.wait([aborting])
 
