@@ -76,7 +76,7 @@ _TICK_NS: Final = 200
 """How long it takes to read the clock. So a loop that only looks at the clock ends."""
 _START_NS: Final = 10**12
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
-_MAX_EVENTS: Final = 500_000
+_MAX_EVENTS: Final = 2_000_000
 
 
 class Deadlock(AssertionError):
