@@ -23,6 +23,7 @@ import rlightning_aio
 import rlightning_aio.sync as rl
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -202,10 +203,12 @@ class Port:
     """An awaitable env that has a port, so to speak, from its making until it has closed."""
 
     is_open = False
+    when_made: Callable[[], object] = staticmethod(lambda: None)
 
     def __init__(self) -> None:
         self.observation_space: Any = gym.spaces.Discrete(2)
         self.action_space: Any = gym.spaces.Discrete(3)
+        Port.when_made()
         if Port.is_open:
             raise OSError("port in use")
         Port.is_open = True
@@ -236,3 +239,26 @@ async def test_a_successor_is_made_when_the_env_before_it_has_closed(
         assert batch.restarted.tolist() == [True]
         batch, _ = await group.step(batch.respond(action=[SLEEP]))
         assert batch.restarted.tolist() == [False]
+
+
+async def test_an_env_that_is_aborted_as_it_is_made_closes_before_the_next(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    aborting: list[asyncio.Task[None]] = []
+    made = asyncio.Event()
+
+    def abort() -> None:
+        made.set()
+        aborting.append(asyncio.ensure_future(group.abort()))
+
+    async with rlightning_aio.build_env_group(entry(Port, placement="loop")) as group:
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=[HANG]))
+        await group.abort()
+        with monkeypatch.context() as patch:
+            patch.setattr(Port, "when_made", abort)
+            group.reset_async()
+            await made.wait()
+        await asyncio.wait(aborting)
+        batch, _ = await group.reset()
+        assert batch.is_reset.tolist() == [True]

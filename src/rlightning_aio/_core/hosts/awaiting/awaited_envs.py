@@ -198,8 +198,9 @@ class AwaitedEnvs:
         env = self._new_env(record, make)
         try:
             error = await asyncio.shield(env.made)
-        except BaseException:
+        except BaseException:  # Whatever is made next waits for its close.
             env.leave()
+            record.leaving = self._spawn(self._close(env))
             raise
         if error is None:
             if record.runner is not None:
