@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from group.sample_envs import Gate
+from kit.scripted import Counts
 
 from rlightning_aio import (
     BatchedData,
@@ -16,6 +17,7 @@ from rlightning_aio import (
     PolicyResponse,
     UnknownEnv,
     build_env_group,
+    sync,
 )
 from rlightning_aio._core.group.state.conditions import DEATH, LOST_EPISODE
 from rlightning_aio.errors import EnvRaised, EpisodeLost, GroupClosed
@@ -159,3 +161,23 @@ async def test_ordinary_steps_go_on_after_an_abort(start: Any, entry: Any) -> No
         before = batch
     conditions = getattr(group, "wrapped", group)._core.tables.conditions
     assert not conditions.unusual & (DEATH | LOST_EPISODE)
+
+
+def test_the_seed_of_an_aborted_reset_is_nobody_elses() -> None:
+    """The reset after it brings options, and so travels beside the row that has the seed."""
+
+    class Told(Counts):
+        length = 1
+
+        def told(self) -> dict[str, Any]:
+            return {"seed": -1 if self.seed is None else self.seed}
+
+    with sync.build_env_group(task=Told, placement="inline") as group:
+        group.reset_async(seed=5)
+        group.abort()
+        batch, _ = group.reset(options={"deed": 0})
+        with group.auto_reset(math.inf):
+            for _ in range(2):
+                batch, _ = group.step(batch.respond(action=[0]))
+        assert batch.is_reset.tolist() == [True]
+        assert [info["seed"] for info in batch.info()] == [-1]
