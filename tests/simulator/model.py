@@ -749,7 +749,7 @@ class Model:
                 after.append(state.copy())
                 after[-1].play(done)
             if self._may_be_rebuilt(env, request):  # And interrupted in the reset that follows.
-                env.errors = env.errors[0], self._most_errors(env)
+                env.errors, env.put_away = (env.errors[0], self._most_errors(env)), True
                 after += [env.fresh(), env.fresh()]
                 after[-1].play(Request("reset"))
             env.loose += after
