@@ -260,7 +260,7 @@ def started(
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
             text=True,
             process_group=0,  # In this session: Ctrl-Z does nothing to a group without a shell.
             # The parent may ignore some of these signals, as nohup does.
@@ -277,7 +277,8 @@ def started(
         while place == "worker" and len(found) != len(STOPS):
             forked = [one for server in children(trainers[0].pid) for one in children(server)]
             found = [one for one in forked if children(one)]
-        drained += [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
+        pipes = [pipe for process in processes for pipe in (process.stdout, process.stderr)]
+        drained += [threading.Thread(target=pipe.read, daemon=True) for pipe in pipes]
         for thread in drained:
             thread.start()
         yield found
@@ -285,13 +286,14 @@ def started(
         for process in processes:
             process.kill()
             process.wait()
-        # Their workers hold the pipes, too. A worker that outlives its port would stop the next
-        # arm with that path.
+        # Their workers and watchdogs hold pipes, too. One that outlives its port would stop the
+        # next arm with that path.
         for thread in drained:
             thread.join()
         for process in processes:
             process.stdin.close()
             process.stdout.close()
+            process.stderr.close()
 
 
 def table(found: list[Stopped]) -> str:
