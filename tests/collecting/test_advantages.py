@@ -157,7 +157,7 @@ def test_a_block_equals_cleanrl_to_the_bit(steps: int, envs: int, seed: int) -> 
     expected = cleanrl(
         rollout.reward, dones[:-1], values, next_values[:envs], dones[-1], 0.99, 0.95
     )
-    next_values[rollout.at_ends("truncated")] = 0.0
+    next_values[rollout.truncated.reshape(-1)[rollout.ends]] = 0.0
     found = rollout.advantages(values, next_values, 0.99, 0.95)
     assert found.shape == (steps, envs)
     np.testing.assert_array_equal(found, expected)
@@ -225,7 +225,7 @@ def test_values_after_a_termination_are_ignored(
         )
     rollout = rollout_of(rewards, terminated, truncated, (), [steps] * envs)
     next_values = rng.normal(size=len(rollout.ends))
-    over = np.flatnonzero(rollout.at_ends("terminated"))
+    over = np.flatnonzero(rollout.terminated.reshape(-1)[rollout.ends])
     next_values[over] = [data.draw(st.sampled_from(NOT_FINITE)) for _ in over]
     places = np.arange(steps * envs).reshape(rollout.shape)
     chains = places.T if block else places.reshape(envs, steps)
