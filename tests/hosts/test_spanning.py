@@ -65,7 +65,7 @@ async def test_a_scope_is_left_after_an_error_and_after_a_hang(config: dict[str,
 async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
     config: dict[str, Any],
 ) -> None:
-    """Its next step is answered by the first result of another, and a reset is a plain reset."""
+    """Its next step is answered by the first result of another, and a reset keeps its seed."""
     async with rl.build_env_group(config) as group:
         await group.reset(seed=5)
         batch, _ = await group.step(steps(e_0=CRASH, e_1=CRASH))
@@ -76,7 +76,8 @@ async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
         assert "ended while it was idle: hosts.spanning.Crash" in batch.info("worker_restarted")[0]
         assert (batch.info("seed"), batch.info("options")) == ([5], [None])
         batch, _ = await group.reset(seed=7, env_ids=["e-1"])
-        assert batch.restarted.tolist() == [False]
+        assert batch.is_reset.tolist() == [True]
+        assert batch.info("seed") == [8]
         batch, _ = await group.step(steps(e_0=ADD, e_1=ADD))
         assert batch.observation.tolist() == [1, 1]
 

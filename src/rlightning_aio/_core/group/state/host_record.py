@@ -262,5 +262,5 @@ class HostRecord:
 
 def last_lines(stderr_tail: str) -> str:
     """The end of a message: what a worker wrote at last."""
-    lines = stderr_tail.strip().splitlines()[-20:]
+    lines = stderr_tail.strip().splitlines()[-25:]
     return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""
