@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from cli.command import invoke, invoke_json, run, write_config
 
+from rlightning_aio.evaluation.estimates import mean_estimate
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -73,3 +75,14 @@ def test_a_rollout_says_that_its_means_favour_short_episodes(tmp_path: Path) -> 
     one = config(tmp_path, {"plain": "1"})
     assert "use rlightning-aio eval" in invoke("rollout", one, "--steps", 200).stdout
     assert "rlightning-aio eval" not in invoke("rollout", one, "--steps", 1).stdout
+
+
+def test_estimates_of_any_finite_values() -> None:
+    assert mean_estimate([]) is None
+    for values in ([1e308, 1.5e308, 1.7e308], [-1e308, 1.2e308], [5e-324, 0.0], [0.0, 0.0]):
+        found = mean_estimate(values)
+        assert found is not None
+        assert min(values) <= found.mean <= max(values)
+        assert found.low is not None
+        assert found.high is not None
+        assert found.low <= found.mean <= found.high

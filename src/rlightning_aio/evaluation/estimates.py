@@ -48,11 +48,23 @@ def mean_estimate(values: Sequence[float]) -> Estimate | None:
     if not values:
         return None
     count = len(values)
-    mean = fmean(values)
+    # Scaling by a power of two is exact, and keeps the sum of large values finite.
+    _, exponent = math.frexp(max(map(abs, values)))
+    scaled = [math.ldexp(value, -exponent) for value in values]
+    mean = fmean(scaled)
     if count == 1:
-        return Estimate(mean, None, None, 1)
-    half = _student_quantile(count - 1) * stdev(values) / math.sqrt(count)
-    return Estimate(mean, mean - half, mean + half, count)
+        return Estimate(values[0], None, None, 1)
+    half = _student_quantile(count - 1) * stdev(scaled) / math.sqrt(count)
+    low, middle, high = (_grown(value, exponent) for value in (mean - half, mean, mean + half))
+    return Estimate(middle, low, high, count)
+
+
+def _grown(value: float, exponent: int) -> float:
+    """Return ``value * 2**exponent``, or infinity on overflow."""
+    try:
+        return math.ldexp(value, exponent)
+    except OverflowError:
+        return math.copysign(math.inf, value)
 
 
 def wilson_estimate(successes: int, count: int) -> Estimate | None:
