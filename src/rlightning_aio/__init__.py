@@ -43,38 +43,25 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 _HOMES = {
-    "batch": ("BatchedData",),
-    "collecting": ("Collector",),
-    "config": ("EnvConfig", "load_config"),
-    "envs.base": ("BaseEnv",),
-    "errors": (
-        "BadAction",
-        "ClientRefused",
-        "ConfigError",
-        "EnvAway",
-        "EnvBusy",
-        "EnvError",
-        "EnvFault",
-        "EnvHung",
-        "EnvRaised",
-        "GroupClosed",
-        "NothingPending",
-        "RLightningError",
-        "ResetNeeded",
-        "ResetNeeded",
-        "SnapshotError",
-        "StartFailed",
-        "UnknownEnv",
-        "WorkerDied",
-    ),
-    "_core.group.api.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
-    "evaluation": ("evaluate",),
-    "outcomes": ("Outcome",),
-    "registry": ("ENVS",),
-    "spaces": ("Anything",),
-    "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
+    "ENVS": "registry",
+    "Anything": "spaces",
+    "BaseEnv": "envs.base",
+    "BatchedData": "batch",
+    "Collector": "collecting",
+    "EnvConfig": "config",
+    "EnvGroup": "_core.group.api.aio",
+    "EnvHandle": "_core.group.api.aio",
+    "EnvMeta": "types",
+    "EnvRet": "types",
+    "MultiAgentEnvRet": "types",
+    "Outcome": "outcomes",
+    "PolicyResponse": "types",
+    "build_env_group": "_core.group.api.aio",
+    "evaluate": "evaluation",
+    "load_config": "config",
+    "run": "_core.group.api.aio",
 }
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
+"""Modules of names; all others are errors."""
 
 __all__ = [
     "ENVS",
@@ -115,9 +102,10 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    home = _HOMES.get(name, "errors")
+    value = getattr(importlib.import_module(f"{__name__}.{home}"), name)
     globals()[name] = value
     return value
 

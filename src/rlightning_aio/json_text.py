@@ -11,8 +11,6 @@ from typing import Any
 
 from rlightning_aio.trees import converted
 
-__all__ = ["finite", "json_of"]
-
 
 def json_of(value: Any, *, indent: int | None = None) -> str:
     """Return `value`, made of dicts, lists, texts and numbers, as JSON."""

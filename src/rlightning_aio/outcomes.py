@@ -12,18 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, ge
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-__all__ = [
-    "BLAMES",
-    "Blame",
-    "Loss",
-    "Outcome",
-    "OutcomeKind",
-    "TimeSpent",
-    "bystanders",
-    "is_bystanders",
-    "own_end",
-]
-
 OutcomeKind: TypeAlias = Literal[
     "terminated",
     "truncated",

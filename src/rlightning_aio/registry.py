@@ -23,22 +23,6 @@ if TYPE_CHECKING:
 
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = [
-    "BACKENDS",
-    "CALLABLE",
-    "ENVS",
-    "PLACEMENTS",
-    "Backend",
-    "Placement",
-    "Registry",
-    "did_you_mean",
-    "is_mujocos",
-    "is_of_simulator",
-    "load",
-    "placement_of",
-    "plugins",
-]
-
 CALLABLE: Final = "callable"
 """Backend of envs that come from a callable."""
 

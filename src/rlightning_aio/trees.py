@@ -19,28 +19,6 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = [
-    "Node",
-    "Path",
-    "Tree",
-    "array_of_tensor",
-    "as_array",
-    "as_numpy",
-    "converted",
-    "copied",
-    "holds_tensor",
-    "index",
-    "is_dict",
-    "is_tensor",
-    "is_tuple",
-    "key_of",
-    "mapped",
-    "stacked",
-    "tree_of",
-    "walked",
-    "zipped",
-]
-
 Tree: TypeAlias = Any
 """An array, or a dict or tuple of trees."""
 Path: TypeAlias = tuple[Any, ...]

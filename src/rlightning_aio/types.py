@@ -12,16 +12,6 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import gymnasium as gym
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-__all__ = [
-    "Autoreset",
-    "ClientTraits",
-    "EnvMeta",
-    "EnvRet",
-    "MultiAgentEnvRet",
-    "PolicyResponse",
-    "unchecked",
-]
-
 Autoreset: TypeAlias = Literal["disabled", "next_step", "same_step"]
 """See `EnvMeta`."""
 

@@ -15,8 +15,6 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.plugins.piper import guard
 from rlightning_aio.plugins.piper.guard import SafeStop
 
-__all__ = ["CameraOptions", "Limit", "PiperOptions", "action_limits", "check_reset_position"]
-
 # The bounds of the end pose contain the arm's reach; the arm refuses unreachable poses.
 JOINT_LIMITS = {f"joint_{i}": limits for i, limits in enumerate(guard.JOINT_LIMITS, 1)}
 POSE_LIMITS = {
