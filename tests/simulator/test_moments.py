@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from kit.scripted import Counts
-from simulator.world import World
+from simulator.world import Deadlock, World
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -150,6 +150,19 @@ def test_without_a_limit_a_request_may_take_any_time(world: World) -> None:
     with built(entry(step_timeout=5.0)) as group:
         batch, _ = group.reset(options={"takes": 1e5})
         assert not batch.restarted.any()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "end"), [([9] * 4, ""), ([0, 99, 0, 0], "hung in a step and was killed")]
+)
+def test_an_actor_has_the_time_limits_of_all_its_steps(
+    world: World, seconds: list[int], end: str
+) -> None:
+    """It executes them in turn, and doesn't tell which of them takes so long."""
+    with built(entry(4, placement="ray", envs_per_process=4, step_timeout=10.0)) as group:
+        batch, _ = group.reset()
+        batch, _ = group.step(batch.respond(action=seconds))
+        assert cause(batch) == [end] * 4
 
 
 def test_a_worker_that_survives_its_kill_ends_with_its_fork_server(world: World) -> None:
@@ -452,3 +465,20 @@ def test_calls_go_on_when_one_is_cancelled(world: World) -> None:
 
     for whose in (0, 3):
         world.run(main(whose))
+
+
+def test_a_program_that_goes_on_without_end_fails(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing happens in its world: its event loop turns."""
+    monkeypatch.setattr("simulator.world._MAX_EVENTS", 1000)
+
+    def turn() -> None:
+        asyncio.get_running_loop().call_soon(turn)
+
+    async def main() -> None:
+        turn()
+        await asyncio.Event().wait()
+
+    with pytest.raises(Deadlock):
+        world.run(main())

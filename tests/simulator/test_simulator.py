@@ -7,6 +7,8 @@ import logging
 import shutil
 import subprocess
 import sys
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,7 @@ import pytest
 from simulator.coverage import ROWS, row_key, rows
 from simulator.program import draw
 from simulator.runs import run, run_twice, shown, shrunk
+from simulator.world import Faults
 
 from rlightning_aio._core.group.state.episodes import Episodes
 
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
 
 CHUNKS, SEEDS = 5, 15
+STORM = Faults(deaths=0.03, stops=0.02, interrupts=0.02, lags=0.02, starts=0.1, fork_servers=0.02)
 ROOT = Path(__file__).parents[2]
 TRACES = """
 import sys
@@ -57,6 +61,14 @@ def test_programs_do_what_the_model_says(chunk: int) -> None:
         program = draw(seed)
         found = run_twice(program) if seed % 5 == 0 else run(program)
         assert not found.error, shown(shrunk(found, run_twice))
+
+
+def test_groups_survive_every_kind_of_fault() -> None:
+    programs = [replace(draw(seed), faults=STORM) for seed in range(40)]
+    runs = [run(one) for one in programs if one.kind == "group" and "async" not in one.features]
+    assert not [shown(found) for found in runs if found.error]
+    counts = sum((found.counts for found in runs), Counter[str]())
+    assert counts.keys() >= {"deaths", "stops", "interrupts", "lags", "slow starts", "refusals"}
 
 
 def test_the_same_happens_in_another_folder(tmp_path: Path) -> None:
