@@ -126,6 +126,22 @@ def test_a_hang_is_ended_in_time(world: World, begun: float, is_stopped: bool) -
         assert batch.restarted.tolist() == [True, False]
 
 
+def test_a_hang_is_ended_though_an_earlier_worker_ended_before_its_kill(world: World) -> None:
+    """It replied as its stacks were written, and its env went over to the next worker."""
+    with built(entry(step_timeout=8.0, recycle={"episodes": 1})) as group:
+        group.reset()
+        ask(group, e0=8.1)
+        assert not group.collect_async()[0].restarted.any()
+        for _ in range(2):  # To the other host, and back.
+            group.reset()
+            group.step(rl.BatchedData(["e-0"], [rl.PolicyResponse("e-0", 1.0)]))
+        assert group.metrics()["envs/recycled"] == 2
+        with takes(world, 8.0, 10.5):
+            ask(group, e0=FOR_EVER)
+            batch, _ = group.collect_async()
+        assert cause(batch) == ["hung in a step and was killed"]
+
+
 def test_workers_are_looked_at_a_few_times_within_the_shortest_limit(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:

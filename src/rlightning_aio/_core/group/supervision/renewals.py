@@ -102,7 +102,10 @@ class Renewals:
         """Note that the worker of a host has closed, or has died with a next one in the peer."""
         assert record.peer is not None
         record.stage, record.start_by, record.restart_at = Stage.CLOSED, None, None
-        record.deaths, record.dying, record.peer.is_next = {}, False, False
+        record.deaths, record.peer.is_next = {}, False
+        # It may have ended before it was killed, and nothing of that concerns the next one here.
+        record.dying, record.die_by, record.is_hung = False, None, False
+        record.abort_by, record.aborted_slot = {}, None
         self._note_change()
 
     def give_back(self, record: HostRecord) -> None:
