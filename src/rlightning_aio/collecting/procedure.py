@@ -1,14 +1,14 @@
 """One code for both kinds of groups: procedures, run with or without ``await``.
 
-A procedure is a generator that yields functions to call, and is sent their results. Only the two
-functions that run it differ between asynchronous and synchronous groups.
+A procedure is a generator that yields functions to call, and is sent their results. One coroutine
+runs it. With a synchronous group nothing in it is awaited, so it ends at its first step.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
 
@@ -22,50 +22,32 @@ Procedure: TypeAlias = Generator[Callable[[], Any], Any, T]
 
 
 def run(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
-    """Run `procedure` to its end: synchronously, or as a coroutine if `group` is asynchronous."""
-    if isinstance(group, AsyncEnvGroup):
-        return _awaited(procedure)
-    return _called(procedure)
-
-
-def _called(procedure: Procedure[T]) -> T:
-    """Run `procedure` to its end, synchronously.
+    """Run `procedure` to its end: synchronously, or as a coroutine if `group` is asynchronous.
 
     Raises:
-        TypeError: a call must be awaited.
+        TypeError: `group` is synchronous, and a call must be awaited.
     """
+    awaits = isinstance(group, AsyncEnvGroup)
+    running = _run(procedure, awaits=awaits)
+    if awaits:
+        return running
+    try:
+        running.send(None)
+    except StopIteration as end:
+        return end.value
+    raise AssertionError("nothing is awaited")
+
+
+async def _run(procedure: Procedure[T], *, awaits: bool) -> T:
+    """Run `procedure` to its end; awaitable results of calls are awaited, or refused."""
     try:
         call = next(procedure)
         while True:
             try:
                 value = call()
                 if hasattr(value, "__await__"):
-                    _discard(value)
-                    raise TypeError(
-                        "a policy that is a coroutine function needs an asynchronous group: "
-                        "rlightning_aio.build_env_group, not rlightning_aio.sync's"
-                    )
-            except BaseException as error:
-                call = procedure.throw(error)
-            else:
-                call = procedure.send(value)
-    except StopIteration as stop:
-        return stop.value
-
-
-def _discard(value: Any) -> None:
-    if inspect.iscoroutine(value):
-        value.close()
-
-
-async def _awaited(procedure: Procedure[T]) -> T:
-    """Run `procedure` to its end, and await awaitable results of calls."""
-    try:
-        call = next(procedure)
-        while True:
-            try:
-                value = call()
-                if hasattr(value, "__await__"):
+                    if not awaits:
+                        _refuse(value)
                     value = await value
             except BaseException as error:
                 call = procedure.throw(error)
@@ -73,3 +55,12 @@ async def _awaited(procedure: Procedure[T]) -> T:
                 call = procedure.send(value)
     except StopIteration as stop:
         return stop.value
+
+
+def _refuse(value: Any) -> NoReturn:
+    if inspect.iscoroutine(value):
+        value.close()
+    raise TypeError(
+        "a policy that is a coroutine function needs an asynchronous group: "
+        "rlightning_aio.build_env_group, not rlightning_aio.sync's"
+    )

@@ -15,25 +15,39 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_OF_BOTH: Final = (
-    "__contains__", "__delitem__", "__eq__", "__ge__", "__getitem__", "__gt__", "__iter__",
-    "__le__", "__len__", "__lt__", "__ne__", "__repr__", "__reversed__", "__setitem__", "clear",
-    "copy", "pop",
-)  # fmt: skip
-_OF_LISTS: Final = (
-    "__add__", "__iadd__", "__imul__", "__mul__", "__rmul__", "append", "count", "extend", "index",
-    "insert", "remove", "reverse", "sort",
-)  # fmt: skip
-_OF_DICTS: Final = (
-    "__ior__", "__or__", "__ror__", "get", "items", "keys", "popitem", "setdefault", "update",
-    "values",
-)  # fmt: skip
+_READS_NOTHING: Final = {
+    "__class_getitem__", "__doc__", "__getattribute__", "__hash__", "__init__", "__new__",
+    "__sizeof__", "fromkeys",
+}  # fmt: skip
+"""Of a list or a dict; all else that they define reads or changes what they hold."""
 
 _MAKING: Final = threading.RLock()
 """Held while infos are made, so that another thread that reads them waits until they are there."""
 
 
-class LazyInfos(list[dict[str, Any]]):
+class _Lazy:
+    """What is made by the first call of any of its methods."""
+
+    __slots__ = ()
+
+    _kind: Any  # A list or a dict.
+    _make: Callable[[], Any] | None
+
+    def fill(self) -> None:
+        """Make what it holds, unless that has been done."""
+        if self._make is None:
+            return
+        with _MAKING:
+            if self._make is not None:
+                self._kind.__init__(self, self._make())
+                self._make = None
+
+    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
+        """Pickle and copy as a plain list or dict."""
+        return self._kind, (self._kind(self),)
+
+
+class LazyInfos(_Lazy, list[dict[str, Any]]):
     """A list that is made by the first call of any of its methods.
 
     Args:
@@ -42,32 +56,18 @@ class LazyInfos(list[dict[str, Any]]):
 
     __slots__ = ("_make",)
 
-    # Mutable, as any list.
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    _kind = list
 
     def __init__(self, make: Callable[[], list[dict[str, Any]]]) -> None:
         super().__init__()
-        self._make: Callable[[], list[dict[str, Any]]] | None = make
-
-    def fill(self) -> None:
-        """Make the elements, unless that has been done."""
-        if self._make is None:
-            return
-        with _MAKING:
-            if self._make is not None:
-                super().extend(self._make())
-                self._make = None
+        self._make = make
 
     def __radd__(self, other: list[dict[str, Any]]) -> list[dict[str, Any]]:
         """Concatenate; a plain list's own method would read the elements past this class."""
         return other + list(self)
 
-    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
-        """Pickle and copy as a plain list."""
-        return list, (list(self),)
 
-
-class LazyColumns(dict[str, Any]):
+class LazyColumns(_Lazy, dict[str, Any]):
     """A dict that is made by the first call of any of its methods.
 
     Left out: `json.dumps`, which looks into a dict past its methods, and can't write arrays anyway.
@@ -79,8 +79,7 @@ class LazyColumns(dict[str, Any]):
 
     __slots__ = ("_make", "_make_each")
 
-    # Mutable, as any dict.
-    __hash__ = None  # pyright: ignore[reportAssignmentType]
+    _kind = dict
 
     def __init__(
         self,
@@ -88,25 +87,12 @@ class LazyColumns(dict[str, Any]):
         make_each: Callable[[], list[dict[str, Any]]] | None = None,
     ) -> None:
         super().__init__()
-        self._make: Callable[[], dict[str, Any]] | None = make
+        self._make = make
         self._make_each = make_each
 
     def each(self) -> list[dict[str, Any]] | None:
         """Return the infos of the single envs; None if only the columns say what they are now."""
         return None if self._make is None or self._make_each is None else self._make_each()
-
-    def fill(self) -> None:
-        """Make the entries, unless that has been done."""
-        if self._make is None:
-            return
-        with _MAKING:
-            if self._make is not None:
-                super().update(self._make())
-                self._make = None
-
-    def __reduce_ex__(self, protocol: object) -> tuple[Any, ...]:
-        """Pickle and copy as a plain dict."""
-        return dict, (dict(self),)
 
 
 def _filling(kind: type[Any], name: str) -> Callable[..., Any]:
@@ -120,7 +106,6 @@ def _filling(kind: type[Any], name: str) -> Callable[..., Any]:
     return call
 
 
-for _name in (*_OF_BOTH, *_OF_LISTS):
-    setattr(LazyInfos, _name, _filling(list, _name))
-for _name in (*_OF_BOTH, *_OF_DICTS):
-    setattr(LazyColumns, _name, _filling(dict, _name))
+for _lazy, _plain in ((LazyInfos, list), (LazyColumns, dict)):
+    for _name in vars(_plain).keys() - _READS_NOTHING:
+        setattr(_lazy, _name, _filling(_plain, _name))
