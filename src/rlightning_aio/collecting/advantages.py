@@ -8,7 +8,7 @@ formulas.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -75,43 +75,42 @@ class Segments:
         return found
 
 
-def gae(
-    segments: Segments,
-    rewards: NDArray[Any],
-    terminated: NDArray[np.bool_],
-    values: NDArray[Any],
-    next_values: NDArray[Any],
-    gamma: float,
-    lam: float,
-    stops: NDArray[np.bool_] | None = None,
-) -> NDArray[Any]:
+class Chains(NamedTuple):
+    """What advantages are computed from.
+
+    Attributes:
+        segments: of the transitions.
+        rewards, terminated: ``[n]``.
+        values: ``[n]``, whose dtype the results have.
+        next_values: ``[k]``, after the ends of segments; ignored after a termination.
+        stops: ``[n]``, further ends, inside segments: those of an agent that ends before others.
+    """
+
+    segments: Segments
+    rewards: NDArray[Any]
+    terminated: NDArray[np.bool_]
+    values: NDArray[Any]
+    next_values: NDArray[Any]
+    stops: NDArray[np.bool_] | None
+
+    def errors(self, after: NDArray[Any], gamma: float) -> NDArray[Any]:
+        """Return those of the values if `after` are the next ones, but 0 after a termination."""
+        # Without a product, as 0 times infinity is NaN.
+        return self.rewards + gamma * np.where(self.terminated, 0, after) - self.values
+
+
+def gae(chains: Chains, gamma: float, lam: float) -> NDArray[Any]:
     """Generalised advantage estimation (Schulman et al., 2016, arXiv:1506.02438, eq. 16).
 
-    `rewards`, `terminated` and `values` are ``[n]``; `next_values` after the ends of segments are
-    ``[k]``, ignored after a termination. `gamma` is the discount, `lam` is λ. `stops` marks
-    further ends, inside segments: those of an agent that ends before others.
+    `gamma` is the discount, `lam` is λ.
     """
-    after = _until(terminated, segments.successors(values, next_values))
-    errors = rewards + gamma * after - values
-    return segments.backwards(errors.astype(values.dtype, copy=False), gamma * lam, stops)
-
-
-def _until(terminated: NDArray[np.bool_], after: NDArray[Any]) -> NDArray[Any]:
-    """Set values after a termination to 0, without a product: 0 times infinity is NaN."""
-    return np.where(terminated, 0, after)
+    segments, values = chains.segments, chains.values
+    errors = chains.errors(segments.successors(values, chains.next_values), gamma)
+    return segments.backwards(errors.astype(values.dtype, copy=False), gamma * lam, chains.stops)
 
 
 def vtrace(
-    segments: Segments,
-    rewards: NDArray[Any],
-    terminated: NDArray[np.bool_],
-    values: NDArray[Any],
-    next_values: NDArray[Any],
-    log_ratios: NDArray[Any],
-    gamma: float,
-    lam: float,
-    clip: float,
-    stops: NDArray[np.bool_] | None = None,
+    chains: Chains, log_ratios: NDArray[Any], gamma: float, lam: float, clip: float
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """V-trace (Espeholt et al., 2018, arXiv:1802.01561, eq. 1 and section 4.2).
 
@@ -120,16 +119,16 @@ def vtrace(
     are clipped at `clip`, and so are those that carry corrections back (the paper's traces c,
     scaled by `lam`, remark 2).
     """
+    segments, values, stops = chains.segments, chains.values, chains.stops
     dtype = values.dtype
     ratios = np.exp(log_ratios).astype(dtype, copy=False)
     rhos = np.minimum(ratios, dtype.type(clip))
     traces = lam * rhos
-    after = segments.successors(values, next_values)
-    errors = rhos * (rewards + gamma * _until(terminated, after) - values)
-    corrections = segments.backwards(errors.astype(dtype, copy=False), gamma * traces, stops)
-    targets = values + corrections
-    following = segments.successors(targets, next_values)
+    errors = rhos * chains.errors(segments.successors(values, chains.next_values), gamma)
+    traced = segments.backwards(errors.astype(dtype, copy=False), gamma * traces, stops)
+    targets = values + traced
+    after = segments.successors(targets, chains.next_values)
     # A stop's successor is not part of its chain, so its value is used instead of its target.
-    after = following if stops is None else np.where(stops, after, following)
-    advantages = rhos * (rewards + gamma * _until(terminated, after) - values)
-    return targets, advantages.astype(dtype, copy=False)
+    if stops is not None:
+        after = np.where(stops, segments.successors(values, chains.next_values), after)
+    return targets, (rhos * chains.errors(after, gamma)).astype(dtype, copy=False)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cached_property, partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.collecting.advantages import Segments, gae, vtrace
+from rlightning_aio.collecting.advantages import Chains, Segments, gae, vtrace
 from rlightning_aio.collecting.trees import with_lists
-from rlightning_aio.trees import Tree, zipped
+from rlightning_aio.trees import Tree, mapped, zipped
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -86,7 +87,6 @@ class Rollout:
         self.shape: tuple[int, ...] = index.shape
         self.ends, self._end_observation = ends
         self.episodes = episodes
-        self._segments: Segments | None = None
 
     @property
     def num_chains(self) -> int:
@@ -138,11 +138,9 @@ class Rollout:
 
     # -- chains -------------------------------------------------------------------
 
-    def _chains(self) -> Segments:
-        if self._segments is None:
-            stride = self.shape[1] if len(self.shape) > 1 else 1
-            self._segments = Segments(self.ends, len(self), stride)
-        return self._segments
+    @cached_property
+    def _segments(self) -> Segments:
+        return Segments(self.ends, len(self), self.shape[1] if len(self.shape) > 1 else 1)
 
     @property
     def next_observation(self) -> Tree:
@@ -150,7 +148,7 @@ class Rollout:
 
         def after(leaf: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
             flat = self._flat(leaf)
-            return self._chains().successors(flat, ends).reshape(leaf.shape)
+            return self._segments.successors(flat, ends).reshape(leaf.shape)
 
         return with_lists(zipped(after, self._columns["observation"], self._end_observation))
 
@@ -180,21 +178,7 @@ class Rollout:
         Raises:
             ValueError: an argument has another shape.
         """
-        if isinstance(values, dict):
-            return {
-                agent: self._gae(agent, own, next_values[agent], gamma, lam)
-                for agent, own in cast("dict[str, Any]", values).items()
-            }
-        return self._gae(None, values, next_values, gamma, lam)
-
-    def _gae(
-        self, agent: str | None, values: Any, next_values: Any, gamma: float, lam: float
-    ) -> NDArray[Any]:
-        now, after = self._checked(values, next_values)
-        reward, terminated = self._of(agent, "reward"), self._of(agent, "terminated")
-        stops = None if agent is None else self._of(agent, "done")
-        found = gae(self._chains(), reward, terminated, now, after, gamma, lam, stops)
-        return found.reshape(self.shape)
+        return self._by_agent(partial(gae, gamma=gamma, lam=lam), values, next_values)
 
     def vtrace(
         self,
@@ -226,41 +210,41 @@ class Rollout:
         Raises:
             ValueError: an argument has another shape.
         """
-        if isinstance(values, dict):
-            return {
-                agent: self._vtrace(
-                    agent, own, next_values[agent], log_ratios[agent], gamma, lam, clip
-                )
-                for agent, own in cast("dict[str, Any]", values).items()
-            }
-        return self._vtrace(None, values, next_values, log_ratios, gamma, lam, clip)
+        traced = partial(vtrace, gamma=gamma, lam=lam, clip=clip)
+        return self._by_agent(traced, values, next_values, log_ratios)
 
-    def _vtrace(
+    def _by_agent(
+        self, compute: Callable[..., Any], values: Any, next_values: Any, *log_ratios: Any
+    ) -> Any:
+        """Compute what has the shape of the rollout; a dict of such if `values` are one."""
+        given = values, next_values, *log_ratios
+        if not isinstance(values, dict):
+            return self._computed(compute, None, *given)
+        agents = cast("dict[str, Any]", values)
+        return {
+            agent: self._computed(compute, agent, *(one[agent] for one in given))
+            for agent in agents
+        }
+
+    def _computed(
         self,
+        compute: Callable[..., Any],
         agent: str | None,
         values: Any,
         next_values: Any,
-        log_ratios: Any,
-        gamma: float,
-        lam: float,
-        clip: float,
-    ) -> _Pair:
+        *log_ratios: Any,
+    ) -> Any:
         now, after = self._checked(values, next_values)
-        ratios = self._rows("log_ratios", log_ratios)
-        reward, terminated = self._of(agent, "reward"), self._of(agent, "terminated")
-        targets, advantages = vtrace(
-            self._chains(),
-            reward,
-            terminated,
+        chains = Chains(
+            self._segments,
+            self._of(agent, "reward"),
+            self._of(agent, "terminated"),
             now,
             after,
-            ratios,
-            gamma,
-            lam,
-            clip,
             None if agent is None else self._of(agent, "done"),
         )
-        return targets.reshape(self.shape), advantages.reshape(self.shape)
+        found = compute(chains, *(self._rows("log_ratios", ratios) for ratios in log_ratios))
+        return mapped(lambda flat: flat.reshape(self.shape), found)
 
     def _of(self, agent: str | None, name: str) -> NDArray[Any]:
         column = self[name]
