@@ -15,10 +15,4 @@ def seed_of(session: int, episode: int) -> int:
 def action_of(kind: str, session: int, episode: int, step: int) -> dict[str, Any]:
     if kind == "dice":
         return {"move": (session + episode) % 4}
-    if kind == "echo":
-        return {"message": f"{session} {episode} {step}: é" * (step % 3)}
-    if step == 0:
-        return {"type": "list_tools"}
-    arguments = [{"amount": session + episode}, {"text": f"{episode}"}, {}][step - 1]
-    tool = ["add", "fail", "unknown"][step - 1]
-    return {"type": "call_tool", "tool_name": tool, "arguments": arguments}
+    return {"message": f"{session} {episode} {step}: é" * (step % 3)}

@@ -3,8 +3,8 @@
 Usage: openenv_server.py serve KIND PORT SESSIONS
        openenv_server.py direct KIND SESSIONS EPISODES
 
-`echo` is the env of OpenEnv's own template, `dice` has a seed and a time limit, and `tools` is
-called as an MCP server is. `direct` prints what each session's episodes return, as JSON.
+`echo` is the env of OpenEnv's own template, and `dice` has a seed and a time limit. `direct` prints
+what each session's episodes return, as JSON.
 """
 
 # It runs in a Python of its own, with packages that are not here.
@@ -17,16 +17,13 @@ import random
 import shutil
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
 import openenv
 import uvicorn
-from fastmcp import FastMCP
 from openenv.core.env_server import create_app
 from openenv.core.env_server.interfaces import Environment
-from openenv.core.env_server.mcp_environment import MCPEnvironment
 from openenv.core.env_server.serialization import deserialize_action
 from openenv.core.env_server.types import Action, Observation, State
 from openenv_actions import STEPS, action_of, seed_of
@@ -42,7 +39,7 @@ class Rolled(Observation):
 
 
 class Dice(Environment):
-    """Adds moves up; ends at ten, or is truncated after six steps. A negative move never ends."""
+    """Adds moves up; ends at ten, or is truncated after six steps."""
 
     SUPPORTS_CONCURRENT_SESSIONS = True
 
@@ -61,62 +58,11 @@ class Dice(Environment):
         return self._rolled(metadata={"seed": seed})
 
     def step(self, action: Move, timeout_s: float | None = None, **kwargs: Any) -> Rolled:
-        if action.move < 0:
-            time.sleep(3600)
         self.total += action.move
         self._state.step_count += 1
         late = self._state.step_count >= 6
         done = late or self.total >= 10
         return self._rolled(reward=float(action.move), done=done, metadata={"late": late})
-
-    @property
-    def state(self) -> State:
-        return self._state
-
-
-class Tools(MCPEnvironment):
-    """Tools that add to a number, and that raise."""
-
-    SUPPORTS_CONCURRENT_SESSIONS = True
-
-    def __init__(self) -> None:
-        server = FastMCP("calculator")
-        self.total = 0
-        self._state = State()
-
-        @server.tool
-        def add(amount: int) -> int:
-            """Add to the number."""
-            self.total += amount
-            return self.total
-
-        @server.tool
-        def fail(text: str) -> str:
-            """Raise an error."""
-            raise ValueError(text)
-
-        super().__init__(server)
-
-    def reset(self, seed: int | None = None, episode_id: str | None = None, **_: Any) -> Any:
-        self.total = seed or 0
-        self._state = State(episode_id=episode_id, step_count=0)
-        return Observation(done=False, reward=0.0, metadata={"seed": seed})
-
-    def step(self, action: Action, timeout_s: float | None = None, **kwargs: Any) -> Observation:
-        return self._judged(super().step(action, timeout_s, **kwargs))
-
-    async def step_async(
-        self, action: Action, timeout_s: float | None = None, **kwargs: Any
-    ) -> Observation:
-        return self._judged(await super().step_async(action, timeout_s, **kwargs))
-
-    def _judged(self, observation: Observation) -> Observation:
-        self._state.step_count += 1
-        observation.reward, observation.done = float(self.total), self._state.step_count >= 4
-        return observation
-
-    def _step_impl(self, action: Action, timeout_s: float | None = None, **_: Any) -> Observation:
-        raise NotImplementedError
 
     @property
     def state(self) -> State:
@@ -145,9 +91,7 @@ def echo() -> tuple[Any, Any, Any]:
 
 def classes(kind: str) -> tuple[Any, Any, Any]:
     """The classes of the env, of its actions and of its observations."""
-    if kind == "echo":
-        return echo()
-    return (Dice, Move, Rolled) if kind == "dice" else (Tools, Action, Observation)
+    return echo() if kind == "echo" else (Dice, Move, Rolled)
 
 
 def direct(kind: str, sessions: int, episodes: int) -> list[Any]:

@@ -146,3 +146,16 @@ def test_the_examples_end_with_their_tables(
     monkeypatch.setenv("ISAACSIM_ASSET_ROOT", str(assets))
     table = closing_table(name, f"envs.0.interpreter={PYTHON}", "--steps", "128")
     assert steps(table["steps"]) == 128
+
+
+def test_six_simulators_share_a_group(
+    bare: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The config of all runs unchanged, too, with a column for each entry at the end."""
+    for simulator in ("ale_py", "mani_skill", "mpe2", "piper_sdk"):
+        pytest.importorskip(simulator)
+    assets, _ = bare
+    monkeypatch.setenv("ISAACSIM_ASSET_ROOT", str(assets))
+    table = closing_table("zoo", f"envs.3.interpreter={PYTHON}", "--steps", "2000")
+    names = {"cheetah", "pong", "pick_cube", "isaac_cartpole", "spread", "piper"}
+    assert names <= {*table["all"]}

@@ -169,6 +169,18 @@ async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_ag
 
 
 @on_asyncio
+async def test_other_messages_of_openenv_are_methods() -> None:
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
+        await group.reset()
+        await group.step(steps_of("o-0"))
+        assert (await group["o-0"].call("state"))["step_count"] == 1
+        assert await group["o-0"].call("mcp", "tools/list", {"a": 1}) == {"result": {"a": 1}}
+
+
+@on_asyncio
 async def test_an_env_queues_while_its_server_is_full() -> None:
     async with Misbehaving(capacity=1) as server:
         first = rl.build_env_group(entry(server.url, num_workers=1))
