@@ -77,15 +77,9 @@ def _adopted(
 
 
 class _GivenEnv(GymnasiumEnv):
-    def __init__(
-        self,
-        made: Any,
-        config: EnvConfig,
-        worker_index: int,
-        preprocess_fn: PreprocessFn | None,
-    ) -> None:
+    def __init__(self, made: Any, *args: Any) -> None:
         self._made = made
-        super().__init__(config, worker_index, preprocess_fn)
+        super().__init__(*args)
 
     def stop(self) -> None:
         """Call the method of that name of the outermost wrapper or env that has one."""
@@ -127,14 +121,8 @@ class _AwaitableEnv(FastPath, BaseEnv):
     A space that it doesn't have is `Anything`.
     """
 
-    def __init__(
-        self,
-        made: Any,
-        config: EnvConfig,
-        worker_index: int,
-        preprocess_fn: PreprocessFn | None,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn)
+    def __init__(self, made: Any, *args: Any) -> None:
+        super().__init__(*args)
         self.env = made
         self.switches_task = bool(getattr(made, "switches_task", False))
 

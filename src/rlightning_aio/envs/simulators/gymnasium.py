@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import SyncVectorEnv
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.base import BaseEnv, result_of
 from rlightning_aio.envs.fast_path import BareReset, BareStep, FastPath
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
 from rlightning_aio.sharing import check_threads, num_cores
@@ -36,14 +36,8 @@ class GymnasiumEnv(FastPath, BaseEnv):
     ``env_kwargs``), or a loop over that number of envs if the task has none.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         self.env = self._make()
         self._is_vector = isinstance(self.env, gym.vector.VectorEnv)
         if self._is_vector:

@@ -8,26 +8,26 @@ Left out: more than one live env in a process, which the simulator does not supp
 from __future__ import annotations
 
 import importlib
-from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn
+from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.simulators.isaac_task import make_simulator
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.trees import mapped
-from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.types import PolicyResponse
 
 
 class _IsaacEnv(BaseEnv):
-    """The shared part of both backends: construction, seeds, conversion of actions and results.
+    """Both backends: what differs is whether the task has agents, and then all is by agent.
 
     Sub-environments that finish are reset by the simulator within the same step, so the
     observation that comes with ``last_terminated`` or ``last_truncated`` is already the
@@ -40,19 +40,13 @@ class _IsaacEnv(BaseEnv):
     default_env_class: ClassVar[str | None] = None
     live_env_id: ClassVar[str | None] = None
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         self._fresh = True
         self._claim_process()
         try:
             self.env = make_simulator(
-                self.env_id, self.config, self.default_env_class, worker_index
+                self.env_id, self.config, self.default_env_class, self.worker_index
             )
         except BaseException:
             _IsaacEnv.live_env_id = None
@@ -69,16 +63,54 @@ class _IsaacEnv(BaseEnv):
             )
         _IsaacEnv.live_env_id = self.env_id
 
-    def _reset_simulator(
-        self, seed: int | list[int] | None, options: dict[str, Any] | None
-    ) -> tuple[Any, dict[str, Any]]:
+    def _single_spaces(self, what: str) -> Any:
+        """The space of one sub-environment's observations or actions, or such by agent."""
+        return getattr(self.env, f"{what}_spaces" if self.agents else f"single_{what}_space")
+
+    def _batched(self, what: str) -> gym.Space[Any]:
+        spaces = self._single_spaces(what)
+        if self.agents:
+            spaces = gym.spaces.Dict({agent: spaces[agent] for agent in self.agents})
+        return spaces if self.num_envs == 1 else batch_space(spaces, self.num_envs)
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return self._batched("observation")
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return self._batched("action")
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet | MultiAgentEnvRet:
         """Reset every sub-environment; the simulator has one generator for all of them."""
         first_seed = seed[0] if isinstance(seed, list) else seed
         if self._fresh:
             # The first reset after construction reports the velocities from before it.
             self.env.reset(seed=first_seed, options=options)
             self._fresh = False
-        return self.env.reset(seed=first_seed, options=options)
+        observation, extras = self.env.reset(seed=first_seed, options=options)
+        return self._result(observation, self._log(extras) | self._by_agent(extras))
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet | MultiAgentEnvRet:
+        given, spaces = self._preprocess_fn(policy_resp), self._single_spaces("action")
+        if self.agents:
+            actions = {agent: self._tensor(given[agent], spaces[agent]) for agent in self.agents}
+        else:
+            actions = self._tensor(given, spaces)
+        observation, reward, terminated, truncated, extras = self.env.step(actions)
+        return self._result(
+            observation,
+            self._ended(extras) | self._by_agent(extras),
+            last_reward=mapped(self._scalar_or_own, reward),
+            last_terminated=mapped(self._scalar_or_own, terminated),
+            last_truncated=mapped(self._scalar_or_own, truncated),
+        )
+
+    def _result(
+        self, observation: Any, info: dict[str, Any], **step: Any
+    ) -> EnvRet | MultiAgentEnvRet:
+        kind = MultiAgentEnvRet if self.agents else EnvRet
+        return kind(env_id=self.env_id, observation=self._own(observation), info=info, **step)
 
     def _tensor(self, action: Any, space: gym.Space[Any]) -> Any:
         """Convert an action to ``[num_envs, ...]`` on the simulation device."""
@@ -92,9 +124,6 @@ class _IsaacEnv(BaseEnv):
             tensor = torch.tensor(action, device=self.env.device, dtype=dtype)
         return tensor.reshape(self.num_envs, *((1,) if discrete else space.shape or ()))
 
-    def _batched(self, space: gym.Space[Any]) -> gym.Space[Any]:
-        return space if self.num_envs == 1 else batch_space(space, self.num_envs)
-
     def _own(self, value: Any) -> Any:
         """Copy nested tensors, without the batch axis if there is one sub-environment."""
         alone = self.num_envs == 1
@@ -106,9 +135,19 @@ class _IsaacEnv(BaseEnv):
     def _log(self, extras: Mapping[str, Any]) -> dict[str, Any]:
         return {"episode_info": dict(extras["log"])} if "log" in extras else {}
 
-    @abstractmethod
+    def _by_agent(self, extras: Mapping[str, Any]) -> dict[str, Any]:
+        info: dict[str, Any] = {}
+        for agent in self.agents:
+            if kept := {k: v for k, v in extras[agent].items() if k != "final_obs"}:
+                info[agent] = kept
+        return info
+
     def _final_obs(self, extras: Mapping[str, Any]) -> Any:
         """Return the observations before the resets of this step, or None if not computed."""
+        if not self.agents:
+            return extras.get("final_obs")
+        found = {agent: extras[agent].get("final_obs") for agent in self.agents}
+        return None if None in found.values() else found
 
     def _ended(self, extras: Mapping[str, Any]) -> dict[str, Any]:
         """Return info about the episodes that ended in this step.
@@ -143,35 +182,6 @@ class IsaacManagerBasedEnv(_IsaacEnv):
 
     default_env_class: ClassVar[str | None] = "isaaclab.envs::ManagerBasedRLEnv"
 
-    def get_observation_space(self) -> gym.Space[Any]:
-        return self._batched(self.env.single_observation_space)
-
-    def get_action_space(self) -> gym.Space[Any]:
-        return self._batched(self.env.single_action_space)
-
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> EnvRet:
-        observation, extras = self._reset_simulator(seed, options)
-        return EnvRet(
-            env_id=self.env_id, observation=self._own(observation), info=self._log(extras)
-        )
-
-    def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        action = self._tensor(self._preprocess_fn(policy_resp), self.env.single_action_space)
-        observation, reward, terminated, truncated, extras = self.env.step(action)
-        return EnvRet(
-            env_id=self.env_id,
-            observation=self._own(observation),
-            last_reward=self._scalar_or_own(reward),
-            last_terminated=self._scalar_or_own(terminated),
-            last_truncated=self._scalar_or_own(truncated),
-            info=self._ended(extras),
-        )
-
-    def _final_obs(self, extras: Mapping[str, Any]) -> Any:
-        return extras.get("final_obs")
-
 
 class IsaacMarlEnv(_IsaacEnv):
     """A direct multi-agent task (``DirectMARLEnv``).
@@ -180,46 +190,3 @@ class IsaacMarlEnv(_IsaacEnv):
     `IsaacManagerBasedEnv`. ``info["final_obs"]`` is by agent, and ``info[agent]`` holds the
     task's own report for that agent.
     """
-
-    def get_observation_space(self) -> gym.Space[Any]:
-        spaces: Mapping[str, gym.Space[Any]] = self.env.observation_spaces
-        return gym.spaces.Dict({agent: self._batched(spaces[agent]) for agent in self.agents})
-
-    def get_action_space(self) -> gym.Space[Any]:
-        spaces: Mapping[str, gym.Space[Any]] = self.env.action_spaces
-        return gym.spaces.Dict({agent: self._batched(spaces[agent]) for agent in self.agents})
-
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> MultiAgentEnvRet:
-        observation, extras = self._reset_simulator(seed, options)
-        return MultiAgentEnvRet(
-            env_id=self.env_id,
-            observation=self._own(observation),
-            info=self._log(extras) | self._by_agent(extras),
-        )
-
-    def step(self, policy_resp: PolicyResponse) -> MultiAgentEnvRet:
-        given: Mapping[str, Any] = self._preprocess_fn(policy_resp)
-        spaces: Mapping[str, gym.Space[Any]] = self.env.action_spaces
-        actions = {agent: self._tensor(given[agent], spaces[agent]) for agent in self.agents}
-        observation, reward, terminated, truncated, extras = self.env.step(actions)
-        return MultiAgentEnvRet(
-            env_id=self.env_id,
-            observation=self._own(observation),
-            last_reward={agent: self._scalar_or_own(reward[agent]) for agent in reward},
-            last_terminated={agent: self._scalar_or_own(terminated[agent]) for agent in terminated},
-            last_truncated={agent: self._scalar_or_own(truncated[agent]) for agent in truncated},
-            info=self._ended(extras) | self._by_agent(extras),
-        )
-
-    def _final_obs(self, extras: Mapping[str, Any]) -> Any:
-        found = {agent: extras[agent].get("final_obs") for agent in self.agents}
-        return None if None in found.values() else found
-
-    def _by_agent(self, extras: Mapping[str, Any]) -> dict[str, Any]:
-        info: dict[str, Any] = {}
-        for agent in self.agents:
-            if kept := {k: v for k, v in extras[agent].items() if k != "final_obs"}:
-                info[agent] = kept
-        return info

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn, sub_env_seeds
+from rlightning_aio.envs.base import BaseEnv, sub_env_seeds
 from rlightning_aio.envs.simulators.vulkan import do_without_materials, render_device_is_usable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.trees import as_numpy, is_tensor, mapped
@@ -51,14 +51,8 @@ class ManiskillEnv(BaseEnv):
             Vulkan device, or a task whose assets have not been downloaded.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         self._make_kwargs: dict[str, Any] = {
             "num_envs": self.num_envs,
             "max_episode_steps": config.max_episode_steps,

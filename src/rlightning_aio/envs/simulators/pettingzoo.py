@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn
+from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import did_you_mean
 from rlightning_aio.trees import as_numpy, mapped, tree_of
@@ -47,14 +47,8 @@ class PettingZooEnv(BaseEnv):
     The config's ``max_episode_steps`` truncates the episode for all agents that are left.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         self.env = self._make()
         self.agents = tuple(self.env.possible_agents)
         self._observation_spaces = {a: self.env.observation_space(a) for a in self.agents}

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio import EnvConfig, PolicyResponse
-    from rlightning_aio.envs.base import PreprocessFn
 
 
 class OpenEnvOptions(BaseModel):
@@ -82,21 +81,15 @@ class OpenEnv(BaseEnv):
     ``observation_field`` or ``action_field`` it is the value of that field.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         options = read_options(OpenEnvOptions, self.env_id, config.env_kwargs)
         self._options = options
         self._columns = {
             name: _space_of(self.env_id, name, given) for name, given in options.columns.items()
         }
         self._urls = (config.task_name, *options.urls)
-        self._url = worker_index % len(self._urls)
+        self._url = self.worker_index % len(self._urls)
         self._session = self._new_session()
         self._has_reward = False  # In this episode.
 

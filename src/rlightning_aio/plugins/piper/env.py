@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Generator
 
     from rlightning_aio import EnvConfig
-    from rlightning_aio.envs.base import PreprocessFn
 
 # The SDK drops feedback beyond these as garbage.
 MAX_LENGTH, MAX_ANGLE, MAX_GRIPPER = 1.0, math.radians(361), 0.15
@@ -71,14 +70,8 @@ class PiperEnv(BaseEnv):
     transforms_actions = True
     hardware = True
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+    def __init__(self, config: EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
         options = self._options = read_options(PiperOptions, self.env_id, config.env_kwargs)
         self._limits = action_limits(self.env_id, options)
         check_reset_position(self.env_id, options)
