@@ -234,19 +234,6 @@ class Chunked(Probe):
         return self._result(last_reward=float(np.sum(chunk)), info={"type": type(action).__name__})
 
 
-@ENVS.register("sloppy")
-class Sloppy(Probe):
-    """Returns the values in its action, even if they contradict its spaces."""
-
-    transforms_actions = True
-
-    def step(self, policy_resp: PolicyResponse) -> Any:
-        result = self._result()
-        for name, value in policy_resp.action.items():
-            setattr(result, name, value)
-        return result if policy_resp.action else None
-
-
 ADDING = {"name": "one", "backend": "adding", "task": "-", "placement": "inline"}
 
 
@@ -254,7 +241,7 @@ ADDING = {"name": "one", "backend": "adding", "task": "-", "placement": "inline"
 class Adding(BaseEnv):
     """Adds up its actions, in the trainer's process."""
 
-    RAISE, INTERRUPT = 8, 7
+    RAISE = 8
 
     def get_observation_space(self) -> gym.Space[Any]:
         return spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -276,8 +263,6 @@ class Adding(BaseEnv):
         action = int(policy_resp.action)
         if action == self.RAISE:
             raise ValueError("no end")
-        if action == self.INTERRUPT:
-            raise KeyboardInterrupt
         self.total += action
         info = {"nested": {"total": self.total}, "success": self.total == 20}
         parts = self._observation(), float(action), self.total >= 20, False, info

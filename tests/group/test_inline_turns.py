@@ -1,4 +1,4 @@
-"""Inline envs take turns, also with other tasks, and end a step that raises."""
+"""Inline envs take turns, also with other tasks, and a step that raises counts for nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kit.driven import INLINE
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio.errors import EnvBusy, EnvRaised
+from rlightning_aio.errors import EnvRaised
 
 
 def test_inline_entries_take_turns() -> None:
@@ -111,18 +111,3 @@ def test_a_step_that_raises_counts_towards_no_limit() -> None:
             for expected in (False, False, True):
                 batch, flags = group.step(batch.respond(action=np.array([1])))
                 assert flags == [expected]
-
-
-def test_an_interrupt_ends_the_step_that_it_strikes() -> None:
-    """The program gets it, and the group continues, once the error of the step is collected."""
-    with rlightning_aio.sync.build_env_group(ADDING) as group:
-        batch, _ = group.reset()
-        with pytest.raises(KeyboardInterrupt):
-            group.step(batch.respond(action=np.array([Adding.INTERRUPT])))
-        assert group.pending == group.env_ids
-        with pytest.raises(EnvBusy, match="collect it first"):
-            group.step(batch.respond(action=np.array([3])))
-        with pytest.raises(EnvRaised, match="KeyboardInterrupt"):
-            group.collect_async()
-        batch, _ = group.step(batch.respond(action=np.array([3])))
-        assert batch.reward.tolist() == [3]

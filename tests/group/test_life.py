@@ -137,16 +137,6 @@ def test_a_group_that_cannot_be_built_holds_nothing() -> None:
     assert len(list(Path("/proc/self/fd").iterdir())) == held
 
 
-def test_an_open_group_that_is_dropped_is_closed_with_a_warning() -> None:
-    """The garbage collector ends its workers."""
-    before = children()
-    group = sync.build_env_group({**PROBE, "placement": "inline"})
-    group.init()
-    with pytest.warns(ResourceWarning, match="was not closed"):
-        del group
-    assert children() == before
-
-
 # -- surroundings
 
 

@@ -373,13 +373,6 @@ async def test_an_episode_that_had_ended_is_not_begun_again_after_a_failed_resto
     assert (batch.restarted.tolist(), batch.observation) == ([True], [None])
 
 
-def test_an_env_that_was_never_reset_has_no_state() -> None:
-    entry = {"name": "e", "task": Fragile, "placement": "inline"}
-    no_state = pytest.raises(SnapshotError, match="env 'e-0' has no state yet")
-    with sync.build_env_group(entry) as group, no_state:
-        group.snapshot()
-
-
 def test_a_state_is_branched_into_many_envs() -> None:
     """Into all envs of the entry, or some of any equal entry; they go on alike."""
     entry = entry_of("of its own", num_workers=4, placement="inline")
@@ -403,17 +396,6 @@ def test_a_state_is_branched_into_many_envs() -> None:
             np.testing.assert_equal(some["e-3"].observation, batch["e-0"].observation)
         with pytest.raises(SnapshotError, match="no state of 'e-1', only of e-2, e-0; nothing"):
             group.restore(snapshot, source="e-1")
-
-
-def test_a_restore_creates_what_the_first_reset_would() -> None:
-    """Parts of an env that was never reset."""
-    with (
-        sync.build_env_group(entry_of("of its own", placement="inline")) as one,
-        sync.build_env_group(entry_of("of its own", placement="inline")) as other,
-    ):
-        batch, _ = one.reset(seed=0)
-        shown, _ = other.restore(one.snapshot())
-        np.testing.assert_equal(shown.observation, batch.observation)
 
 
 class Hidden(Fragile):

@@ -16,7 +16,6 @@ from rlightning_aio import (
     EnvBusy,
     EnvRaised,
     EnvRet,
-    GroupClosed,
     NothingPending,
     PolicyResponse,
     UnknownEnv,
@@ -148,23 +147,6 @@ async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
     assert abs(ret.ts_env_sent_ns - time.time_ns()) < 60e9
 
 
-async def test_each_result_is_collected_once(start: Any) -> None:
-    """When none is pending, a collect raises at once."""
-    group = await start(ENTRY)
-    batch, _ = await group.reset()
-    group.step_async(batch.respond(action=actions(1, 2, 3, 4)))
-    came: dict[str, float] = {}
-    while len(came) < 4:
-        batch, flags = await group.collect_async()
-        assert len(batch) > 0
-        assert flags == [False] * len(batch)
-        assert not came.keys() & set(batch.ids())
-        came.update(zip(batch.ids(), batch.reward.tolist(), strict=True))
-    assert came == {"probe-0": 1, "probe-1": 2, "probe-2": 3, "probe-3": 4}
-    with pytest.raises(NothingPending):
-        await group.collect_async()
-
-
 @one_driver
 async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     """Nothing is sent: no env has moved, and each can be stepped afterwards."""
@@ -218,91 +200,10 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     assert batch.observation[:, 2].tolist() == [1] * 4
 
 
-@one_driver
-async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
-    """Until it is collected; the other envs of the refused batch are unaffected."""
-    group = await start(ENTRY)
-    await group.reset()
-    group.step_async(responses(["probe-1"], 1))
-    for request in (
-        group.step(responses(IDS, 1, 2, 3, 4)),
-        group.reset(env_ids=IDS),
-        group["probe-1"].step([0, 1]),
-        group["probe-1"].call("double", 1),
-    ):
-        with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first"):
-            await request
-    with pytest.raises(EnvBusy, match="nothing was sent"):
-        group.step_async(responses(["probe-0", "probe-1"], 1, 2))
-    batch, _ = await group.step(responses(["probe-0", "probe-2"], 3, 4))
-    assert batch.reward.tolist() == [3, 4]
-    batch, _ = await group.collect_async()
-    assert batch.reward.tolist() == [1]
-    batch, _ = await group.step(responses(IDS, 1, 2, 3, 4))
-    assert batch.observation[:, 2].tolist() == [2, 2, 2, 1]
-
-
-@one_driver
-async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -> None:
-    """Results and errors, before they arrive and after."""
-    group = await start(ENTRY)
-    assert group.pending == []
-    await group.reset()
-    group.step_async(responses(["probe-2", "probe-0"], 1, RAISE))
-    assert group.pending == ["probe-0", "probe-2"]
-    batch, _ = await group.step(responses(["probe-1"], 1))
-    assert group.pending == ["probe-0", "probe-2"]
-    left = {"probe-0", "probe-2"}
-    while left:
-        assert {*group.pending} == left
-        try:
-            batch, _ = await group.collect_async()
-            left -= {*batch.env_ids()}
-        except EnvRaised as error:
-            left -= {error.env_id}
-    assert group.pending == []
-    await group.close()
-    with pytest.raises(GroupClosed):
-        _ = group.pending
-
-
 async def until_replied(group: Any, env_id: str, other: str) -> None:
     """Have the group read the reply of an env, by steps of another one, without collecting it."""
     while any(env_id in worker["owed"] for worker in group.get_workers()):
         await group.step(responses([other], 1))
-
-
-@pytest.mark.parametrize("is_read", [False, True])
-@one_driver
-async def test_an_env_whose_error_was_not_collected_is_busy(start: Any, is_read: bool) -> None:
-    """Whether or not the group has read it; the collect that raises it frees the env."""
-    group = await start(ENTRY)
-    await group.reset()
-    group.step_async(responses(["probe-1"], 1, what=RAISE))
-    if is_read:
-        await until_replied(group, "probe-1", "probe-2")
-    for _ in range(2):
-        assert group.pending == ["probe-1"]
-        for send in (
-            lambda: group.step_async(responses(["probe-0", "probe-1"], 1, 2)),
-            lambda: group.reset_async(env_ids=["probe-1"]),
-        ):
-            with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first, with collect_async"):
-                send()
-        for request in (
-            group.step(responses(IDS, 1, 2, 3, 4)),
-            group.reset(env_ids=IDS),
-            group.snapshot(["probe-1"]),
-            group["probe-1"].call("double", 1),
-        ):
-            with pytest.raises(EnvBusy, match=r"'probe-1'.*nothing was sent"):
-                await request
-        await group.step(responses(["probe-0", "probe-2"], 3, 4))
-    with pytest.raises(EnvRaised, match="'probe-1'"):
-        await group.collect_async()
-    assert group.pending == []
-    await group.reset(env_ids=["probe-1"])
-    await group.step(responses(IDS, 1, 2, 3, 4))
 
 
 @one_driver
@@ -349,26 +250,6 @@ async def test_an_error_of_an_env_arrives_with_its_traceback(start: Any) -> None
     assert batch.observation[:, 2].tolist() == [2, 1, 2, 2]
 
 
-async def test_an_error_answers_one_request_of_a_collect(start: Any) -> None:
-    """The next collect returns the others' results."""
-    group = await start(ENTRY)
-    batch, _ = await group.reset()
-    bad = actions(1, 2, 3, 4)
-    bad[2, 0] = RAISE
-    group.step_async(batch.respond(action=bad))
-    came: list[str] = []
-    faults: list[str] = []
-    while len(came) + len(faults) < 4:
-        try:
-            batch, _ = await group.collect_async()
-            came += batch.ids()
-        except EnvRaised as error:
-            faults.append(error.env_id)
-    assert (sorted(came), faults) == (["probe-0", "probe-1", "probe-3"], ["probe-2"])
-    with pytest.raises(NothingPending):
-        await group.collect_async()
-
-
 @one_driver
 async def test_a_handle_is_one_env(start: Any) -> None:
     """It resets, steps and calls methods, with single actions and its own seeds."""
@@ -390,24 +271,6 @@ async def test_a_handle_is_one_env(start: Any) -> None:
         await env.call("no_such_method")
     with pytest.raises(UnknownEnv, match="'probe-9'"):
         group["probe-9"]
-
-
-@one_driver
-async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
-    """Next to steps of other envs; an invalid batch is refused as a whole."""
-    group = await start(ENTRY)
-    batch, _ = await group.reset(seed=5)
-    group.reset_async(seed={"probe-2": 9}, env_ids=["probe-2", "probe-0"])
-    group.step_async(responses(["probe-1"], 3))
-    with pytest.raises(EnvBusy, match=r"can't reset env 'probe-0'.*nothing was sent"):
-        group.reset_async()
-    batch, _ = await group.collect_async(wait_all=True)
-    assert batch.ids() == ["probe-0", "probe-1", "probe-2"]
-    assert batch.is_reset.tolist() == [True, False, True]
-    assert batch.observation[:, 3].tolist() == [-1, 6, 9]
-    group.reset_async(options={"pose": 1})
-    batch, _ = await group.collect_async(wait_all=True)
-    assert batch.info() == [{"options": {"pose": 1}}] * 4
 
 
 @one_driver

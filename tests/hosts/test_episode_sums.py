@@ -115,14 +115,3 @@ def test_sums_equal_those_of_separate_streams(
             both.begin()
         else:
             both.step(*drawn_step(data, shape))
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_a_reset_drops_the_current_episodes(mode: Autoreset) -> None:
-    """No earlier step counts afterwards."""
-    both = Both((2,), mode)
-    both.step(np.array([5.0, 5.0]), np.array([True, False]))
-    both.begin()
-    both.step(np.array([1.0, 2.0]), np.array([True, True]))
-    returns, lengths, _ = both.row
-    assert (returns.tolist(), lengths.tolist()) == ([1.0, 2.0], [1, 1])
