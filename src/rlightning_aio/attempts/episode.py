@@ -148,7 +148,7 @@ class AttemptEpisode:
 
     async def _timed(self, answer: Any) -> Any:
         began = time.monotonic()
-        self._asked_at = asked_at = self._clock.now()
+        self._asked_at = self._clock.now()
         try:
             found = await answer
         except EnvFault as fault:
@@ -159,12 +159,17 @@ class AttemptEpisode:
             raise
         finally:
             self.seconds += time.monotonic() - began
+            self._queued += self._in_queue()
             self._asked_at = None
-            if self._queues:
-                inside = self._episode.seconds_in_env or 0.0
-                self._queued += max(self._clock.now() - asked_at - inside, 0.0)
         self.fault = None
         return found
+
+    def _in_queue(self) -> float:
+        """Seconds for which what is in flight was not executed by the env, but waited for that."""
+        if self._asked_at is None or not self._queues:
+            return 0.0
+        inside = self._episode.seconds_in_env or 0.0
+        return max(self._clock.now() - self._asked_at - inside, 0.0)
 
 
 class AttemptInPlay(AttemptEpisode):
@@ -192,11 +197,7 @@ class AttemptInPlay(AttemptEpisode):
 
     def ran(self) -> float:
         """Seconds for which it could run: not in a queue, nor while the loop was blocked."""
-        queued = self._queued
-        if self._asked_at is not None and self._queues:
-            inside = self._episode.seconds_in_env or 0.0
-            queued += max(self._clock.now() - self._asked_at - inside, 0.0)
-        return self._clock.now() - self._began - queued
+        return self._clock.now() - self._began - self._queued - self._in_queue()
 
     def now(self) -> float:
         """Seconds since any moment, without those for which the loop was blocked."""

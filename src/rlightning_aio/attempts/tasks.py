@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterable, Iterable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from rlightning_aio.attempts.spec import EpisodeSpec
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
+
+_END: Final = object()
 
 
 class TaskSource:
@@ -32,43 +34,31 @@ class TaskSource:
             self._async = aiter(tasks)
         else:
             self._sync = iter(tasks)
-        self._reading: asyncio.Task[Any] | None = None
+        self._reading: asyncio.Future[Any] | None = None
         self.is_at_end = False
 
     def next(self, wake: asyncio.Event) -> EpisodeSpec | None:
         """Return the next task; None if there is none yet, which sets `wake` later, or no more."""
         if self.is_at_end:
             return None
-        try:
-            if self._async is None:
-                return spec_of_task(next(self._sync))
+        if self._async is None:
+            task = next(self._sync, _END)
+        else:
             if self._reading is None:
-                self._reading = asyncio.ensure_future(_read(self._async))
+                self._reading = asyncio.ensure_future(anext(self._async, _END))
                 self._reading.add_done_callback(lambda _: wake.set())
             if not self._reading.done():
                 return None
             reading, self._reading = self._reading, None
-            return spec_of_task(reading.result())
-        except (StopIteration, _NoMore):
-            self.is_at_end = True
-            return None
+            task = reading.result()
+        self.is_at_end = task is _END
+        return None if self.is_at_end else spec_of_task(task)
 
     def close(self) -> None:
         """End the reading."""
         self.is_at_end = True
         if self._reading is not None:
             self._reading.cancel()
-
-
-class _NoMore(Exception):
-    """An async iterator is at its end; a task can't raise StopAsyncIteration."""
-
-
-async def _read(tasks: AsyncIterator[Any]) -> Any:
-    try:
-        return await anext(tasks)
-    except StopAsyncIteration:
-        raise _NoMore from None
 
 
 def spec_of_task(task: Any) -> EpisodeSpec:

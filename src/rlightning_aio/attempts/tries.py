@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from rlightning_aio.attempts.connections import is_connections
 from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.parts import all_agents
 from rlightning_aio.errors import EnvFault, GroupClosed
@@ -33,6 +32,26 @@ _PATIENCE_SECONDS: Final = 0.5
 _SHORTEST_SECONDS: Final = 0.01
 """Between looks whether its time is over, while it could not run."""
 _log = logging.getLogger("rlightning_aio")
+
+# Errors of clients are known by name, because the packages that define them are not imported.
+_PACKAGES: Final = ("openai", "anthropic", "httpx", "httpcore", "aiohttp", "requests", "urllib3")
+_NAMES: Final = frozenset(
+    (
+        # Of openai and anthropic.
+        *("APIConnectionError", "RateLimitError", "InternalServerError"),
+        # Of httpx and httpcore: all errors below the protocol.
+        *("TransportError", "TimeoutException", "NetworkError", "ProtocolError"),
+        # Of aiohttp.
+        *("ClientConnectionError", "ClientPayloadError"),
+        # Of requests and urllib3.
+        *("ConnectionError", "Timeout", "ChunkedEncodingError", "HTTPError"),
+    )
+)
+_OF_FILES: Final = (
+    *(FileNotFoundError, FileExistsError, IsADirectoryError, NotADirectoryError),
+    PermissionError,
+)
+_TOO_MANY, _SERVERS_OWN = 429, 500
 
 
 class Try:
@@ -256,7 +275,7 @@ class Try:
         """The outcome of an agent that raised; an error of ours, or with a blame, says more."""
         blame: Any = getattr(error, "blame", None)
         if blame not in BLAMES:
-            blame = "infrastructure" if is_connections(error) else "caller"
+            blame = "infrastructure" if _is_connections(error) else "caller"
         if blame == "caller" and type(error) not in (*self._logged, _NoCoroutine):
             self._logged.add(type(error))
             _log.warning(
@@ -285,6 +304,41 @@ class Try:
             last=last,
             result=result,
         )
+
+
+def _is_connections(error: BaseException) -> bool:
+    """Return True if an error, or a cause of it, says that a connection or a server has failed.
+
+    Builtin ones do (`OSError`, and so `TimeoutError`, but not those about files), those of the
+    usual clients, and any with the status 429 or 5xx. Any other status is about the request.
+    """
+    seen = set[int]()
+    one: BaseException | None = error
+    while one is not None and id(one) not in seen:
+        seen.add(id(one))
+        status = _status_of(one)
+        if status is not None:
+            return status == _TOO_MANY or status >= _SERVERS_OWN
+        if isinstance(one, OSError) and not isinstance(one, _OF_FILES):
+            return True
+        if any(map(_is_named, type(one).__mro__)):
+            return True
+        one = one.__cause__
+    return False
+
+
+def _is_named(kind: type) -> bool:
+    return kind.__name__ in _NAMES and kind.__module__.partition(".")[0] in _PACKAGES
+
+
+def _status_of(error: Any) -> int | None:
+    """The status of the reply that a client's error is about."""
+    for holder in (error, getattr(error, "response", None)):
+        for name in ("status_code", "status"):
+            status = getattr(holder, name, None)
+            if type(status) is int and status > 0:
+                return status
+    return None
 
 
 class _NoCoroutine(TypeError):
