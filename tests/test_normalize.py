@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from collecting.scripted import Disturbed, Script, scripted_group
+from collecting.scripted import KINDS, Script, scripted_group
 from group import sample_envs
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio import sync
-from rlightning_aio.collecting import Collector
+from rlightning_aio import BatchedData, PolicyResponse, sync
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.normalize import Normalizer
+from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,52 +65,48 @@ class Lists:
         return np.clip(reward / np.sqrt(variance + 1e-8), -10, 10)
 
 
-class Policy:
-    """Records each batch twice, and compares."""
-
-    def __init__(self, gamma: float) -> None:
-        self.normalizer, self.lists = Normalizer(gamma), Lists(gamma)
-
-    def __call__(self, batch: Any) -> dict[str, Any]:
-        seen = self.normalizer.observe(batch)
-        assert seen.dtype == np.float32
-        assert seen.shape == batch.observation.shape
-        rows = [column.reshape(-1).tolist() for column in (
-            batch.index, batch.reward, batch.is_reset, batch.done
-        )]  # fmt: skip
-        observations = batch.observation.reshape(-1, 3)
-        for k, (env, reward, is_reset, done) in enumerate(zip(*rows, strict=True)):
-            self.lists.note(env, observations[k], reward, is_reset=is_reset, done=done)
-        expected = normal(observations, self.lists.observations)
-        np.testing.assert_allclose(seen.reshape(-1, 3), expected, rtol=1e-4, atol=1e-4)
-        return {"action": np.zeros((*batch.is_reset.shape, 1)), "seen": seen}
+def observe(normalizer: Normalizer, lists: Lists, batch: BatchedData) -> None:
+    """Record a batch twice, and compare."""
+    seen = normalizer.observe(batch)
+    assert seen.dtype == np.float32
+    assert seen.shape == batch.observation.shape
+    rows = [column.reshape(-1).tolist() for column in (
+        batch.index, batch.reward, batch.is_reset, batch.done
+    )]  # fmt: skip
+    observations = batch.observation.reshape(-1, 3)
+    for k, (env, reward, is_reset, done) in enumerate(zip(*rows, strict=True)):
+        lists.note(env, observations[k], reward, is_reset=is_reset, done=done)
+    expected = normal(observations, lists.observations)
+    np.testing.assert_allclose(seen.reshape(-1, 3), expected, rtol=1e-4, atol=1e-4)
 
 
-@given(st.data(), st.sampled_from(["single", "same_step", "vector", "same_step_vector"]))
+@given(st.data(), st.sampled_from([*KINDS]))
 def test_values_are_normalised_by_all_results_of_all_envs(data: Any, kind: str) -> None:
     """In any order of results; returns start again at resets, ends and losses."""
     draw = data.draw
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    group, logs = scripted_group(kind, draw(st.integers(1, 4)), draw(st.sampled_from([0.1, 0.5])))
-    policy = Policy(draw(st.sampled_from([0.0, 0.5, 0.99])))
+    group = scripted_group(kind, draw(st.integers(1, 4)), draw(st.sampled_from([0.1, 0.5])))
+    gamma = draw(st.sampled_from([0.0, 0.5, 0.99]))
+    normalizer, lists = Normalizer(gamma), Lists(gamma)
     with group, group.auto_reset(math.inf):
-        disturbed: Any = Disturbed(
-            group,
-            logs,
-            choose=lambda count: int(generator.integers(count)),
-            loses=lambda: generator.random() < 0.1,
-            interrupts=lambda: False,
-        )
-        rollout = Collector(disturbed, policy, num_transitions=40, min_results=2).collect()
-    normalizer, lists = policy.normalizer, policy.lists
-    scaled = normalizer.scaled(rollout.reward)
-    np.testing.assert_allclose(scaled, lists.scaled(rollout.reward), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(
-        normalizer.normalized(rollout.end_observation),
-        normal(rollout.end_observation, lists.observations),
-        rtol=1e-4,
-        atol=1e-4,
-    )
+        batch, _ = group.reset()
+        action = np.zeros((*batch.is_reset.shape[1:], 1))
+        observe(normalizer, lists, batch)
+        for _ in range(20):
+            some = generator.permutation(group.env_ids)[: generator.integers(1, len(group) + 1)]
+            ids: list[str] = some.tolist()
+            if (chance := generator.random()) < 0.1:
+                batch, _ = group.reset(env_ids=ids)
+                for part in parts_of(batch):  # As of an env whose worker was replaced.
+                    part.flags[..., TRUNCATED] = chance < 0.05
+            else:
+                responses = [PolicyResponse(env_id, action) for env_id in ids]
+                batch, _ = group.step(BatchedData(ids, responses))
+            observe(normalizer, lists, batch)
+    found, reward = normalizer.normalized(batch.observation), batch.reward
+    expected = normal(batch.observation, lists.observations), lists.scaled(reward)
+    np.testing.assert_allclose(found, expected[0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(normalizer.scaled(reward), expected[1], rtol=1e-4, atol=1e-4)
 
 
 def trees(generator: np.random.Generator, count: int) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from collecting.scripted import Script, Tickets, scripted_group
+from collecting.scripted import Script, scripted_group
 from group import sample_envs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from kit.counting import ClientThread, CountingEnv
@@ -245,9 +245,9 @@ def test_a_sub_environment_that_waits_for_others_makes_no_transitions() -> None:
 
 
 def test_blocks_that_would_have_holes_raise() -> None:
-    group, _ = scripted_group("vector", 2, 0.1)
+    group = scripted_group("vector", 2, 0.1)
     with group, group.auto_reset(99):
-        collector = Collector(group, Tickets(), num_transitions=8, wait_all=True)
+        collector = Collector(group, None, num_transitions=8, wait_all=True)
         with pytest.raises(ValueError, match=r"no \[T, N\] block.*min_results instead"):
             collector.collect()
     with poles(3) as group, group.auto_reset():

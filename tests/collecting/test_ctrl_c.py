@@ -7,9 +7,10 @@ import math
 import os
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
-from collecting.test_interruptions import PER_ENTRY, SEED, Uneven, check, parts_of, policy
+from collecting.test_interruptions import parts_of
 from faults.striking import struck
 
 from rlightning_aio import sync
@@ -21,10 +22,56 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
+SEED = 7
+PER_ENTRY = ("fast", "slow")
 STRIDE = int(os.environ.get("RLIGHTNING_AIO_STRIDE", "97"))
 """Every so many lines, Ctrl-C is pressed; 1 takes minutes."""
 NUM_LINES = 9000
 """More lines than a collect executes."""
+
+
+class Uneven(gym.Env[Any, Any]):
+    """Shows [steps of the episode, a number that depends on all before]; episodes are short."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.steps, self.length, self.at = 0, *self.np_random.integers((1, 0), (8, 1000)).tolist()
+        return np.array([0.0, self.at]), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        self.at = (7 * self.at + 3 * int(action[0]) + int(self.np_random.integers(1000))) % 1009
+        over, odd = self.steps >= self.length, bool(self.length % 2)
+        observation = np.array([float(self.steps), self.at])
+        return observation, float(self.at % 100), over and odd, over and not odd, {}
+
+
+def policy(batch: BatchedData) -> dict[str, Any]:
+    return {"action": batch.observation[:, 1:] % 5, "seen": batch.observation}
+
+
+def check(found: list[Rollout]) -> None:
+    """Each env has made its first transitions, each once and in order, as it does alone."""
+    alone: dict[int, tuple[Uneven, Any]] = {}
+    for rollout in found:
+        after = rollout.next_observation
+        for place in np.ndindex(rollout.shape):
+            index = int(rollout.index[place])
+            if index not in alone:
+                env = Uneven()
+                alone[index] = env, env.reset(seed=SEED + index)[0]
+            env, before = alone[index]
+            assert rollout.observation[place].tolist() == before.tolist(), f"env {index}"
+            assert rollout.seen[place].tolist() == before.tolist()
+            assert rollout.first[place] == (before[0] == 0)
+            shown, reward, *ends, _ = env.step(before[1:] % 5)
+            assert after[place].tolist() == shown.tolist()
+            assert rollout.reward[place] == reward
+            assert [rollout.terminated[place], rollout.truncated[place]] == ends
+            alone[index] = env, env.reset()[0] if any(ends) else shown
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Collectors that are cancelled or begin anew, and whose envs raise.
+"""Collectors that begin anew, and whose envs raise.
 
 Nothing is lost or invented: each env's transitions are those that it must have made.
 """
@@ -6,10 +6,10 @@ Nothing is lost or invented: each env's transitions are those that it must have 
 from __future__ import annotations
 
 import asyncio
+import copy
 import inspect
 import itertools
 import math
-import types
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -17,164 +17,27 @@ import numpy as np
 import pytest
 from kit.counting import ClientThread, CountingEnv
 from kit.driven import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
-from kit.scripted import Awaitable, Counts
+from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio as rl
 import rlightning_aio.sync
 from rlightning_aio.collecting import Collector, Rollout
-from rlightning_aio.collecting.rollout import Ends
 from rlightning_aio.errors import EnvRaised, RLightningError
 from rlightning_aio.evaluation import evaluate
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Generator
+    from collections.abc import Callable
 
     from rlightning_aio.batch import BatchedData
-
-SEED = 7
-
-
-class Uneven(gym.Env[Any, Any]):
-    """Shows [steps of the episode, a number that depends on all before]; episodes are short."""
-
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
-    action_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.steps, self.length, self.at = 0, *self.np_random.integers((1, 0), (8, 1000)).tolist()
-        return np.array([0.0, self.at]), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.steps += 1
-        self.at = (7 * self.at + 3 * int(action[0]) + int(self.np_random.integers(1000))) % 1009
-        over, odd = self.steps >= self.length, bool(self.length % 2)
-        observation = np.array([float(self.steps), self.at])
-        return observation, float(self.at % 100), over and odd, over and not odd, {}
-
-
-def copied(rollout: Rollout) -> Rollout:
-    """One whose arrays nobody else writes to."""
-    columns = {name: rollout[name].copy() for name in rollout}
-    return Rollout(columns, Ends(rollout.ends, rollout.end_observation.copy()), rollout.episodes)
-
-
-class Awaited(Awaitable):
-    """An awaitable `Uneven`, whose resets take some turns of the event loop, and steps one."""
-
-    def __init__(self, turns: int) -> None:
-        super().__init__(Uneven)
-        self.turns = turns
-
-    async def pause(self, action: Any = None) -> None:
-        for _ in range(self.turns if action is None else 1):
-            await asyncio.sleep(0)
-
-
-def policy(batch: BatchedData) -> dict[str, Any]:
-    return {"action": batch.observation[:, 1:] % 5, "seen": batch.observation}
-
-
-async def awaited_policy(batch: BatchedData) -> dict[str, Any]:
-    await asyncio.sleep(0)
-    return policy(batch)
-
-
-@types.coroutine
-def cut_off(coroutine: Coroutine[Any, Any, Any], at: int) -> Generator[Any, Any, Any]:
-    """Cancel a coroutine where it waits for the time `at`, counted from 0."""
-    steps = coroutine.__await__()
-    for count in itertools.count():
-        try:
-            waits_for = steps.send(None)
-        except StopIteration as stop:
-            return stop.value
-        if count == at:
-            steps.throw(asyncio.CancelledError())
-        yield waits_for
-    raise AssertionError
-
-
-def check(found: list[Rollout]) -> None:
-    """Each env has made its first transitions, each once and in order, as it does alone."""
-    alone: dict[int, tuple[Uneven, Any]] = {}
-    for rollout in found:
-        after = rollout.next_observation
-        for place in np.ndindex(rollout.shape):
-            index = int(rollout.index[place])
-            if index not in alone:
-                env = Uneven()
-                alone[index] = env, env.reset(seed=SEED + index)[0]
-            env, before = alone[index]
-            assert rollout.observation[place].tolist() == before.tolist(), f"env {index}"
-            assert rollout.seen[place].tolist() == before.tolist()
-            assert rollout.first[place] == (before[0] == 0)
-            shown, reward, *ends, _ = env.step(before[1:] % 5)
-            assert after[place].tolist() == shown.tolist()
-            assert rollout.reward[place] == reward
-            assert [rollout.terminated[place], rollout.truncated[place]] == ends
-            alone[index] = env, env.reset()[0] if any(ends) else shown
 
 
 def parts_of(rollout: Rollout | dict[str, Rollout]) -> list[Rollout]:
     """Copies of the rollouts that a collector has returned."""
-    return [copied(one) for one in (rollout.values() if type(rollout) is dict else [rollout])]
-
-
-async def collected(collector: Any, at: int, size: int) -> tuple[list[Rollout], int]:
-    """Collect until each env has made a transition; the first two calls are cut off at `at`.
-
-    Returns the rollouts, and how many calls were cut off.
-    """
-    found: list[Rollout] = []
-    num_cut = 0
-    while len(found) < 4 or len({*np.concatenate([one.index.flat for one in found])}) < size:
-        collecting = collector.collect()
-        try:
-            found += parts_of(await (cut_off(collecting, at) if num_cut < 2 else collecting))
-        except asyncio.CancelledError:
-            num_cut += 1
-    return found, num_cut
-
-
-PER_ENTRY = {"fast": policy, "slow": policy}
-AWAITED = dict.fromkeys(PER_ENTRY, awaited_policy)
-WAYS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "one policy": (policy, {"num_transitions": 3}),
-    "a policy for each entry": (PER_ENTRY, {"num_transitions": 3}),
-    "awaitable policies": (AWAITED, {"num_transitions": 3}),
-    "several results": (PER_ENTRY, {"num_transitions": 5, "min_results": 2}),
-    "a block": (awaited_policy, {"num_transitions": 8, "wait_all": True}),
-    "a block for each entry": (PER_ENTRY, {"num_transitions": 8, "wait_all": True}),
-}
-
-
-@pytest.mark.parametrize(
-    ("way", "slow"),
-    [*zip(WAYS, itertools.repeat("loop")), *zip(list(WAYS)[1::3], itertools.repeat("inline"))],
-)
-async def test_a_collect_goes_on_wherever_it_was_cancelled(way: str, slow: str) -> None:
-    """As if it had not been: envs that are slow to reset included."""
-    makers = {"fast": lambda: Awaited(0), "slow": lambda: Awaited(60)}
-    entries = [
-        {"name": name, "task": make, "num_workers": 2, "placement": "loop"}
-        for name, make in makers.items()
+    return [
+        copy.deepcopy(one) for one in (rollout.values() if type(rollout) is dict else [rollout])
     ]
-    if slow == "inline":
-        entries[1] |= {"task": Uneven, "placement": "inline"}
-    answer, options = WAYS[way]
-    for at in itertools.count():
-        async with rl.build_env_group(entries) as group:
-            with group.auto_reset(math.inf):
-                collector: Any = Collector(group, answer, seed=SEED, **options)
-                found, num_cut = await collected(collector, at, 4)
-        check(found)
-        assert sum(map(len, found)) % options["num_transitions"] == 0
-        if not num_cut:
-            assert at > 1
-            break
 
 
 # -- envs that raise, and groups that others use between two calls
@@ -437,10 +300,10 @@ async def test_an_env_that_may_move_something_real_is_reset_by_nobody_else() -> 
             collector: Any = Collector(group, failing(1), num_transitions=12)
             with pytest.raises(EnvRaised) as raised:
                 await collector.collect()
-            found = [copied(await collector.collect()) for _ in range(2)]
+            found = [copy.deepcopy(await collector.collect()) for _ in range(2)]
             assert 1 not in found[1].index
             await send_a_reset(group, raised.value)
-            found += [copied(await collector.collect()) for _ in range(4)]
+            found += [copy.deepcopy(await collector.collect()) for _ in range(4)]
             assert (2, 0) in steps_of(found)[1]
 
 
