@@ -42,7 +42,7 @@ from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import AsyncGenerator, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -149,14 +149,12 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
         found.action_space = str(meta.action_space)
         found.num_envs = meta.num_envs
         found.max_episode_steps = config.max_episode_steps or meta.max_episode_steps
-        batch, _ = await group.reset(seed=0)
         if _has_no_samples(meta.action_space):
+            await group.reset(seed=0)
             return
-        respond = Responder(group, None, 0)
         with ensure_auto_reset(group):
-            for _ in range(_STEPS):
-                await respond_to_all(group, respond, batch)
-                batch, _ = await group.collect_async()
+            async for _ in _results(group, _STEPS, seed=0):
+                pass
             found.steps = _STEPS
             if steps:
                 await _play(config, group, steps, found)
@@ -165,6 +163,17 @@ async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
             await _compare_spaces(group, min(steps, _LOOKED_AT), found)
     if steps and (config.recycle or found.leaks) and not found.is_random:
         await _renew(one, found)
+
+
+async def _results(group: EnvGroup, steps: int, seed: int) -> AsyncGenerator[BatchedData]:
+    """Yield the results of a reset, and of steps with random actions, the same each time."""
+    respond = Responder(group, None, 0)
+    batch, _ = await group.reset(seed=seed)
+    yield batch
+    for _ in range(steps):
+        await respond_to_all(group, respond, batch)
+        batch, _ = await group.collect_async()
+        yield batch
 
 
 def _has_no_samples(space: Any) -> bool:
@@ -184,11 +193,7 @@ async def _play(config: EnvConfig, group: EnvGroup, steps: int, found: _Finding)
     (worker,) = group.get_workers()
     pid, samples, times = worker["pid"] or os.getpid(), list[dict[str, float]](), list[int]()
     rewards = bad = 0
-    respond = Responder(group, None, 0)
-    batch, _ = await group.reset(seed=0)
-    for _ in range(steps):
-        await respond_to_all(group, respond, batch)
-        batch, _ = await group.collect_async()
+    async for batch in _results(group, steps, seed=0):
         stepped = ~batch.is_reset
         of_steps = summed_rewards(batch.reward)[stepped]
         rewards, bad = rewards + of_steps.size, bad + np.count_nonzero(~np.isfinite(of_steps))
@@ -269,7 +274,9 @@ async def _renew(config: EnvConfig, found: _Finding) -> None:
 
 async def _repeat(group: EnvGroup, steps: int, found: _Finding) -> None:
     """Play twice with the same seed and actions."""
-    first, again = [await _played(group, steps) for _ in range(2)]
+    first, again = [
+        [_contents(batch) async for batch in _results(group, steps, seed=1)] for _ in range(2)
+    ]
     differs = next((k for k in range(steps + 1) if first[k] != again[k]), None)
     found.is_random = differs is not None
     if differs is not None:
@@ -278,18 +285,6 @@ async def _repeat(group: EnvGroup, steps: int, found: _Finding) -> None:
             f"two episodes with the same seed and actions differ from {where} on: draw random "
             "numbers from a generator that reset(seed=…) seeds, such as gymnasium's np_random"
         )
-
-
-async def _played(group: EnvGroup, steps: int) -> list[bytes]:
-    """Return what a reset with a seed and steps with actions of the same seed show."""
-    respond = Responder(group, None, 0)
-    batch, _ = await group.reset(seed=1)
-    results = [_contents(batch)]
-    for _ in range(steps):
-        await respond_to_all(group, respond, batch)
-        batch, _ = await group.collect_async()
-        results.append(_contents(batch))
-    return results
 
 
 def _contents(batch: BatchedData) -> bytes:

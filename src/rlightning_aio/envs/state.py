@@ -16,6 +16,7 @@ import random
 import sys
 from dataclasses import dataclass
 from inspect import iscoroutinefunction, unwrap
+from operator import methodcaller
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
@@ -74,20 +75,12 @@ class _Part(NamedTuple):
 # -- kinds of parts -----------------------------------------------------------------------
 
 
-def _nothing(part: Any) -> None:
-    del part
-
-
-def _unchanged(part: Any, state: Any) -> None:
-    del part, state
+def _nothing(*_: Any) -> None:
+    """Save or load nothing."""
 
 
 def _held(layer: Any) -> dict[str, Any]:
     return cast("dict[str, Any]", vars(layer))
-
-
-def _attributes(layer: Any) -> dict[str, Any]:
-    return dict(_held(layer))
 
 
 def _set_attributes(layer: Any, state: dict[str, Any]) -> None:
@@ -129,10 +122,6 @@ def _set_generators(space: Any, state: list[Any]) -> None:
         _set_generators(one, own)
 
 
-def _own_state(part: Any) -> Any:
-    return part.save_state()
-
-
 def _load_own_state(part: Any, state: Any) -> None:
     part.load_state(state)
 
@@ -152,10 +141,10 @@ def _set_console_state(console: Any, state: Any) -> None:
 
 
 _ENV = _Kind(_env_attributes, _set_env_attributes, is_layer=True)
-_LAYER = _Kind(_attributes, _set_attributes, is_layer=True)
-_OWN = _Kind(_own_state, _load_own_state)
+_LAYER = _Kind(_held, _set_attributes, is_layer=True)
+_OWN = _Kind(methodcaller("save_state"), _load_own_state)
 _SPACE = _Kind(_generators, _set_generators)
-_KEPT = _Kind(_nothing, _unchanged)
+_KEPT = _Kind(_nothing, _nothing)
 _OF_LIBRARIES: Final[dict[str, dict[str, _Kind]]] = {
     "ale_py": {"ALEInterface": _Kind(_console_state, _set_console_state)},
     "rlightning_aio": {"StickyConsole": _OWN},

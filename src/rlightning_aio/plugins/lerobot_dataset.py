@@ -12,7 +12,7 @@ import threading
 import warnings
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, cast
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
@@ -162,8 +162,8 @@ def named_columns(observation: Any, names: Mapping[str, str]) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     known: list[str] = []
-    for key, column in _leaves(observation):
-        known.append(key)
+    for path, column in walked(observation):
+        known.append(key := ".".join(map(str, path)))
         name = names.get(key) or _NAMES.get(key) or _default_name(key, column)
         if name in found:
             raise ValueError(f"two columns of the observation would be {name}: say by names={{…}}")
@@ -171,15 +171,6 @@ def named_columns(observation: Any, names: Mapping[str, str]) -> dict[str, Any]:
     if unknown := [key for key in names if key not in known]:
         raise ValueError(f"names has {unknown}; the observation has {known}")
     return found
-
-
-def _leaves(observation: Any, path: tuple[str, ...] = ()) -> Generator[tuple[str, Any]]:
-    if isinstance(observation, dict | tuple):
-        held = cast("dict[str, Any] | tuple[Any, ...]", observation)
-        for key, part in held.items() if isinstance(held, dict) else enumerate(held):
-            yield from _leaves(part, (*path, str(key)))
-    else:
-        yield ".".join(path), observation
 
 
 def _default_name(key: str, column: NDArray[Any]) -> str:
