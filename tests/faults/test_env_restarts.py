@@ -13,7 +13,7 @@ from kit.driven import Driven, on_one_driver
 from kit.scripted import Awaitable, Counts
 from kit.tokens import Tokens, entry, marked, two_workers
 
-from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised
+from rlightning_aio.errors import EnvHung, EnvRaised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -102,18 +102,6 @@ def test_exceptions_in_a_row_are_raised_at_last(start: Start, tmp_path: Path, pl
     batch, _ = group.step(tokens.steps(env_ids, {"faulty-1": "raise"}))
     check_marked(batch, "faulty-1", CAUSES["raise"], "env_raised")
     assert group.group.metrics()["envs/restarts"] == 3
-
-
-@on_one_driver
-def test_calls_and_ctrl_c_restart_nothing(start: Start) -> None:
-    group, tokens = start(two_workers(on_env_error="restart")), Tokens()
-    with pytest.raises(EnvRaised):
-        group.call("faulty-1", "do", "raise")
-    with pytest.raises(EnvRaised):
-        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "keyboard interrupt"}))
-    assert group.group.metrics()["envs/restarts"] == 0
-    batch, _ = group.step(tokens.steps(group.group.env_ids))
-    tokens.check(batch)
 
 
 class Lives(Counts):
@@ -291,12 +279,6 @@ def test_an_env_is_not_rebuilt_after_ctrl_c(build: Start, task: type) -> None:
     assert group.call("e-0", "lives") == (1, [])
     batch, _ = group.step(batch.respond(action=np.array([0])))
     assert batch.observation.tolist() == [[1, 1]]
-
-
-@on_one_driver
-def test_a_robot_is_never_moved_by_an_exception(build: Start) -> None:
-    with pytest.raises(ConfigError, match="only your resets may"):
-        build({"name": "arm", "backend": "piper", "task": "sim", "on_env_error": "restart"})
 
 
 @on_one_driver

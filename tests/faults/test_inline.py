@@ -1,4 +1,4 @@
-"""Envs in the trainer's process: their errors are reported, and so are interrupts."""
+"""Envs in the trainer's process: interrupts reach the program."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import gymnasium as gym
 import numpy as np
 import pytest
-from faults.test_env_errors import RAISED, check_error
 from kit.driven import Driven
 from kit.tokens import Tokens, entry
 
@@ -20,22 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     Start: TypeAlias = Callable[..., Driven]
-
-
-def test_an_error_of_an_inline_env_is_reported_and_it_stays_usable(start: Start) -> None:
-    """As in a worker, SystemExit included."""
-    group, tokens = start(entry(2, placement="inline")), Tokens()
-    for name in RAISED:
-        if name in ("interrupt", "keyboard interrupt"):
-            continue
-        with pytest.raises(EnvRaised) as caught:
-            group.step(tokens.steps(group.group.env_ids, {"faulty-1": name}))
-        check_error(caught.value, name, "step")
-        with pytest.raises(EnvRaised) as caught:
-            group.call("faulty-1", "do", name)
-        check_error(caught.value, name, "the call of do()")
-        group.reset(env_ids=["faulty-1"])
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 def test_interrupt_in_an_inline_step_comes_out_and_ends_its_request() -> None:
