@@ -209,36 +209,39 @@ def test_an_arm_that_raises_or_whose_result_is_refused_stops(
         wait_for(log, "stop")
 
 
-def refused_batches() -> dict[str, Callable[[], BatchedData[Any]]]:
-    def of(*actions: Any) -> BatchedData[Any]:
-        return BatchedData(["arm-0"] * len(actions), [PolicyResponse("arm-0", a) for a in actions])
+def of(*actions: Any) -> BatchedData[Any]:
+    return BatchedData(["arm-0"] * len(actions), [PolicyResponse("arm-0", a) for a in actions])
 
-    return {
-        "None": lambda: of(None),
-        "shape": lambda: of(np.zeros(3)),
-        "kind": lambda: of("fast"),
-        "NaN": lambda: of([np.nan, 0.0]),
-        "two rows": lambda: of(np.zeros(2), np.zeros(2)),
-        "no response": lambda: BatchedData(["arm-0"], [None]),
-        "unknown": lambda: BatchedData(
-            ["arm-0", "arm-7"], [PolicyResponse(i, np.zeros(2)) for i in ("arm-0", "arm-7")]
-        ),
-    }
+
+REFUSED: dict[str, Callable[[BatchedData[Any]], BatchedData[Any]]] = {
+    "None": lambda _: of(None),
+    "shape": lambda _: of(np.zeros(3)),
+    "kind": lambda _: of("fast"),
+    "NaN": lambda _: of([np.nan, 0.0]),
+    "two rows": lambda _: of(np.zeros(2), np.zeros(2)),
+    "no response": lambda _: BatchedData(["arm-0"], [None]),
+    "unknown": lambda _: BatchedData(
+        ["arm-0", "arm-7"], [PolicyResponse(i, np.zeros(2)) for i in ("arm-0", "arm-7")]
+    ),
+    "no column": lambda batch: batch.respond(action=None),
+    "a column without rows": lambda batch: batch.respond(action=np.zeros((0, 2))),
+    "a row too many": lambda batch: batch.respond(action=np.zeros((2, 2))),
+}
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("name", refused_batches())
+@pytest.mark.parametrize("name", REFUSED)
 def test_an_arm_stops_when_the_group_refuses_its_batch(
     arm: Any, log: Path, placement: str, name: str
 ) -> None:
     """Although nothing was sent."""
     with sync.build_env_group(arm(placement)) as group:
-        group.reset()
+        batch, _ = group.reset()
         with pytest.raises((RLightningError, ValueError)):
-            group.step(refused_batches()[name]())
+            group.step(REFUSED[name](batch))
         wait_for(log, "stop")
         with pytest.raises(EnvRaised, match="stopped"):
-            group.step(BatchedData(["arm-0"], [PolicyResponse("arm-0", np.zeros(2))]))
+            group.step(of(np.zeros(2)))
         group.reset()
     assert lines(log).count("reset") == 2
 
@@ -251,18 +254,6 @@ class AwaitableArm(Arm):
 
     async def step(self, policy_resp: PolicyResponse) -> EnvRet:  # type: ignore[override]
         return super().step(policy_resp)
-
-
-@pytest.mark.parametrize("placement", ["process", "loop"])
-async def test_an_awaitable_arm_stops_when_the_group_refuses_its_batch(
-    arm: Any, log: Path, placement: str
-) -> None:
-    ENVS.register("test arm", hardware=True)(AwaitableArm)
-    async with build_env_group(arm(placement)) as group:
-        await group.reset()
-        with pytest.raises(BadAction):
-            await group.step(refused_batches()["NaN"]())
-        wait_for(log, "stop")
 
 
 class Hanging(AwaitableArm):
@@ -291,7 +282,7 @@ async def test_the_arm_stops_that_took_the_place_of_another(
         assert lines(log) == ["reset", "stop", "reset"]
         log.unlink()  # noqa: ASYNC240
         with pytest.raises(BadAction):
-            await group.step(refused_batches()["NaN"]())
+            await group.step(of([np.nan, 0.0]))
         wait_for(log, "stop")
 
 
@@ -306,7 +297,7 @@ async def test_an_awaitable_arm_is_not_rebuilt_for_a_task(
         await group["arm-0"].call(RENEW)
         await group.step(batch.respond(action=np.zeros((1, 2))))
         with pytest.raises(BadAction):
-            await group.step(refused_batches()["NaN"]())
+            await group.step(of([np.nan, 0.0]))
         wait_for(log, "stop")
     assert lines(log) == ["reset", "step [0.0, 0.0]", "stop"]
 
@@ -332,10 +323,8 @@ class Closing(Arm):
 
 def test_an_arm_that_has_closed_is_not_stopped_any_more(log: Path) -> None:
     """Its connection is gone then, while another arm of the dead trainer closes."""
-    command = [sys.executable, "-c", TRAINER, "process", str(log), "two"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as trainer:
-        trainer.wait(HANG)
+    with running("process", log, "two") as trainer:
+        trainer.communicate(timeout=HANG)
     wait_for(log, "1 freed")
     after = lines(log)[lines(log).index("0 closed") :]
     assert "0 stopped" not in after
@@ -353,19 +342,6 @@ def test_an_arm_is_freed_when_its_group_closes(arm: Any, log: Path) -> None:
 def test_an_actor_of_ray_gets_no_arm(arm: Any) -> None:
     with pytest.raises(ConfigError, match=r"placement: an actor of Ray can't be told to stop"):
         sync.build_env_group(arm("ray"))
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("columns", [None, np.zeros((0, 2)), np.zeros((2, 2))])
-def test_an_arm_stops_when_a_column_is_refused(
-    arm: Any, log: Path, placement: str, columns: Any
-) -> None:
-    """One without rows, or with a row too many."""
-    with sync.build_env_group(arm(placement)) as group:
-        batch, _ = group.reset()
-        with pytest.raises((RLightningError, ValueError)):
-            group.step(batch.respond(action=columns))
-        wait_for(log, "stop")
 
 
 TRAINER = """
@@ -394,6 +370,13 @@ else:
 """
 
 
+def running(placement: str, log: Path, kind: str) -> subprocess.Popen[str]:
+    """Start a trainer in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-c", TRAINER, placement, str(log), kind]
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
 @pytest.mark.parametrize("kind", ["sync", "async"])
 @pytest.mark.parametrize(
     ("placement", "number"),
@@ -407,14 +390,17 @@ else:
 def test_an_arm_on_its_way_to_the_reset_position_stops(
     log: Path, kind: str, placement: str, number: int
 ) -> None:
-    """Whoever asked for the reset is interrupted or killed; nobody else could stop the arm."""
-    command = [sys.executable, "-c", TRAINER, placement, str(log), kind]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as trainer:
+    """Whoever asked for the reset is interrupted or killed; nobody else could stop the arm. After a
+    kill, a line on stderr says to whoever stands beside the arm why it stands still.
+    """
+    with running(placement, log, kind) as trainer:
         wait_for(log, "reset")
         trainer.send_signal(number)
         wait_for(log, "stop")
-        trainer.wait(HANG)
+        _, said = trainer.communicate(timeout=HANG)
+    if number == signal.SIGKILL:
+        assert said.count("env 'arm-0' was stopped, as the trainer has ended") == 1, said
+        assert lines(log) == ["reset", "stop"]
 
 
 class GymnasiumArm(gym.Env[Any, Any]):
@@ -462,18 +448,6 @@ def test_an_arm_that_is_not_announced_as_one_is_refused(log: Path, placement: st
     entry = {"name": "arm", "task": lambda: GymnasiumArm(log), "placement": placement}
     with pytest.raises(RLightningError, match="on the callable, too"):
         sync.build_env_group(entry).init()
-
-
-def test_after_the_death_of_the_trainer_a_line_says_why_the_arm_stands(log: Path) -> None:
-    """On stderr, for whoever stands beside it."""
-    command = [sys.executable, "-c", TRAINER, "process", str(log), "sync"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as trainer:
-        wait_for(log, "reset")
-        trainer.kill()
-        _, said = trainer.communicate(timeout=HANG)
-    assert said.count("env 'arm-0' was stopped, as the trainer has ended") == 1, said
-    assert lines(log) == ["reset", "stop"]
 
 
 @pytest.mark.parametrize("end", ["abort", "close"])
