@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
-from remote.faulty_proxy import Faults, FaultyProxy
+from remote.proxy import Proxy
 
 from rlightning_aio import EnvAway, ResetNeeded, sync
 from rlightning_aio.errors import BadAction
@@ -86,7 +86,7 @@ def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_pa
     """Whatever is lost meanwhile, and whoever dials in."""
     with sync.build_env_group(served()) as group, arms() as started:
         address = group["robots-0"].address
-        proxy = FaultyProxy(address, Faults())
+        proxy = Proxy(address)
         with proxy:
             arm = ArmProcess(proxy.address, tmp_path / "first")
             started.append(arm)
@@ -108,8 +108,7 @@ def test_an_arm_moves_only_when_its_user_asks(fault: str, operation: str, tmp_pa
             elif fault == "stopped":
                 arm.process.send_signal(signal.SIGSTOP)
             else:
-                for pair in proxy._pairs:
-                    pair.silent = True
+                proxy.silence()
             with pytest.raises(EnvAway):
                 group.collect_async(deadline=HANG)
             arm.end()
@@ -281,7 +280,7 @@ def test_an_arm_at_work_is_stopped_when_its_session_is_over(
     """Somebody watches the session while the env moves, however long that takes."""
     with contextlib.ExitStack() as stack:
         group = stack.enter_context(sync.build_env_group(served(heartbeat=1)))
-        proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
+        proxy = stack.enter_context(Proxy(group["robots-0"].address))
         arm = ArmProcess(proxy.address, tmp_path / "first")
         stack.callback(arm.end)
         batch, _ = group.reset()
@@ -301,35 +300,35 @@ def test_an_arm_at_work_is_stopped_when_its_session_is_over(
             with pytest.raises(KeyboardInterrupt):
                 group.collect_async()
         else:
-            for pair in proxy._pairs:
-                pair.silent = True
+            proxy.silence()
         until = time.monotonic() + HANG
         while not arm.is_stopped():
             assert time.monotonic() < until
             time.sleep(0.01)
 
 
-def test_a_client_misses_a_silent_server_as_soon_as_that_would_miss_it() -> None:
+def test_a_client_misses_a_silent_server_as_soon_as_that_would_miss_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In its first session, too, however patient it is itself."""
     with contextlib.ExitStack() as stack:
         group = stack.enter_context(sync.build_env_group(served(heartbeat=1)))
-        proxy = stack.enter_context(FaultyProxy(group["robots-0"].address, Faults()))
+        proxy = stack.enter_context(Proxy(group["robots-0"].address))
         client = ClientThread(proxy.address, "one", heartbeat=86400)
         group.reset()
-        send, pinged = proxy._send, threading.Event()
+        send, pinged = proxy.send, threading.Event()
 
-        def sending(flow: Any, message: bytes) -> None:
-            send(flow, message)
-            if flow is flow.pair.flows[1] and b"\4PING" in message:
+        def sending(flow: Any, data: bytes) -> None:
+            send(flow, data)
+            if flow is flow.pair.flows[1] and b"\4PING" in data:
                 pinged.set()
 
-        proxy._send = sending
+        monkeypatch.setattr(proxy, "send", sending)
         assert pinged.wait(HANG)
-        close, proxy._close = proxy._close, lambda pair: None  # Nor does it hear of the end.
-        for pair in proxy._pairs:
-            pair.silent = True
+        monkeypatch.setattr(proxy, "close", lambda pair: None)  # Nor does it hear of the end.
+        proxy.silence()
         client.join()  # It ends when its session does.
-        proxy._close = close
+        monkeypatch.undo()
 
 
 @pytest.mark.parametrize("action", [None, np.full((1, 2), 3.0), np.zeros((2, 2)), np.zeros((1, 3))])

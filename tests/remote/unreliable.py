@@ -82,10 +82,6 @@ class Client:
             self.hang_up()
             self.obey(self.session.disconnected("the connection broke"))
 
-    def kill(self) -> None:
-        self.cut()
-        self.begin()
-
     def flush(self) -> None:
         while self.session.outbox:
             parts = self.session.outbox.popleft()
