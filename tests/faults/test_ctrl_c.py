@@ -17,12 +17,12 @@ from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio.sync
-from rlightning_aio.errors import EnvBusy, EnvRaised
+from rlightning_aio.errors import EnvRaised
 from rlightning_aio.protocol import kernel
 from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from rlightning_aio.batch import BatchedData
 
@@ -173,38 +173,6 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
         assert batch.observation.tolist() == [[1]]
 
 
-class Saved(Counts):
-    """Presses Ctrl-C when the state of the first of its kind is saved."""
-
-    presses: Iterator[Callable[[], None]]
-
-    def save_state(self) -> Any:
-        next(self.presses, int)()
-
-    def load_state(self, state: Any) -> None: ...
-
-
-@pytest.mark.parametrize("use", ["step", "step_async", "reset", "call"])
-def test_an_interrupted_call_of_all_inline_envs_keeps_none_of_them_busy(use: str) -> None:
-    """What is left of it is executed before the next request."""
-    Saved.presses = iter([press])
-    entry = {"name": "a", "task": Saved, "placement": "inline", "num_workers": 4}
-    with rlightning_aio.sync.build_env_group(entry) as group:
-        batch, _ = group.reset()
-        with pytest.raises(KeyboardInterrupt):
-            group.snapshot()
-        uses_of(group, batch)[use]()
-
-
-def uses_of(group: Any, batch: BatchedData) -> dict[str, Callable[[], Any]]:
-    return {
-        "step": lambda: group.step(batch.respond(action=[0] * len(batch))),
-        "step_async": lambda: group.step_async(batch.respond(action=[0] * len(batch))),
-        "reset": group.reset,
-        "call": lambda: group["a-0"].get_attr("observation_space"),
-    }
-
-
 class Waiting(Counts):
     """Presses Ctrl-C in the trainer, and waits for a file."""
 
@@ -222,36 +190,6 @@ class Waiting(Counts):
 
     def load_state(self, state: Any) -> None:
         self.save_state()
-
-
-@pytest.mark.parametrize("use", ["step", "step_async", "call"])
-@pytest.mark.parametrize("interrupted", ["call", "snapshot"])
-def test_an_env_is_free_again_after_a_call_that_was_interrupted(
-    use: str, interrupted: str, tmp_path: Path
-) -> None:
-    """Once the call has ended, though nobody waits for it."""
-    go_on = tmp_path / "go-on"
-    waits_for = os.getpid(), str(go_on)
-    entry = {"name": "a", "task": Waiting}
-    with rlightning_aio.sync.build_env_group(entry) as group:
-        batch, _ = group.reset()
-        env = group["a-0"]
-        env.set_attr("waits_for", waits_for)
-        uses = uses_of(group, batch)
-        with pytest.raises(KeyboardInterrupt):
-            env.call("wait", *waits_for) if interrupted == "call" else group.snapshot()
-        with pytest.raises(EnvBusy, match="what was cancelled or aborted still runs in it"):
-            uses[use]()
-        assert group.pending == []
-        go_on.touch()
-        until = time.monotonic() + HANG
-        while True:
-            try:
-                uses[use]()
-            except EnvBusy:
-                assert time.monotonic() < until
-            else:
-                break
 
 
 @pytest.mark.parametrize("interrupted", ["snapshot", "restore"])

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
-from kit.processes import fork_server_pid, kill, pid_of
+from kit.processes import fork_server_pid, pid_of
 from kit.tokens import Tokens, entry, marked, two_workers
 
 from rlightning_aio.errors import StartFailed, WorkerDied
@@ -61,46 +61,12 @@ def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
         assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
 
 
-@kinds_on_both_drivers("deaths", ELSEWHERE)
-def test_death_in_a_reset_is_answered_by_another_reset(start: Start, deaths: list[str]) -> None:
-    """The reset that killed its worker has one marked result, the rest of the group none."""
-    group, tokens = start(two_workers()), Tokens()
-    for resets, death in enumerate(deaths, start=2):
-        group.call("faulty-0", "arm", "resetting", death)
-        batch, _ = group.reset()
-        first, second, *others = batch.values()
-        assert marked(first)
-        assert first.info["worker_restarted"].startswith(DEATHS[death])
-        assert marked(second)
-        assert [ret.info for ret in others] == [{"resets": resets}] * 2
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-
-
 @on_one_driver
 def test_death_in_a_reset_with_options_is_answered_by_one_without(start: Start) -> None:
     """The options may have caused the death; the replacement's reset doesn't repeat them."""
     group = start(two_workers())
     batch, _ = group.reset(options={"fault": "segfault"}, env_ids=["faulty-2"])
     assert marked(batch.values()[0])
-
-
-@kinds_on_both_drivers("deaths", ELSEWHERE)
-def test_death_in_a_call_is_raised_and_the_env_stays_usable(
-    start: Start, deaths: list[str]
-) -> None:
-    """A reset can't answer a call, so the call raises; the envs report the death at their next
-    step.
-    """
-    group, tokens = start(entry()), Tokens()
-    for death in deaths:
-        with pytest.raises(WorkerDied, match="faulty-0") as caught:
-            group.call("faulty-0", "do", death)
-        assert DEATHS[death] in str(caught.value)
-        assert caught.value.env_ids == ("faulty-0",)
-        assert caught.value.exit_code is not None
-        batch, _ = group.step(tokens.steps(group.group.env_ids))
-        assert all(map(marked, batch.values()))
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 @kinds_on_both_drivers("deaths", ELSEWHERE)
@@ -194,15 +160,6 @@ def test_raise_gives_up_only_the_envs_of_the_dead_worker(start: Start) -> None:
         tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
 
 
-def test_death_of_an_idle_worker_is_reported_at_the_next_step(start: Start) -> None:
-    """No call was waiting, but the lost episode doesn't continue silently."""
-    group, tokens = start(two_workers()), Tokens()
-    group.step(tokens.steps(group.group.env_ids))
-    kill(pid_of(group, "faulty-0"))
-    batch, _ = group.step(tokens.steps(group.group.env_ids))
-    assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
-
-
 def test_others_continue_while_a_worker_is_replaced(start: Start, tmp_path: Path) -> None:
     """A replacement that is slow to build delays no other worker."""
     gate = tmp_path / "gate"
@@ -257,22 +214,6 @@ def test_replacement_that_cannot_be_built_is_raised_with_its_error(
     with pytest.raises(WorkerDied, match="could not be rebuilt: ValueError: as asked for"):
         group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
-
-
-def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:
-    """All of its workers die; every env replies once, and continues."""
-    group, tokens = start(two_workers()), Tokens()
-    server = fork_server_pid(group.group)
-    group.step_async(tokens.steps(["faulty-1"]))
-    kill(server)
-    batch, _ = group.collect_async()
-    assert batch.ids() == ["faulty-1"]
-    if not marked(batch["faulty-1"]):  # This env had stepped before the kill.
-        tokens.check(batch)
-        assert marked(group.step(tokens.steps(["faulty-1"]))[0]["faulty-1"])
-    batch, _ = group.step(tokens.steps(["faulty-0", "faulty-2", "faulty-3"]))
-    assert all(map(marked, batch.values()))
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 @on_one_driver

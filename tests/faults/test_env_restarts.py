@@ -207,41 +207,6 @@ def test_an_env_whose_result_cannot_be_sent_is_rebuilt(build: Start, task: type)
     assert batch.observation.tolist() == [[2, 0]]
 
 
-class RaisesAfterHang(AwaitedLives):
-    """Its step hangs, and the first reset of the env that takes its place raises."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.raises = self.env.number == 2
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        if self.raises:
-            self.raises = False
-            raise KeyError("a bug")
-        return await super().reset(seed=seed, options=options)
-
-    async def step(self, action: Any) -> Any:
-        await asyncio.Event().wait()
-
-
-@pytest.mark.parametrize("placement", ["process", "loop"])
-@pytest.mark.parametrize("driver", ["uvloop"])
-def test_an_env_that_raises_in_the_reset_after_a_hang_is_rebuilt(
-    build: Start, placement: str
-) -> None:
-    """Such an exception counts like any other. The episode that was lost is that of the hang."""
-    Lives.made = 0
-    place = {"task": RaisesAfterHang, "placement": placement, "envs_per_process": 1}
-    if placement == "loop":
-        del place["envs_per_process"]
-    group = build({"name": "e", "on_env_error": "restart", "step_timeout": 0.5, **place})
-    group.init()
-    batch, _ = group.reset()
-    batch, _ = group.step(batch.respond(action=[0]))
-    assert batch.outcome[0].kind == "env_hung"
-    assert batch.observation.tolist() == [[3, 0]]
-
-
 class HangsToo(AwaitedLives):
     """Action 3 hangs."""
 

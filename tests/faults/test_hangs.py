@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import threading
@@ -101,14 +100,6 @@ def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
 
 
 @on_one_driver
-def test_hung_reset_with_options_is_found(start: Start) -> None:
-    """Its request went through the channel, not through the ring."""
-    group = start(entry(1, reset_timeout=LIMIT))
-    batch, _ = group.reset(options={"fault": "sleep"})
-    assert marked(batch["faulty-0"])
-
-
-@on_one_driver
 def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> None:
     """The worker was checked while it executed a request without a limit."""
     group, tokens = start(entry(2, reset_timeout=LIMIT)), Tokens()
@@ -118,14 +109,6 @@ def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> N
         group.step(tokens.steps(["faulty-1"]))
         batch, _ = group.step(tokens.steps(["faulty-0", "faulty-1"]))
     assert marked(batch["faulty-1"])
-
-
-def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> None:
-    """It executes nothing, so no request takes too long; yet its env owes a reply."""
-    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
-    stop(pid_of(group, "faulty-0"))
-    batch, _ = group.step(tokens.steps(group.group.env_ids))
-    assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
 
 
 def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
@@ -158,18 +141,6 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
         batch, _ = group.collect_async(min_results=2)
         found = dict(batch.items())
     assert marked(found["faulty-0"])
-
-
-def test_a_late_trainer_takes_no_worker_for_hung(start: Start) -> None:
-    """Time that the trainer spends elsewhere doesn't count for the env."""
-    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
-    for _ in range(2):
-        group.step_async(tokens.steps(group.group.env_ids))
-        with pytest.raises(TimeoutError):  # An event loop that has nothing to wait for.
-            asyncio.run(asyncio.wait_for(asyncio.Event().wait(), 2 * LIMIT))
-        batch, _ = group.collect_async(wait_all=True)
-        assert len(batch) == 4
-        tokens.check(batch)
 
 
 def test_a_trainer_that_reads_megabytes_late_takes_no_worker_for_hung(start: Start) -> None:

@@ -53,27 +53,6 @@ def test_ends_of_their_own_are_the_policys(start: Start) -> None:
 
 
 @pytest.mark.parametrize(
-    ("deed", "kind", "blame"), [(RAISE, "env_raised", "either"), (BLAME, "env_raised", "policy")]
-)
-def test_an_env_that_raises_in_a_step(start: Start, deed: int, kind: str, blame: str) -> None:
-    group = start(entry(num_workers=1))
-    with pytest.raises(rl.EnvRaised) as caught:
-        step(group, deed)
-    assert said(caught.value.outcome) == (kind, blame, "f-0")
-    assert "\n" not in caught.value.outcome.cause
-
-
-@pytest.mark.parametrize(("deed", "blame"), [(RAISE, "env"), (BLAME, "policy")])
-def test_an_env_that_raises_in_its_reset_has_not_started(
-    start: Start, deed: int, blame: str
-) -> None:
-    group = start(entry(num_workers=1))
-    with pytest.raises(rl.EnvRaised) as caught:
-        group.reset(options={"deed": deed})
-    assert said(caught.value.outcome) == ("not_started", blame, "f-0")
-
-
-@pytest.mark.parametrize(
     ("deed", "kind", "blame"), [(DIE, "env_died", "env"), (HANG, "env_hung", "either")]
 )
 def test_a_lost_episode_says_so_and_blames_no_neighbour(

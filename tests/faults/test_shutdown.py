@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 from kit.driven import Driven
-from kit.processes import fork_server_pid, kill, pid_of, stop
+from kit.processes import fork_server_pid, pid_of, stop
 from kit.tokens import Tokens, two_workers
 from patience import HANG
 
@@ -35,14 +35,11 @@ if TYPE_CHECKING:
 
     Start: TypeAlias = Callable[..., Driven]
 
-SECONDS = 2.0
-"""The contract's limit for workers."""
-
 
 def test_all_waits_in_the_library_take_less_than_two_seconds() -> None:
     """For envs that close, for the report of a kill, and for workers whose trainer is gone."""
-    assert times.CLOSE + times.GRACE < SECONDS
-    assert times.CLOSE_ALONE < SECONDS
+    assert times.CLOSE + times.GRACE < 2.0
+    assert times.CLOSE_ALONE < 2.0
 
 
 SCRIPT = """
@@ -423,40 +420,6 @@ def test_child_of_the_trainer_can_not_use_its_group(driver: str) -> None:
         assert process.wait(HANG) == 0
 
 
-@pytest.mark.parametrize(
-    ("driver", "moment"),
-    [*(("sync", moment) for moment in ("new", "up", "busy", "ready", "dead")), ("uvloop", "busy")],
-)
-def test_close_works_at_any_moment_and_twice(build: Start, moment: str) -> None:
-    """Results that were not collected are dropped; nothing else is left of the group."""
-    group, tokens = build(two_workers()), Tokens()
-    if moment != "new":
-        group.init()
-        group.reset()
-    if moment in ("busy", "ready"):
-        group.call("faulty-0", "step_takes", 0.1 if moment == "busy" else 0.0)
-        group.step_async(tokens.steps(group.group.env_ids))
-    if moment == "ready":
-        group.collect_async(min_results=4, max_results=4, wait_all=True)
-        group.step_async(tokens.steps(group.group.env_ids))
-    if moment == "dead":
-        kill(pid_of(group, "faulty-0"))
-    # The envs of a dead worker can't be closed; a warning says so.
-    warned = pytest.warns(UserWarning, match="SIGKILL")
-    with warned if moment == "dead" else contextlib.nullcontext():
-        group.close()
-    for _ in range(2):
-        group.close()
-
-
-def test_env_that_hangs_in_close_is_killed(start: Start) -> None:
-    """`close` waits for it as long as for any other, and names the env."""
-    group = start(two_workers())
-    group.call("faulty-1", "arm", "closing", "deadlock")
-    with pytest.warns(UserWarning, match=r"faulty-1.*did not close in time and was killed"):
-        group.close()
-
-
 def test_env_that_hangs_in_a_step_does_not_delay_close(start: Start) -> None:
     """Whatever its own timeout is."""
     group, tokens = start(two_workers(step_timeout=10 * HANG)), Tokens()
@@ -498,36 +461,6 @@ async def test_start_can_be_closed_from_another_task() -> None:
     await group.close()
     with pytest.raises(GroupClosed):
         await starting
-
-
-INTERRUPTED: dict[str, Callable[[Any, Tokens], Any]] = {
-    "step": lambda group, tokens: group.step(
-        tokens.steps(group.env_ids, {"faulty-1": "interrupt the trainer"})
-    ),
-    "collect_async": lambda group, tokens: (
-        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "interrupt the trainer"})),
-        group.collect_async(wait_all=True),
-    ),
-    "call": lambda group, tokens: group["faulty-1"].call("do", "interrupt the trainer"),
-}
-
-
-@pytest.mark.parametrize("waiting", INTERRUPTED)
-def test_interrupted_wait_loses_nothing(waiting: str) -> None:
-    """The wait raises KeyboardInterrupt, and the next results are right."""
-    group, tokens = Driven("sync", two_workers()), Tokens()
-    group.init()
-    group.reset()
-    with pytest.raises(KeyboardInterrupt):
-        INTERRUPTED[waiting](group.group, tokens)
-    if waiting != "call":
-        batch, _ = group.collect_async(wait_all=True)
-        assert sorted(batch.ids()) == group.group.env_ids
-        tokens.check(batch)
-    group.call("faulty-0", "do", "nothing")  # In the same worker, so the other call is over.
-    for _ in range(3):
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-    group.end()
 
 
 def test_replaced_workers_leave_no_zombies(start: Start) -> None:
