@@ -28,10 +28,8 @@ class FrameKind(IntEnum):
     REQUEST = 3  # trainer; the entry: arguments out of band
     ABORT = 4  # trainer; the request's entry
     CLOSE = 5  # trainer
-    STARTED = 6  # worker: metadata of each env
-    RESULT = 7  # worker; the request's entry: the part out of band
-    VALUE = 8  # worker; the request's entry: the value of a call
-    OTHER = 9  # worker: any other completion
+    RESULT = 6  # worker; the request's entry: the part out of band
+    OTHER = 7  # worker; the entry of a call that has returned, else 0: any other completion
 
 
 class Frame(NamedTuple):

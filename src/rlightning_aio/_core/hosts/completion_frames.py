@@ -9,12 +9,12 @@ Invariant: what can't be pickled, or can't be unpickled in the trainer, is an er
 from __future__ import annotations
 
 import pickle
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.hosts.messages import Built, NotBuilt, Raised, Result, Value
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.frames import Frame, FrameKind
-from rlightning_aio.protocol.pickling import dumped, dumped_with_code
+from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Completion
@@ -26,17 +26,13 @@ SENDER: Final = 0
 def frame_of(completion: Completion) -> Frame:
     """Return the frame that reports a completion."""
     try:
-        if isinstance(completion, Built):
-            return Frame(FrameKind.STARTED, 0, dumped_with_code(completion.started))
         if isinstance(completion, Result):
             payload = completion.out_of_band
             if type(payload) is not bytes:
                 payload = dumped(payload, "the result")
             return Frame(FrameKind.RESULT, completion.entry, payload)
-        if isinstance(completion, Value):
-            payload = dumped(completion.value, "what it returned")
-            return Frame(FrameKind.VALUE, completion.entry, payload)
-        return Frame(FrameKind.OTHER, 0, pickle.dumps(completion))
+        entry = completion.entry if isinstance(completion, Value) else 0
+        return Frame(FrameKind.OTHER, entry, dumped(completion, "what it returned"))
     except BaseException as error:
         if isinstance(completion, Built):
             last = len(completion.started) - 1
@@ -48,23 +44,14 @@ def frame_of(completion: Completion) -> Frame:
 
 def completion_in(host_id: int, frame: Frame) -> Completion:
     """Return the completion of a host that a frame reports."""
-    kind, number, payload = frame
+    kind, entry, payload = frame
     if kind == FrameKind.RESULT:
-        return Result(host_id, number, payload)
+        return Result(host_id, entry, payload)
     try:
-        found: Any = pickle.loads(payload)
+        return pickle.loads(payload)._replace(host_id=host_id)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # Unpickling may raise anything.
-        if kind == FrameKind.STARTED:
-            return NotBuilt(host_id, 0, ErrorText.of(error))
-        if kind == FrameKind.VALUE:
-            return Raised(host_id, number, ErrorText.of(error))
-        raise
-    if kind == FrameKind.STARTED:
-        return Built(host_id, found)
-    return (
-        Value(host_id, number, found)
-        if kind == FrameKind.VALUE
-        else found._replace(host_id=host_id)
-    )
+        text = ErrorText.of(error)
+        # Of a worker's own words, only a value and a description of envs hold what others made.
+        return Raised(host_id, entry, text) if entry else NotBuilt(host_id, 0, text)
