@@ -179,7 +179,7 @@ class Broken:
 
 
 def link_of(group: rlightning_aio.EnvGroup) -> Any:
-    return group._core.supervisor.hosts[0]._link
+    return group._core.supervisor.hosts[0]
 
 
 @LOOPS

@@ -13,7 +13,7 @@ import pytest
 from patience import HANG
 
 from rlightning_aio._core.hosts.arena import Arena
-from rlightning_aio._core.hosts.messages import WorkerPlace
+from rlightning_aio._core.hosts.messages import Death, WorkerPlace
 from rlightning_aio._core.hosts.process import fork_server
 from rlightning_aio._core.hosts.process.fork_messages import Exited, Fork
 from rlightning_aio._core.hosts.process.host import ForkServerHandle
@@ -28,8 +28,8 @@ class Asker:
     host_id = 0
     why = ""
 
-    def on_fork_server_lost(self, why: str) -> None:
-        self.why = why
+    def on_end(self, death: Death) -> None:
+        self.why = death.cause.removeprefix("ended with its fork server: ")
 
     def watch(self, source: Any) -> None: ...
 

@@ -1,4 +1,4 @@
-"""A process host and its link: data from the rings, the channel, and the fork server."""
+"""A process host: data from the rings, the channel, and the fork server."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.base import Wiring
 from rlightning_aio._core.hosts.completion_frames import frame_of
 from rlightning_aio._core.hosts.messages import (
+    Death,
     Died,
     NewSchema,
     Reported,
@@ -250,13 +251,13 @@ def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) 
     started.rings.frame_seen()
     large = bytes(3 << 20)
     started.host.submit(steps(1), [large, b"small"])
-    (link,) = started.writable
+    (host,) = started.writable
     assert not started.rings.has_frame()
     found: list[Any] = []
     while len(found) < 2:
         found += started.received()
         if started.writable:
-            link.on_writable()
+            host.on_writable()
     assert [(f.number, len(f.payload)) for f in found] == [
         (step(1, 0), len(large)),
         (step(1, 1), 5),
@@ -272,12 +273,12 @@ def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) 
 def test_data_that_the_system_has_no_memory_for_is_written_later(started: Scene, code: int) -> None:
     """A call that has numbered its requests can't take them back."""
     started.received()
-    link: Any = started.host._link
+    host: Any = started.host
     broken = Mock(send=Mock(side_effect=OSError(code, "no memory")))
-    with patch.object(link, "_socket", broken):
+    with patch.object(host, "_socket", broken):
         started.host.submit(steps(1), [b"first", b"second"])
-    assert started.writable == {link}
-    link.on_writable()
+    assert started.writable == {host}
+    host.on_writable()
     assert [frame.payload for frame in started.received()] == [b"first", b"second"]
 
 
@@ -336,7 +337,7 @@ def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) 
     assert (died.death.exit_code, died.death.stderr_tail) == (-signal.SIGSEGV, "last words")
     assert died.death.requests == (step(2, 1), *steps(1).tolist(), *steps(2).tolist())
     started.host.on_exit(0, "")
-    started.host.on_fork_server_lost("it ended")
+    started.host.on_end(Death("ended with its fork server: it ended"))
     assert started.posted() == []
     assert not started.watched
     assert started.host.current_request() == (0, 0)
@@ -360,7 +361,7 @@ def test_the_ring_of_a_dead_worker_takes_requests_until_its_death_is_posted(star
     assert set(steps(1).tolist()) <= set(died.death.requests)
 
 
-def test_a_replacement_has_a_new_link(started: Scene) -> None:
+def test_a_replacement_has_a_new_channel(started: Scene) -> None:
     """Reports and frames of the former worker are dropped, and counts are correct."""
     bell, old = started.bell, started.channel
     started.host.submit(steps(1))

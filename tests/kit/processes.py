@@ -49,5 +49,5 @@ def wait_for_reply(group: Any, worker: int) -> None:
     """Wait until a worker's next reply has begun to fill its channel; nobody reads it here, as all
     that is public would.
     """
-    link = group._core.supervisor.hosts[worker]._link
-    assert select.select([link.fileno()], [], [], HANG)[0]
+    host = group._core.supervisor.hosts[worker]
+    assert select.select([host.fileno()], [], [], HANG)[0]

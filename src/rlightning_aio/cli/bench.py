@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from rlightning_aio._core.hosts.process.fork_server import die_with_parent
-from rlightning_aio._core.hosts.process.host import ending
+from rlightning_aio._core.hosts.processes import ending
 from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
 from rlightning_aio.cli.measurement import in_turns, machine_facts
 from rlightning_aio.cli.measuring import Contender, Rule, opened_group

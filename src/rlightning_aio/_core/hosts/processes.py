@@ -1,5 +1,5 @@
 """Processes of this machine: what a worker's envs have started (browsers, simulators, shells) is
-found and killed with it; the memory and the processor time that one uses.
+found and killed with it; the memory and the processor time that one uses; how one has ended.
 
 A process whose parent ends becomes a child of its nearest ancestor that adopts. Each worker adopts,
 so that all that its envs have started stays below it, also what begins a session of its own. The
@@ -116,3 +116,17 @@ def processor_ns(pid: int) -> int | None:
     except (OSError, ValueError):
         return None  # A thread has ended meanwhile, or the accounts have another form.
     return ran or None
+
+
+def ending(exit_code: int) -> str:
+    """Say in a clause how a process ended; `exit_code` is negative for a signal."""
+    if exit_code >= 0:
+        return f"exited with code {exit_code}"
+    try:
+        name = signal.Signals(-exit_code).name
+    except ValueError:
+        name = f"signal {-exit_code}"
+    hint = ""
+    if exit_code == -signal.SIGKILL:
+        hint = " (if you didn't, the kernel may have run out of memory: see dmesg)"
+    return f"was killed by {name}{hint}"

@@ -1,13 +1,14 @@
-"""`ProcessHost`: the life of a worker process; `ForkServerHandle`: the trainer's handle on its
-parent.
+"""`ProcessHost`: the life of a worker process, and the trainer's ends of what the two share;
+`ForkServerHandle`: the trainer's handle on its parent.
 
-A worker is watched through its channel (see `link`) and by the fork server, which is its parent, so
-no death goes unnoticed.
+Requests go into shared rings, larger data into the channel (a socket pair). A worker is watched
+through its channel and by the fork server, which is its parent, so no death goes unnoticed.
 Left out on purpose: decisions about a death, which the supervisor makes.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import signal
@@ -19,8 +20,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.base import Host
+from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.descriptors import occupy_standard_streams
-from rlightning_aio._core.hosts.messages import Closed, Death, Died, WorkerPlace
+from rlightning_aio._core.hosts.messages import Closed, Death, Died, Reported, WorkerPlace
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
     CloseLimit,
@@ -34,15 +36,14 @@ from rlightning_aio._core.hosts.process.fork_messages import (
     Ready,
 )
 from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
-from rlightning_aio._core.hosts.process.link import Link
 from rlightning_aio._core.hosts.process.spares import RunningForkServer
-from rlightning_aio._core.hosts.processes import processor_ns, resident_mb
+from rlightning_aio._core.hosts.processes import ending, processor_ns, resident_mb
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.error_text import ErrorText
-from rlightning_aio.protocol.frames import FrameKind
+from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
-from rlightning_aio.protocol.rings import rings_size
+from rlightning_aio.protocol.rings import TrainerRings, rings_size
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -233,7 +234,8 @@ class ForkServerHandle:
             host = self._hosts.pop(message.host_id)
             host.on_exit(message.exit_code, message.stderr_tail)
         elif isinstance(message, NotForked):
-            self._hosts.pop(message.host_id).on_refused(message.why)
+            host = self._hosts.pop(message.host_id)
+            host.on_end(Death(f"could not be forked: {message.why}", refused=True))
 
     def _lost(self) -> None:
         """Handle the exit of the fork server; the kernel killed its workers."""
@@ -248,7 +250,7 @@ class ForkServerHandle:
             if not self._ready and self._interpreter:
                 why += f"; is {self._interpreter} a Python with the packages that workers need?"
         for host in hosts:
-            host.on_fork_server_lost(why.rstrip())
+            host.on_end(Death(f"ended with its fork server: {why.rstrip()}"))
 
     def release(self, seconds: float) -> None:
         """Keep the fork server for another group if this one had started, and it has no workers and
@@ -282,9 +284,13 @@ def _surroundings(config: EnvConfig) -> tuple[object, ...]:
 
 
 class ProcessHost(Host):
-    """The trainer's handle on one worker process.
+    """The trainer's handle on one worker process, and on its replacements.
 
     See `base.Host` and `Killable`.
+
+    Attributes:
+        pid: of the worker, once it is known.
+        traffic: see `base.Killable.traffic`.
     """
 
     on_bell = True
@@ -307,11 +313,18 @@ class ProcessHost(Host):
             rings_offset,
             rings_offset,
         )
-        self._rings: memoryview | None = None
-        self._link: Link | None = None
-        self._alive = False
+        self._memory: memoryview | None = None
+        # Of the worker that lives. Its channel may end before it does.
+        self._rings: TrainerRings | None = None
+        self._socket: socket.socket | None = None
+        self._frames = FrameReader()
+        self._outgoing = bytearray()
+        self._frames_outgoing = 0
+        # What its envs raised when it closed.
+        self._close_errors: list[tuple[int, ErrorText]] | None = None
         self._closing = False
         self._killed = ""
+        self.traffic = 0
 
     # -- life ---------------------------------------------------------------------
 
@@ -322,10 +335,7 @@ class ProcessHost(Host):
         ours, theirs = _new_channel()
         try:
             ours.setblocking(False)
-            if self._rings is None:
-                size = rings_size(self.num_envs)
-                self._rings = self._wiring.arena.map(self._place.rings_offset, size)
-            self._link = Link(self._place, self._rings, self._wiring, ours)
+            self._open(ours)
             self._fork_server.fork(self, theirs, self._wiring.arena, Fork(self._place))
         except BaseException:
             # The supervisor may try again, when there are descriptors.
@@ -333,8 +343,19 @@ class ProcessHost(Host):
             ours.close()
             theirs.close()
             raise
-        self._alive = True
-        self._link.send(FrameKind.START, payload=self._start_payload)
+        self._send(FrameKind.START, payload=self._start_payload)
+
+    def _open(self, channel: socket.socket) -> None:
+        """Clear the rings and use a new channel, for the next worker."""
+        wiring = self._wiring
+        if self._memory is None:
+            self._memory = wiring.arena.map(self._place.rings_offset, rings_size(self.num_envs))
+        self._rings = TrainerRings(self._memory, self.num_envs, wiring.bell, self.host_id)
+        self._socket, self._frames = channel, FrameReader()
+        self._outgoing, self._frames_outgoing = bytearray(), 0
+        self._close_errors = None
+        wiring.rings[self.host_id] = self._rings.ring(self._wake)
+        wiring.driver.watch(self)
 
     def count_with(self, peer: Host) -> None:
         if isinstance(peer, ProcessHost):
@@ -342,8 +363,7 @@ class ProcessHost(Host):
 
     def attach(self, order: AttachOrder) -> None:
         self._fork_server.note_used(self, order.close_seconds)
-        if self._link is not None:
-            self._link.send(FrameKind.ATTACH, payload=pickle.dumps(order))
+        self._send(FrameKind.ATTACH, payload=pickle.dumps(order))
 
     def kill(self, *, dump: bool) -> None:
         self._killed = "did not close in time and was killed" if self._closing else ""
@@ -354,100 +374,203 @@ class ProcessHost(Host):
 
     def close(self) -> None:
         self._closing = True
-        if self._alive and self._link is not None:
-            self._link.send(FrameKind.CLOSE)
+        if self._rings is not None:
+            self._send(FrameKind.CLOSE)
         else:
             self._wiring.completions.append(Closed(self.host_id, []))
 
     def release(self) -> None:
-        self._close_link()
-        self._rings = None
+        self._part()
+        self._memory = None
 
-    def _close_link(self) -> None:
-        self._alive = False
-        if self._link is not None:
-            self._link.close()
-            self._link = None
+    def _part(self) -> None:
+        """Take the rings away, and close the channel; unread data is lost."""
+        if self._rings is not None:
+            self._wiring.rings[self.host_id] = self._rings = None
+        self._close_channel()
+
+    def _close_channel(self) -> None:
+        if self._socket is not None:
+            self._wiring.driver.unwatch(self)
+            self._socket.close()
+            self._socket = None
 
     def on_exit(self, exit_code: int, stderr_tail: str) -> None:
         """Handle the exit of the worker; read its pending output first."""
-        if self._link is not None:
-            self._link.on_readable()
+        self.on_readable()
         by_us = self._killed and exit_code == -signal.SIGKILL
-        self._ended(self._killed if by_us else ending(exit_code), exit_code, stderr_tail)
+        cause = self._killed if by_us else ending(exit_code)
+        self.on_end(Death(cause, exit_code, stderr_tail))
 
-    def on_refused(self, why: str) -> None:
-        """Handle that the worker could not be forked."""
-        self._ended(f"could not be forked: {why}", None, "", refused=True)
-
-    def on_fork_server_lost(self, why: str) -> None:
-        """Handle the exit of the fork server, which ended the worker, too."""
-        self._ended(f"ended with its fork server: {why}", None, "")
-
-    def _ended(
-        self, cause: str, exit_code: int | None, stderr_tail: str, *, refused: bool = False
-    ) -> None:
-        link, post = self._link, self._wiring.completions.append
-        if link is None:
+    def on_end(self, death: Death) -> None:
+        """Handle the end of the worker; its requests are added here."""
+        rings, post = self._rings, self._wiring.completions.append
+        if rings is None:
             return
-        link.poll()
-        requests = link.last_requests()
-        self._close_link()
+        self.poll()
+        requests = (rings.current()[0], *rings.last_requests())
+        self._part()
         self.pid = None
         if not self._closing:
-            post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests, refused)))
+            post(Died(self.host_id, replace(death, requests=requests)))
             return
-        errors = link.close_errors
+        errors = self._close_errors
         if errors is None:
             # Before that env it has closed all others, unless it was in a request.
             is_closing = requests[0] and not number_of(requests[0])
             first = slot_of(requests[0]) - self.first_slot if is_closing else 0
-            text = ErrorText("WorkerDied", f"its worker {cause}", stderr_tail)
+            text = ErrorText("WorkerDied", f"its worker {death.cause}", death.stderr_tail)
             errors = [(index, text) for index in range(first, self.num_envs)]
         post(Closed(self.host_id, errors))
 
-    # -- requests and replies -----------------------------------------------------
+    # -- requests -----------------------------------------------------------------
 
     def packed(self, arguments: Any) -> bytes:
         return dumped(arguments, "it")
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None = None) -> None:
-        if self._link is not None:
-            self._link.submit(entries, arguments)
+        if self._rings is None:
+            return
+        if arguments is None:
+            if self._rings.request(entries):
+                self._wake()
+            return
+        frames = [
+            encode(FrameKind.REQUEST, entry, packed)
+            for entry, packed in zip(entries.tolist(), arguments, strict=True)
+        ]
+        self._frames_outgoing += len(frames)
+        self._write(b"".join(frames))
 
     def abort(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.abort`. A worker only reads this between requests, if its envs block."""
-        if self._link is not None:
-            for entry in entries.tolist():
-                self._link.send(FrameKind.ABORT, entry)
+        for entry in entries.tolist():
+            self._send(FrameKind.ABORT, entry)
 
     def stop(self, index: int, number: int) -> None:
-        if self._link is not None:
-            self._link.stop(index, number)
+        if self._rings is not None:
+            self._rings.stop(index, number)
+
+    def _wake(self) -> None:
+        """Wake the sleeping worker: its ring has requests."""
+        if self._socket is None or self._outgoing:
+            self._write(BELL)
+            return
+        try:
+            self._socket.send(BELL)  # Few enough bytes to be sent whole or not at all.
+        except OSError:
+            self._write(BELL)
+
+    def _send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
+        """Send a frame, now or when the channel has room; drop it if there is no worker."""
+        if self._rings is not None:
+            self._frames_outgoing += 1
+            self._write(encode(kind, number, payload))
+
+    def _write(self, data: bytes) -> None:
+        if self._outgoing:
+            self._outgoing += data
+            return
+        sent = self._write_some(data)
+        if sent < len(data):
+            self._outgoing += data[sent:]
+            self._wiring.driver.watch_writable(self, True)
+        elif self._frames_outgoing:
+            self._all_written()
+
+    def _write_some(self, data: bytes | bytearray) -> int:
+        if self._socket is None:
+            return len(data)
+        try:
+            return self._socket.send(data)
+        except BlockingIOError:
+            return 0
+        except (BrokenPipeError, ConnectionResetError):
+            # The worker is gone; the fork server will report its exit.
+            return len(data)
+        except OSError as error:
+            if error.errno not in (errno.ENOBUFS, errno.ENOMEM):
+                raise
+            return 0
+
+    def on_writable(self) -> None:
+        sent = self._write_some(self._outgoing)
+        del self._outgoing[:sent]
+        self.traffic += sent
+        if not self._outgoing:
+            self._wiring.driver.watch_writable(self, False)
+            self._all_written()
+
+    def _all_written(self) -> None:
+        # Only now: a worker expects a counted frame to be complete.
+        assert self._rings is not None
+        while self._frames_outgoing:
+            self._frames_outgoing -= 1
+            self._rings.count_frame()
+
+    # -- replies ------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """Return the descriptor of the channel."""
+        assert self._socket is not None
+        return self._socket.fileno()
+
+    def on_readable(self) -> None:
+        """Read all frames. Reports come by `poll`, from the rings of all workers."""
+        while self._socket is not None and self._rings is not None:
+            try:
+                data = self._socket.recv(CHUNK_BYTES)
+            except BlockingIOError:
+                return
+            except ConnectionResetError:
+                data = b""
+            if not data:
+                # The fork server keeps the other end open until it has handled the exit, and it
+                # reports the cause. Until that is read, the ring takes further requests.
+                self._close_channel()
+                return
+            self.traffic += len(data)
+            if data == BELL and self._frames.is_empty:
+                return
+            for frame in self._frames.feed(data):
+                self._rings.frame_seen()
+                completion = completion_in(self.host_id, frame)
+                if isinstance(completion, Closed):  # Posted when the worker has ended.
+                    self._close_errors = completion.errors
+                else:
+                    self._wiring.completions.append(completion)
+            if len(data) < CHUNK_BYTES:
+                return
 
     def poll(self) -> None:
-        if self._link is not None:
-            self._link.poll()
+        if self._rings is None:
+            return
+        entries = self._rings.reports()
+        if len(entries):
+            # Frames that were sent before these reports come first.
+            if self._rings.has_frame():
+                self.on_readable()
+            self._wiring.completions.append(Reported(self.host_id, entries))
+
+    def catch_up(self) -> bool:
+        posted, traffic = len(self._wiring.completions), self.traffic
+        self._fork_server.on_readable()
+        if self._outgoing:
+            self.on_writable()
+        self.on_readable()
+        self.poll()
+        return (len(self._wiring.completions), self.traffic) != (posted, traffic)
+
+    # -- the state of the worker ------------------------------------------------------
 
     def current_request(self) -> tuple[int, int]:
-        return (0, 0) if self._link is None else self._link.current_request()
+        return (0, 0) if self._rings is None else self._rings.current()
 
     def resident_mb(self) -> float:
         return 0.0 if self.pid is None else resident_mb(self.pid)
 
     def processor_ns(self) -> int | None:
         return None if self.pid is None else processor_ns(self.pid)
-
-    @property
-    def traffic(self) -> int:
-        return 0 if self._link is None else self._link.traffic
-
-    def catch_up(self) -> bool:
-        posted, traffic = len(self._wiring.completions), self.traffic
-        self._fork_server.on_readable()
-        if self._link is not None:
-            self._link.catch_up()
-        return (len(self._wiring.completions), self.traffic) != (posted, traffic)
 
 
 def check_system(config: EnvConfig) -> None:
@@ -474,17 +597,3 @@ def _new_channel() -> tuple[socket.socket, socket.socket]:
     theirs.close()
     occupy_standard_streams()  # The program has closed some since the group was built.
     return socket.socketpair()
-
-
-def ending(exit_code: int) -> str:
-    """Say in a clause how a process ended; `exit_code` is negative for a signal."""
-    if exit_code >= 0:
-        return f"exited with code {exit_code}"
-    try:
-        name = signal.Signals(-exit_code).name
-    except ValueError:
-        name = f"signal {-exit_code}"
-    hint = ""
-    if exit_code == -signal.SIGKILL:
-        hint = " (if you didn't, the kernel may have run out of memory: see dmesg)"
-    return f"was killed by {name}{hint}"
