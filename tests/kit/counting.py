@@ -72,7 +72,7 @@ class CountingEnv(BaseEnv):
 def look(group: Any, seconds: float = 0.02, server: str = "robots-0") -> None:
     """Let the sockets of an env_server work, while nothing is asked of anybody."""
     time.sleep(seconds)
-    group[server]._server.on_readable()  # noqa: SLF001
+    group[server]._server.listener.on_readable()  # noqa: SLF001
     group._core.intake.apply_completions()  # noqa: SLF001
 
 

@@ -46,7 +46,7 @@ def with_a_client() -> Iterator[tuple[Any, Any, ClientThread, Any]]:
     with sync.build_env_group(ENTRY) as group:
         friend = ClientThread(group["robots-0"].address, "arm")
         batch, _ = group.reset(env_ids=["robots-0/arm"])
-        yield group, group["robots-0"]._server._listener, friend, batch
+        yield group, group["robots-0"]._server.listener, friend, batch
         group.close()
         friend.join()
 
@@ -70,7 +70,7 @@ def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
         group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
         assert begun.wait(HANG)
         server: Any = group["robots-0"]._server
-        listener = server._listener
+        listener = server.listener
         read_events = listener._read_events
 
         def read_late() -> None:
@@ -82,7 +82,7 @@ def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
             read_events()
 
         monkeypatch.setattr(listener, "_read_events", read_late)
-        server.on_readable()
+        listener.on_readable()
         batch, _ = group.collect_async(deadline=HANG)
     assert batch.observation.tolist() == [[0, -1, 1]]
     assert "client_lost" not in batch.values()[0].info
@@ -147,7 +147,7 @@ def test_all_that_came_before_the_end_of_a_connection_is_read(
 def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: bytes) -> None:
     """A greeting that arrives while the socket closes would end the process (libzmq assertion)."""
     with sync.build_env_group(ENTRY) as group:
-        listener = group["robots-0"]._server._listener
+        listener = group["robots-0"]._server.listener
         (peer,) = dial(group["robots-0"].address, 1)
         with peer:
             peer.settimeout(HANG)

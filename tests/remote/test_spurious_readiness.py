@@ -10,7 +10,7 @@ from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 
 from rlightning_aio import sync
-from rlightning_aio._core.hosts.env_server import authenticator, listener
+from rlightning_aio._core.hosts.env_server import listener
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,8 +44,7 @@ def test_spurious_readiness_disturbs_neither_side(
 
         return asked
 
-    for module in (listener, authenticator):
-        monkeypatch.setattr(module, "is_readable", lying(module.is_readable))
+    monkeypatch.setattr(listener, "is_readable", lying(listener.is_readable))
     with sync.build_env_group(served(heartbeat=60.0)) as group:
         thread = ClientThread(group["robots-0"].address, "c0", CountingEnv())
         batch, _ = group.reset()

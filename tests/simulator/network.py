@@ -212,7 +212,9 @@ class _Listener:
         if self.connections.pop(route, None) is not None:
             self.incoming.append((route, None))
 
-    def pump(self) -> None:
+    def on_writable(self) -> None: ...
+
+    def on_readable(self) -> None:
         self._has_more = False
         while self.incoming:
             route, parts = self.incoming.popleft()

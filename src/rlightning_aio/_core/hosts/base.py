@@ -342,8 +342,10 @@ class Shared(Protocol):
         ...
 
     def disown(self) -> None:
-        """Drop it in a forked process; the parent continues to use it."""
-        ...
+        """Drop it in a forked process; the parent continues to use it.
+
+        Nothing is to be done where it belongs to threads, which only the parent has.
+        """
 
 
 class HostFactory(Protocol):

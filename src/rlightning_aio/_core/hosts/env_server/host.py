@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Host
+from rlightning_aio._core.hosts.base import Host, Shared
 from rlightning_aio._core.hosts.env_server.listener import Listener
 from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio._core.hosts.messages import (
@@ -48,12 +48,17 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 
-class EnvServer:
+class EnvServer(Shared):
     """What the places of one entry share; see `base.Server`.
 
     Args:
         config: the entry.
         wiring: of the group.
+
+    Attributes:
+        places: of the entry, in order.
+        sessions: of the clients.
+        listener: for them.
     """
 
     def __init__(self, config: EnvConfig, wiring: Wiring) -> None:
@@ -68,10 +73,9 @@ class EnvServer:
             heartbeat=settings.heartbeat,
             objection=wiring.objection,
         )
-        self._listener = Listener(self.server_id, settings, self.sessions)
+        self.listener = Listener(self.server_id, settings, self.sessions)
         self._driver = wiring.driver
         self._slab: Slab | None = None
-        self._is_open = self._is_watched = False
 
     def add(self, index: int, host: EnvServerHost) -> ClientPlace:
         """Add a place before the start; they come in order."""
@@ -79,18 +83,6 @@ class EnvServer:
         place = ClientPlace(f"{self.server_id}/{name or index}", host, name)
         self.places.append(place)
         return place
-
-    def start(self) -> None:
-        """Have the address; idempotent."""
-        if not self._is_open:
-            self._listener.start()
-            self._is_open = True
-
-    def listen(self) -> None:
-        """Let clients dial in; idempotent."""
-        if not self._is_watched:
-            self._is_watched = True
-            self._driver.watch(self)
 
     def slab_for(self, meta: EnvMeta) -> tuple[Slab, bool]:
         """Return the slab of all places, and True if this has made it."""
@@ -105,7 +97,7 @@ class EnvServer:
     # -- what the group asks of it ---------------------------------------------------
 
     def address(self) -> str:
-        return self._listener.address
+        return self.listener.address
 
     def clients(self) -> Mapping[str, str]:
         return self.sessions.clients()
@@ -114,49 +106,27 @@ class EnvServer:
         return self.sessions.refused
 
     def is_readable(self) -> bool:
-        return self._is_open and self._listener.is_readable()
+        return self.listener.is_readable()
 
     def poll(self) -> None:
-        if self.is_readable():
-            self._listener.pump()
+        if self.listener.is_readable():
+            self.listener.on_readable()
 
-    def flush(self) -> None:
-        """Send what was requested."""
-        if self._is_open:
-            self._listener.flush()
+    # -- its life -------------------------------------------------------------------
 
-    # -- as a source, and as a shared resource ------------------------------------------
-
-    def fileno(self) -> int:
-        return self._listener.fileno()
-
-    def on_readable(self) -> None:
-        self._listener.pump()
-
-    def on_writable(self) -> None:
-        """Do nothing: ZMQ sends by itself, so no driver calls this."""
-
-    def catch_up(self) -> bool:
-        """Read what has come; return True if there was anything."""
-        has_news = self.is_readable()
-        self.poll()
-        return has_news
+    def listen(self) -> None:
+        """Let clients dial in."""
+        self._driver.watch(self.listener)
 
     def close(self) -> None:
         """Send the clients a goodbye, and stop listening; idempotent."""
-        if self._is_open:
-            self._is_open = False
-            if self._is_watched:
-                self._driver.unwatch(self)
-            self._listener.close()
+        self._driver.unwatch(self.listener)
+        self.listener.close()
 
     def release(self, seconds: float) -> None:
         """See `base.Shared`."""
         del seconds
         self.close()
-
-    def disown(self) -> None:
-        """Do nothing: the sockets belong to threads that only the parent has."""
 
 
 class EnvServerHost(Host):
@@ -199,13 +169,14 @@ class EnvServerHost(Host):
 
     def start(self) -> None:
         """Have the address to listen on."""
-        self.server.start()
+        self.server.listener.start()
         self._post(Built(self.host_id, []))
 
     def attach(self, order: AttachOrder) -> None:
         """Let clients dial in. The row is known when the first one does."""
         del order
-        self.server.listen()
+        if not self._row:  # Once is enough for all places.
+            self.server.listen()
 
     def close(self) -> None:
         """Send the clients of all places a goodbye."""
@@ -250,7 +221,7 @@ class EnvServerHost(Host):
         else:
             action, extras = given or STEP_IN_ROW
             sessions.step(self._place, self._action(action), extras)
-        self.server.flush()
+        self.server.listener.flush()
 
     def _action(self, given: Any) -> Any:
         """Return the action of a step: `given`, or that of the row if it travels there."""
@@ -260,7 +231,7 @@ class EnvServerHost(Host):
         """Send the client away, which stops its env, whatever that does now."""
         del index, number
         self.server.sessions.drop(self._place, "an action was refused, or a call ended early")
-        self.server.flush()
+        self.server.listener.flush()
 
     # -- events of the place -------------------------------------------------------------
 
@@ -329,13 +300,15 @@ class EnvServerHost(Host):
         return self._num_messages
 
     def catch_up(self) -> bool:
-        return self.server.catch_up()
+        has_news = self.server.is_readable()
+        self.server.poll()
+        return has_news
 
     def kill(self, *, dump: bool) -> None:
         """Send the client away; its env has stopped, or will when it hears of that."""
         del dump
         self.server.sessions.drop(self._place, "the trainer no longer waits for its answer")
-        self.server.flush()
+        self.server.listener.flush()
 
     def destroy(self) -> None:
         """Do nothing: nothing is left when a client was sent away."""

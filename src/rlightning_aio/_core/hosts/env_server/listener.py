@@ -1,19 +1,25 @@
 """`Listener`: the sockets of an env_server, a ZMQ ROUTER without a thread.
 
-Rule: one descriptor wakes the driver, which then calls `Listener.pump`. `ServerSessions` decides
-what messages mean. The descriptor is that of a set: those of ZMQ, which only report changes, and a
-`WakeUp`, which is set whenever there is work without a change.
+Rule: one descriptor wakes the driver, and `ServerSessions` decides what messages mean. The
+descriptor is that of a set: those of ZMQ, which only report changes, and a `WakeUp`, which is set
+whenever there is work without a change.
+
+ZMQ asks about every connection in the middle of its handshake (ZAP, RFC 27), and reads nothing from
+it before the answer, which `zmq.auth` gives. ZMQ asks without keys, too: with an authenticator it
+refuses protocols before ZMTP 3, and a connection in one of these that came while the socket closes
+would end the process (an assertion of libzmq 4.3).
 """
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from typing import TYPE_CHECKING, Final, cast
 
 import zmq
+from zmq.auth import Authenticator
 
 from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descriptor_set
-from rlightning_aio._core.hosts.env_server.authenticator import Authenticator
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.error_text import LOG
 from rlightning_aio.protocol.net.wire import (
@@ -22,6 +28,7 @@ from rlightning_aio.protocol.net.wire import (
     MAX_FRAME_BYTES,
     ping_ms,
 )
+from rlightning_aio.remote.keys import ListedKeys, read_server_keys
 from rlightning_aio.remote.zmq_messages import (
     is_readable,
     next_frame,
@@ -37,7 +44,7 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.server_session import ServerSessions
     from rlightning_aio.protocol.net.wire import Part
 
-_MESSAGES_PER_PUMP: Final = 1000
+_MESSAGES_PER_READ: Final = 1000
 """Upper limit, so that the driver does other things in between."""
 _MAX_UNSENT_PER_CLIENT: Final = 100
 _MAX_UNREAD_PER_CLIENT: Final = 100
@@ -51,6 +58,7 @@ _FAILED: Final = (
 """Events of handshakes that failed. Which of them comes depends on the end that notices first."""
 _EVENTS: Final = int(zmq.EVENT_ACCEPTED) | int(zmq.EVENT_DISCONNECTED) | sum(_FAILED)
 _EVENT: Final = struct.Struct("=Hi")
+_DOMAIN: Final = "rlightning-aio"
 
 
 class Listener:
@@ -69,7 +77,9 @@ class Listener:
         self.server_id = server_id
         self._settings = settings
         self._sessions = sessions
-        self._authenticator = Authenticator(settings.keys)
+        self._keys = None if settings.keys is None else read_server_keys(settings.keys)
+        self._listed = None if self._keys is None else ListedKeys(self._keys.clients)
+        self._authenticator: Authenticator
         self._address: str | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._router: zmq.Socket[bytes]
@@ -92,11 +102,13 @@ class Listener:
     # -- life -----------------------------------------------------------------------
 
     def start(self) -> None:
-        """Listen.
+        """Listen, if it doesn't yet.
 
         Raises:
             StartFailed: the address is not available.
         """
+        if self._context is not None:
+            return
         self._context = zmq.Context[zmq.Socket[bytes]]()
         self._descriptors = new_descriptor_set()
         self._wake_up = WakeUp()
@@ -127,7 +139,7 @@ class Listener:
         router.set(zmq.HEARTBEAT_IVL, interval)
         router.set(zmq.HEARTBEAT_TIMEOUT, patience)
         router.set(zmq.HEARTBEAT_TTL, given_to_peer)
-        self._authenticator.open(context, router)
+        self._authenticate(context, router)
         host = "127.0.0.1" if settings.host == "localhost" else settings.host
         if ":" in host:
             router.set(zmq.IPV6, 1)
@@ -135,8 +147,26 @@ class Listener:
         self._monitor = router.get_monitor_socket(_EVENTS)
         router.bind(f"tcp://{host}:{settings.port or '*'}")
         self._address = router.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
-        for socket in (router, self._monitor, self._authenticator.socket):
+        for socket in (router, self._monitor, self._questions):
             self._descriptors.register(_descriptor(socket), READABLE)
+
+    def _authenticate(
+        self, context: zmq.Context[zmq.Socket[bytes]], router: zmq.Socket[bytes]
+    ) -> None:
+        """Make ZMQ ask about all connections to `router`, which is not bound yet."""
+        self._authenticator = Authenticator(context)
+        self._authenticator.start()
+        router.set_string(zmq.ZAP_DOMAIN, _DOMAIN)
+        router.set(zmq.ZAP_ENFORCE_DOMAIN, 1)
+        if self._keys is not None:
+            self._authenticator.configure_curve_callback(_DOMAIN, self._listed)
+            router.set(zmq.CURVE_SERVER, 1)
+            router.set(zmq.CURVE_SECRETKEY, self._keys.secret)
+
+    @property
+    def _questions(self) -> zmq.Socket[bytes]:
+        """The socket on which ZMQ asks."""
+        return cast("zmq.Socket[bytes]", self._authenticator.zap_socket)  # pyright: ignore[reportUnknownMemberType]
 
     def close(self) -> None:
         """Send all clients a goodbye and stop listening; idempotent, takes at most 0.2 s."""
@@ -154,32 +184,32 @@ class Listener:
     # -- waiting --------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable while `pump` has something to do."""
+        """Return a descriptor that is readable while `on_readable` has something to do."""
         return self._descriptors.fileno()
 
     def is_readable(self) -> bool:
-        """Return True if `pump` has something to do. Asking may clear the descriptor."""
-        return self._is_woken or is_readable(self._router)
+        """Return True if `on_readable` has something to do. Asking may clear the descriptor."""
+        return self._context is not None and (self._is_woken or is_readable(self._router))
 
     def _call_back(self) -> None:
-        """Make the driver pump once more, though no change will wake it."""
+        """Make the driver call `on_readable` once more, though no change will wake it."""
         if not self._is_woken:
             self._is_woken = True
             self._wake_up.set()
 
     # -- messages -------------------------------------------------------------------
 
-    def pump(self) -> None:
+    def on_readable(self) -> None:
         """Read all messages and send all that wait; never blocks."""
         if self._is_woken:
             self._is_woken = False
             self._wake_up.clear()
-        self._authenticator.answer()
+        self._answer_questions()
         self._read_events()
         # What a connection sent before its end counts, so its messages are read after that event.
         # This question is what clears ZMQ's descriptor.
         has_message = is_readable(self._router)
-        for _ in range(_MESSAGES_PER_PUMP):
+        for _ in range(_MESSAGES_PER_READ):
             if not has_message:
                 break
             has_message = self._receive() and is_readable(self._router)
@@ -190,6 +220,16 @@ class Listener:
             for route in gone:
                 self._sessions.disconnected(route)
         self.flush()
+
+    def on_writable(self) -> None:
+        """Do nothing: ZMQ sends by itself, so no driver calls this."""
+
+    def _answer_questions(self) -> None:
+        """Say which connections continue, of those whose handshakes have come so far."""
+        asked = self._questions
+        while is_readable(asked) and (question := next_message(asked)) is not None:
+            with contextlib.suppress(StopIteration):  # It awaits nothing.
+                self._authenticator.handle_zap_message(question).send(None)
 
     def _read_events(self) -> None:
         """Note which connections have come and gone."""
@@ -225,10 +265,16 @@ class Listener:
         if self._sessions.holds(route):
             self._sessions.receive(route, parts)
         elif self._is_open(frame):
-            self._sessions.receive(route, parts, self._authenticator.names_of(frame))
+            self._sessions.receive(route, parts, self._names_of(frame))
             if self._sessions.holds(route):
                 self._open[frame.get(zmq.SRCFD)] = route
         return True
+
+    def _names_of(self, frame: zmq.Frame) -> set[str] | None:
+        """Return the names that the key of a message's sender was made for; None without keys."""
+        if self._listed is None:
+            return None
+        return self._listed.names(cast("str", frame.get("User-Id")).encode())
 
     def _is_open(self, frame: zmq.Frame) -> bool:
         """Return True if a connection without a session that sent `frame` is still there."""

@@ -21,7 +21,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
-from rlightning_aio._core.hosts.base import Host
+from rlightning_aio._core.hosts.base import Host, Shared
 from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.descriptors import Inbox
 from rlightning_aio._core.hosts.limits import limits_of
@@ -68,7 +68,7 @@ the cluster, over sockets that the parent uses.
 """
 
 
-class _Connection:
+class _Connection(Shared):
     """The connection of this process to a cluster; see `base.Shared`.
 
     A connection that the program made itself is used and left open. Otherwise one connection serves
@@ -90,9 +90,6 @@ class _Connection:
         if _Connection._is_ours and not _Connection._users:
             _Connection._is_ours = False
             ray.shutdown()
-
-    def disown(self) -> None:
-        """Do nothing: a forked process has no threads of Ray."""
 
 
 @dataclass
