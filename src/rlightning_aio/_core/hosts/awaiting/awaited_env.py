@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rlightning_aio._core.hosts import times
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
+from rlightning_aio.protocol.entries import op_of
 from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
 
-Then: TypeAlias = "Callable[[AwaitedEnv, int, Any, BaseException | None], None]"
+OnOutcome: TypeAlias = "Callable[[AwaitedEnv, int, Any, BaseException | None], None]"
 """Gets the env, the entry of a request, its outcome, and the error that it raised instead."""
 
 
@@ -33,6 +34,7 @@ class AwaitedEnv:
         make: makes the runner; called in the task.
         context: a copy of it is the context of the task.
         watch: wraps the coroutine that answers a request, given the entry.
+        on_outcome: is called when a request has ended, unless the env has left before.
         broke: is called when the task ends by itself: a cancel scope that the env has left open
             was cancelled while the env was idle, or the event loop ends.
 
@@ -51,11 +53,13 @@ class AwaitedEnv:
         make: Callable[[], AwaitedRunner],
         context: Context,
         watch: Callable[[Coroutine[Any, Any, Any], int], Awaitable[Any]],
+        on_outcome: OnOutcome,
         broke: Callable[[AwaitedEnv], None],
     ) -> None:
         self.index = index
         self.runner: AwaitedRunner
         self._watch = watch
+        self._on_outcome = on_outcome
         self._broke = broke
         self._loop = loop = asyncio.get_running_loop()
         self.made: asyncio.Future[BaseException | None] = loop.create_future()
@@ -63,7 +67,7 @@ class AwaitedEnv:
         self.answering: Coroutine[Any, Any, Any] | None = None
         self.is_leaving = False
         self._close_error: ErrorText | None = None
-        self._request: tuple[int, int, Any, Then] | None = None
+        self._request: tuple[int, Any] | None = None
         self._idle: asyncio.Future[None] | None = None
         self._is_cancelled = False
         self._context = context.copy()
@@ -78,16 +82,14 @@ class AwaitedEnv:
 
     # -- requests -----------------------------------------------------------------
 
-    def give(self, op: int, entry: int, arguments: Any, then: Then) -> None:
+    def give(self, entry: int, arguments: Any) -> None:
         """Execute a request; the env must be idle.
 
         Args:
-            op: the operation.
-            entry: of the request that the outcome answers.
+            entry: of the request.
             arguments: as of `AwaitedRunner.answer`.
-            then: gets the outcome, unless the env leaves before.
         """
-        self._request = op, entry, arguments, then
+        self._request = entry, arguments
         if self._idle is not None and not self._idle.done():
             self._idle.set_result(None)
 
@@ -122,8 +124,8 @@ class AwaitedEnv:
         finally:
             self._idle = None
 
-    async def _execute(self, op: int, entry: int, arguments: Any, then: Then) -> None:
-        self.answering = answering = self.runner.answer(op, arguments)
+    async def _execute(self, entry: int, arguments: Any) -> None:
+        self.answering = answering = self.runner.answer(op_of(entry), arguments)
         outcome = None
         error: BaseException | None = None
         try:
@@ -137,7 +139,7 @@ class AwaitedEnv:
             self._loop.call_soon(reraise, error)
         self._request = self.answering = None
         if not self.is_leaving:
-            then(self, entry, outcome, error)
+            self._on_outcome(self, entry, outcome, error)
         error = None  # Its traceback refers to this frame.
 
     # -- the end ------------------------------------------------------------------

@@ -163,6 +163,13 @@ class AwaitedEnvs:
             record.runner = runner
             record.env = self._new_env(record, lambda runner=runner: runner)
             self._records.append(record)
+        if self._limits and self._enter is not None:
+            self._beat(min(self._limits.values()) / 4, self._enter)
+
+    def _beat(self, seconds: float, enter: Callable[[int], object]) -> None:
+        """Say again and again that no env holds the loop now."""
+        enter(0)
+        self._loop.call_later(seconds, self._beat, seconds, enter)
 
     async def build(self) -> list[EnvStarted] | None:
         """Build the envs, one in each turn of the loop; None if one can't be, which is posted."""
@@ -184,7 +191,8 @@ class AwaitedEnvs:
             return None
 
     def _new_env(self, record: _EnvRecord, make: Callable[[], AwaitedRunner]) -> AwaitedEnv:
-        env = AwaitedEnv(record.index, make, record.context, self._watch, self._on_broken)
+        events = self._on_outcome, self._on_broken
+        env = AwaitedEnv(record.index, make, record.context, self._watch, *events)
         self._envs.add(env)
         env.task.add_done_callback(lambda _: self._envs.discard(env))
         return env
@@ -289,9 +297,8 @@ class AwaitedEnvs:
 
     def _give(self, record: _EnvRecord, env: AwaitedEnv) -> None:
         """Have an env execute the request in its record."""
-        op = op_of(record.entry)
-        env.give(op, record.entry, record.arguments, self._on_outcome)
-        if (seconds := self._limits.get(op)) is not None:
+        env.give(record.entry, record.arguments)
+        if (seconds := self._limits.get(op_of(record.entry))) is not None:
             record.due = time.monotonic() + seconds
             if self._look is None:
                 self._plan_look()

@@ -18,7 +18,7 @@ import sys
 import time
 import traceback
 import weakref
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, cast
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
@@ -38,7 +38,9 @@ from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, ri
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder, WorkerPlace
+    from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
     from rlightning_aio._core.hosts.running.row_writer import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
@@ -79,8 +81,7 @@ class Worker:
         self._attached = False
         self._closing = False
         self._awaits = False
-        self._submit: Callable[[int, Any], None]
-        self._abort_awaited: Callable[[int], None]
+        self._awaited: AwaitedEnvs
         self._order: StartOrder
         self._shared = list(shared)
         self._is_child = False
@@ -108,21 +109,22 @@ class Worker:
     def _serve_awaitable(self) -> None:
         """Serve envs whose `reset` and `step` are coroutine functions concurrently."""
         # Not at the top: no other worker needs asyncio.
-        from rlightning_aio._core.hosts.awaiting.worker_loop import Awaiting  # noqa: PLC0415
+        from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs  # noqa: PLC0415
+        from rlightning_aio._core.hosts.awaiting.worker_loop import serve  # noqa: PLC0415
 
         rings, ring = self._rings, self._ring
-        awaiting = Awaiting(
-            self._order,
+        self._awaited = awaited = AwaitedEnvs(
+            SENDER,
             self._first_slot,
-            self._runners,
+            self._order,
             rings.made,
-            lambda entry: rings.report(entry, ring),
-            self._post,
-            lambda entry: rings.begin(entry, time.monotonic_ns()),
+            post=self._post,
+            done=lambda entry: rings.report(entry, ring),
+            enter=lambda entry: rings.begin(entry, time.monotonic_ns()),
         )
-        self._submit, self._abort_awaited = awaiting.envs.submit, awaiting.envs.abort
+        runners = cast("list[AwaitedRunner]", self._runners)
         try:
-            errors = awaiting.serve(self._channel, self._take_requests)
+            errors = serve(awaited, runners, self._channel, self._take_requests)
         finally:
             self._closing = True  # The event loop has closed them.
             self._end_watch()
@@ -134,7 +136,7 @@ class Worker:
         while not self._closing:
             self._receive(socket.MSG_DONTWAIT)
             for request in rings.requests():
-                self._submit(request, None)
+                self._awaited.submit(request, None)
             # From now on the trainer sends a wake-up for each request, even if envs are busy.
             if rings.fall_asleep() and not self._closing:
                 return True
@@ -315,7 +317,7 @@ class Worker:
         request = frame.number
         self._begin(request)
         if self._awaits:
-            self._submit(request, frame.payload)
+            self._awaited.submit(request, frame.payload)
             return
         if self._execute(request, frame.payload):
             self._rings.report(request, self._ring)
@@ -324,8 +326,8 @@ class Worker:
         """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
         if self._awaits:
             for request in self._rings.requests():  # It may be the newest.
-                self._submit(request, None)
-            self._abort_awaited(frame.number)
+                self._awaited.submit(request, None)
+            self._awaited.abort(frame.number)
 
     def _close(self, frame: Frame) -> None:
         del frame
