@@ -64,24 +64,24 @@ def test_an_inline_env_is_freed_when_its_group_closes() -> None:
     assert made[0]() is None
 
 
-class Counting(Scripted):
-    """Writes down how often it was made before."""
+class Noting(Scripted):
+    """Writes down whether it takes the place of another."""
 
     def __init__(self, log: Path) -> None:
         with log.open("a") as file:
-            file.write(os.environ["RLIGHTNING_AIO_RESTARTS"])
+            file.write("again " if "RLIGHTNING_AIO_MADE_BEFORE" in os.environ else "new ")
 
 
 @pytest.mark.parametrize("kind", ["worker", "shared", "inline", "awaitable", "loop"])
-def test_a_callable_can_know_how_often_it_was_called(kind: str, tmp_path: Path) -> None:
-    """After exceptions and deaths: no number comes twice, so it can be part of a file's name."""
+def test_a_callable_can_know_that_it_was_called_before(kind: str, tmp_path: Path) -> None:
+    """After exceptions and deaths: so a file of the env before is continued, not overwritten."""
     dies = kind in ("worker", "shared", "awaitable")
     fields: dict[str, Any] = {"placement": kind} if not dies else {}
     if kind == "shared":
         fields = {"envs_per_process": 2}
 
     def made(k: int) -> Any:
-        env = Counting(tmp_path / str(k))
+        env = Noting(tmp_path / str(k))
         return Awaitable(env) if kind in ("awaitable", "loop") else env
 
     tasks = [partial(made, k) for k in range(2)]
@@ -96,10 +96,10 @@ def test_a_callable_can_know_how_often_it_was_called(kind: str, tmp_path: Path) 
                     await group.step(batch.respond(action=[0, 0]))
 
     asyncio.run(play())
-    assert "RLIGHTNING_AIO_RESTARTS" not in os.environ
-    assert (tmp_path / "0").read_text() == ("012345" if dies else "0123")
+    assert "RLIGHTNING_AIO_MADE_BEFORE" not in os.environ
+    assert (tmp_path / "0").read_text() == "new " + "again " * (5 if dies else 3)
     deaths = 2 if kind == "shared" else 0
-    assert (tmp_path / "1").read_text() == "012"[: 1 + deaths]
+    assert (tmp_path / "1").read_text() == "new " + "again " * deaths
 
 
 KILLS = {"crash": ABORT, "hang": HANG, "abort": HANG, "destroyed": SLEEP}

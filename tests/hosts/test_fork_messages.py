@@ -140,7 +140,7 @@ def test_fork_server_serves_a_trainer_that_does_not_read() -> None:
         # Orders without a channel fail, so this needs no worker.
         count = 3000
         for host_id in range(count):
-            trainer.send(Fork(WorkerPlace(host_id, 1, 0, 1, 0, 0, 0)))
+            trainer.send(Fork(WorkerPlace(host_id, 1, 0, 1, 0, 0)))
         while trainer.waiting:
             assert select.select([], [trainer], [], HANG)[1], "it reads no more"
             trainer.flush()

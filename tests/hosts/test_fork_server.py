@@ -44,7 +44,7 @@ def lost(interpreter: str) -> str:
     server = ForkServerHandle(interpreter, {}, ("gymnasium",), asker)
     channel, worker = socket.socketpair()
     arena = Arena()
-    server.fork(asker, worker, arena, Fork(WorkerPlace(0, 1, 0, 1, 0, 0, 0)))
+    server.fork(asker, worker, arena, Fork(WorkerPlace(0, 1, 0, 1, 0, 0)))
     assert server._server is not None
     os.waitid(os.P_PID, server._server.process.pid, os.WEXITED | os.WNOWAIT)
     server.on_readable()

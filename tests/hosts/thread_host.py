@@ -176,7 +176,7 @@ class EnvThread(threading.Thread):
     def build(self, order: StartOrder) -> None:
         """Build the envs, and post their descriptions, or which of them can't be built."""
         try:
-            for runner in built_envs(order, [0] * len(order.worker_indices), inline=True):
+            for runner in built_envs(order, inline=True):
                 self._runners.append(runner)
             started = [runner.started() for runner in self._runners]
         except BaseException as error:  # noqa: BLE001  # An env may raise anything.

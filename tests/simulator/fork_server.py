@@ -247,8 +247,7 @@ class _WorkerProcess(Process):
             memory = map_shared(self._arena, place.bell_offset, bell_size(place.num_hosts))
             bell = WorkerBell(memory, place.num_hosts, place.host_id)
             memory = map_shared(self._arena, place.rings_offset, rings_size(place.num_envs))
-            made = map_shared(self._arena, place.made_offset, rings_size(place.num_envs))
-            rings = WorkerRings(memory, place.num_envs, bell, made)
+            rings = WorkerRings(memory, place.num_envs, bell)
             channel = sockets.by_number[self._channel]
             self._worker = _Worker(channel, self._arena, rings, place.first_slot)  # pyright: ignore[reportArgumentType]
             self._worker.serve()

@@ -23,7 +23,7 @@ class FrameKind(IntEnum):
     """
 
     BELL = 0  # both
-    START = 1  # trainer: what to build
+    START = 1  # trainer; 1 if the worker is a replacement: what to build
     ATTACH = 2  # trainer: offsets and sizes of the slabs, and the rows of the envs
     REQUEST = 3  # trainer; the entry: arguments out of band
     ABORT = 4  # trainer; the request's entry

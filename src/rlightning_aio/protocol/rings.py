@@ -67,7 +67,7 @@ def _capacity(num_envs: int) -> int:
 
 def rings_size(num_envs: int) -> int:
     """Size in bytes of the words and both rings of a worker with `num_envs` envs."""
-    return 8 * (_WORDS + 2 * _capacity(num_envs) + 2 * num_envs)
+    return 8 * (_WORDS + 2 * _capacity(num_envs) + num_envs)
 
 
 def _split(buffer: memoryview, num_envs: int) -> tuple[memoryview, memoryview, memoryview]:
@@ -79,11 +79,6 @@ def _split(buffer: memoryview, num_envs: int) -> tuple[memoryview, memoryview, m
 
 def _stops(words: memoryview[int], num_envs: int) -> memoryview[int]:
     """Return a word for each env: the request up to which it must stop whatever it moves."""
-    return words[len(words) - 2 * num_envs : len(words) - num_envs]
-
-
-def _made(words: memoryview[int], num_envs: int) -> memoryview[int]:
-    """Return a word for each env: how often it was made, by this worker and those before it."""
     return words[len(words) - num_envs :]
 
 
@@ -91,15 +86,14 @@ class TrainerRings:
     """The trainer's side: appends requests, reads reports.
 
     Args:
-        buffer: the memory of the rings. It is cleared here, but for how often each env was made.
+        buffer: the memory of the rings; it is cleared here.
         num_envs: of the worker.
         bell: of the group; index: of the worker's counter in it.
     """
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: TrainerBell, index: int) -> None:
         self._words, requests, reports = _split(buffer, num_envs)
-        cleared = self._words[: len(self._words) - num_envs]
-        cleared[:] = memoryview(bytes(8 * len(cleared))).cast("q")
+        self._words[:] = memoryview(bytes(8 * len(self._words))).cast("q")
         self._requests: NDArray[np.int64] = np.frombuffer(requests, np.int64)
         self._reports: NDArray[np.int64] = np.frombuffer(reports, np.int64)
         self._own = memoryview(bytearray(16)).cast("q")
@@ -206,17 +200,9 @@ class WorkerRings:
 
     Attributes:
         own: the worker's own counts; see `exchange`.
-        made: how often each env was made, by this worker and by those that it replaces; in the
-            memory of these rings unless that of others is given.
     """
 
-    def __init__(
-        self,
-        buffer: memoryview,
-        num_envs: int,
-        bell: WorkerBell,
-        made: memoryview | None = None,
-    ) -> None:
+    def __init__(self, buffer: memoryview, num_envs: int, bell: WorkerBell) -> None:
         self._words, requests, reports = _split(buffer, num_envs)
         self._reports = reports
         self._mask = _capacity(num_envs) - 1
@@ -227,7 +213,6 @@ class WorkerRings:
         self._frames_sent = 0
         self._stops = _stops(self._words, num_envs)
         self._stopped = [0] * num_envs
-        self.made = _made(self._words if made is None else _split(made, num_envs)[0], num_envs)
 
     def to_stop(self, first_slot: int) -> list[int]:
         """Return the indices of the envs that must stop now.

@@ -169,9 +169,6 @@ class Host(Protocol):
         An actor of Ray can't, so the config refuses hardware there.
         """
 
-    def count_with(self, peer: Host) -> None:
-        """Count how often its envs were made together with a host of the same envs."""
-
     def resident_mb(self) -> float:
         """Return the resident memory of its worker and its descendants; 0 if it isn't known."""
         return 0.0

@@ -76,7 +76,7 @@ class InlineHost(Host):
         self._post(Built(self.host_id, started))
 
     def _built(self) -> list[EnvStarted]:
-        for runner in built_envs(self._order, [0] * self.num_envs, inline=True):
+        for runner in built_envs(self._order, inline=True):
             self._runners.append(runner)
             if self._order.is_hardware:
                 _HARDWARE.add(runner.env)

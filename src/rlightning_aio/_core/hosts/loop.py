@@ -40,10 +40,7 @@ class LoopHost(Host):
         self.first_slot = first_slot
         self.num_envs = len(order.worker_indices)
         self._wiring = wiring
-        made = [0] * self.num_envs
-        self._envs = AwaitedEnvs(
-            host_id, first_slot, order, made, post=self._post, done=self._note_done
-        )
+        self._envs = AwaitedEnvs(host_id, first_slot, order, post=self._post, done=self._note_done)
         offset, size = wiring.bell_offset, bell_size(wiring.num_hosts)
         memory = wiring.arena.map(offset, size)
         self._bell: WorkerBell | None = WorkerBell(memory, wiring.num_hosts, host_id)

@@ -64,6 +64,7 @@ class StartOrder:
         tasks: of `known_tasks`.
         is_hardware: the envs move something real.
         logs: how a worker logs; None for Python's own way.
+        is_again: the envs take the place of others that were made before.
     """
 
     config: EnvConfig
@@ -75,6 +76,7 @@ class StartOrder:
     tasks: tuple[bytes, ...] = ()
     is_hardware: bool = False
     logs: LogSettings | None = None
+    is_again: bool = False
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,6 @@ class WorkerPlace:
         host_id: of its host, one of `num_hosts`.
         first_slot, num_envs: slots of its envs.
         bell_offset, rings_offset: in the arena.
-        made_offset: of the rings whose memory counts how often each env was made: its own, or
-            those of the peer that it is renewed for.
     """
 
     host_id: int
@@ -110,7 +110,6 @@ class WorkerPlace:
     num_envs: int
     bell_offset: int
     rings_offset: int
-    made_offset: int
 
 
 # -- completions ------------------------------------------------------------------

@@ -16,8 +16,8 @@ from rlightning_aio.trees import copied
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-RESTARTS: Final = "RLIGHTNING_AIO_RESTARTS"
-"""Environment variable that tells the code of an env, while it is made, how often it was before."""
+MADE_BEFORE: Final = "RLIGHTNING_AIO_MADE_BEFORE"
+"""Environment variable that is there while an env is made again, in place of one that is gone."""
 
 
 def adapted(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -97,8 +98,8 @@ def _assembled(plan: Plan, orders: Sequence[StartOrder], tables: Tables) -> Core
         if not order.config.recycle:
             continue
         host_id = len(supervisor.hosts)
-        host = host_class(order.config)(host_id, record.slots.start, order, wiring)
-        host.count_with(record.host)
+        again = replace(order, is_again=True)
+        host = host_class(order.config)(host_id, record.slots.start, again, wiring)
         supervisor.add(host, order.config, record)
         poller.add(host)
     return Core(tables, supervisor, poller, zero_copy=plan.zero_copy)

@@ -15,6 +15,7 @@ import math
 import time
 from collections import deque
 from contextvars import copy_context
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ from rlightning_aio.protocol.entries import entry as entry_of
 from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, MutableSequence
+    from collections.abc import Callable, Coroutine
     from contextvars import Context
 
     from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
@@ -99,7 +100,6 @@ class AwaitedEnvs:
     Args:
         host_id, first_slot: of the host.
         order: what to build.
-        made: how often each env was made, counted on here.
         post: gets every completion.
         done: gets the entries of requests whose results are all in their rows.
         enter: gets an entry whenever the code of its env is about to run, and 0 after that; None:
@@ -115,7 +115,6 @@ class AwaitedEnvs:
         host_id: int,
         first_slot: int,
         order: StartOrder,
-        made: MutableSequence[int] | memoryview[int],
         *,
         post: Callable[[Completion], object],
         done: Callable[[int], object],
@@ -124,7 +123,6 @@ class AwaitedEnvs:
         self._host_id = host_id
         self._first_slot = first_slot
         self._order = order
-        self._made = made
         self._inline = enter is None
         self._post = post
         self._done = done
@@ -199,7 +197,10 @@ class AwaitedEnvs:
 
     async def _build(self, record: _EnvRecord) -> BaseException | None:
         """Build an env; return the error if that fails."""
-        make: Any = partial(built_env, self._order, self._made, record.index, inline=self._inline)
+        order = self._order
+        if record.runner is not None:
+            order = replace(order, is_again=True)
+        make: Any = partial(built_env, order, record.index, inline=self._inline)
         if self._enter is not None:
             entry = entry_of(0, self._first_slot + record.index, 0)
             make = partial(_entered, make, self._enter, entry)

@@ -311,8 +311,8 @@ class ProcessHost(Host):
             self.num_envs,
             wiring.bell_offset,
             rings_offset,
-            rings_offset,
         )
+        self._is_replacement = False
         self._memory: memoryview | None = None
         # Of the worker that lives. Its channel may end before it does.
         self._rings: TrainerRings | None = None
@@ -343,7 +343,7 @@ class ProcessHost(Host):
             ours.close()
             theirs.close()
             raise
-        self._send(FrameKind.START, payload=self._start_payload)
+        self._send(FrameKind.START, int(self._is_replacement), self._start_payload)
 
     def _open(self, channel: socket.socket) -> None:
         """Clear the rings and use a new channel, for the next worker."""
@@ -357,11 +357,8 @@ class ProcessHost(Host):
         wiring.rings[self.host_id] = self._rings.ring(self._wake)
         wiring.driver.watch(self)
 
-    def count_with(self, peer: Host) -> None:
-        if isinstance(peer, ProcessHost):
-            self._place = replace(self._place, made_offset=peer._place.rings_offset)  # noqa: SLF001
-
     def attach(self, order: AttachOrder) -> None:
+        self._is_replacement = True  # Whatever comes next.
         self._fork_server.note_used(self, order.close_seconds)
         self._send(FrameKind.ATTACH, payload=pickle.dumps(order))
 

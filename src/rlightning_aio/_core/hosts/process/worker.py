@@ -18,6 +18,7 @@ import sys
 import time
 import traceback
 import weakref
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, cast
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
@@ -117,7 +118,6 @@ class Worker:
             SENDER,
             self._first_slot,
             self._order,
-            rings.made,
             post=self._post,
             done=lambda entry: rings.report(entry, ring),
             enter=lambda entry: rings.begin(entry, time.monotonic_ns()),
@@ -261,11 +261,12 @@ class Worker:
             self._begin_with(0)
             order = pickle.loads(frame.payload)
             assert order is not None
+            order = replace(order, is_again=order.is_again or frame.number > 0)
             self._spinner = Spinner(enabled=order.spins)
             self._order = order
             if order.logs is not None:
                 log_like(order.logs, _name_of(order))
-            for runner in built_envs(order, self._rings.made):
+            for runner in built_envs(order):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
             if order.is_hardware:
@@ -409,10 +410,8 @@ def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
     bell_memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
     bell = WorkerBell(bell_memory, place.num_hosts, place.host_id)
     rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
-    made_memory = map_shared(arena, place.made_offset, rings_size(place.num_envs))
-    rings = WorkerRings(rings_memory, place.num_envs, bell, made_memory)
-    shared = bell_memory, rings_memory, made_memory
-    worker = Worker(channel, arena, rings, place.first_slot, shared)
+    rings = WorkerRings(rings_memory, place.num_envs, bell)
+    worker = Worker(channel, arena, rings, place.first_slot, (bell_memory, rings_memory))
     # Not for ever: the env and what it holds are dropped with the worker.
     known = weakref.ref(worker)
 

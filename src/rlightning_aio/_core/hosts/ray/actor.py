@@ -94,12 +94,12 @@ class EnvActor:
     def hello(self) -> None:
         """Return, which shows that a node has started this actor."""
 
-    def build(self, order: bytes, restarts: int = 0) -> Frame:
+    def build(self, order: bytes, is_replacement: bool = False) -> Frame:
         """Build the envs, and give each a row in this process.
 
         Args:
             order: a `StartOrder`, pickled.
-            restarts: how many actors were before this one.
+            is_replacement: of an actor before this one.
 
         Returns `Built` or `NotBuilt`.
         """
@@ -107,8 +107,9 @@ class EnvActor:
         try:
             given = pickle.loads(order)
             assert given is not None
-            given = replace(given, trainer_pid=None)
-            for runner in built_envs(given, [restarts] * len(given.worker_indices)):
+            is_again = given.is_again or is_replacement
+            given = replace(given, trainer_pid=None, is_again=is_again)
+            for runner in built_envs(given):
                 self._runners.append(runner)
             places = list(_placed_here(self._runners))
             give_rows(places, SENDER, self._post)

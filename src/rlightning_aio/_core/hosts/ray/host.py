@@ -9,7 +9,6 @@ Left out on purpose: the execution of requests (see `actor`).
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import sys
@@ -177,7 +176,6 @@ class RayHost(Host):
         self._post = wiring.completions.append
         self._pid = os.getpid()
         self._life: _Life | None = None
-        self._lives = itertools.count()
         self._started: list[EnvStarted] = []
         self._order: AttachOrder | None = None
         self._table: RowTable | None = None
@@ -199,11 +197,7 @@ class RayHost(Host):
         life = self._life = _Life(actor)
         self._wiring.driver.watch(self)
         life.call(actor.hello, self._on_placed)
-        life.call(actor.build, self._on_built, self._start_payload, next(self._lives))
-
-    def count_with(self, peer: Host) -> None:
-        if isinstance(peer, RayHost):
-            self._lives = peer._lives  # noqa: SLF001
+        life.call(actor.build, self._on_built, self._start_payload, self._order is not None)
 
     def attach(self, order: AttachOrder) -> None:
         """Map the rows of the trainer; the actor has its own."""

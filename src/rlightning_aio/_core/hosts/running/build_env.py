@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
-from rlightning_aio.envs.adapted.makers import RESTARTS
+from rlightning_aio.envs.adapted.makers import MADE_BEFORE
 from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions, says_hardware
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
@@ -22,7 +23,7 @@ from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.registry import CALLABLE, ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableSequence
+    from collections.abc import Iterator
 
     from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.config import EnvConfig
@@ -57,9 +58,7 @@ def build_env(
     return env
 
 
-def built_envs(
-    order: StartOrder, made: MutableSequence[int] | memoryview[int], *, inline: bool = False
-) -> Iterator[EnvRunner]:
+def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
     """Build the envs of a host one after the other; see `built_env`.
 
     A worker has its own numbers: those that fork servers fork have the same generators.
@@ -71,7 +70,7 @@ def built_envs(
     num_envs = len(order.worker_indices)
     renewal = Renewal(order.config, num_envs) if order.config.recycle else None
     for index in range(num_envs):
-        runner = built_env(order, made, index, inline=inline)
+        runner = built_env(order, index, inline=inline)
         runner.renewal = renewal
         check_distinct(runner.env, simulations)
         yield runner
@@ -112,20 +111,13 @@ def not_built(
     return NotBuilt(host_id, min(num_built, most - 1), ErrorText.of(error))
 
 
-def built_env(
-    order: StartOrder,
-    made: MutableSequence[int] | memoryview[int],
-    index: int,
-    *,
-    inline: bool = False,
-) -> EnvRunner:
+def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunner:
     """Build one env of a host.
 
-    While it is made, `RESTARTS` in the environment says how often it was made before.
+    While it is made, `MADE_BEFORE` is in the environment if it takes the place of another.
 
     Args:
         order: of the host.
-        made: how often each env of the host was made, counted on here.
         index: of the env in the host.
         inline: see `EnvRunner`.
 
@@ -137,19 +129,19 @@ def built_env(
     if makers := makers_of(config):
         config = config.model_copy(update={"task": makers[index]})
 
-    def make() -> BaseEnv:
+    def make(*, is_again: bool) -> BaseEnv:
         fn = order.preprocess_fns[index]
         hardware = order.is_hardware
-        os.environ[RESTARTS] = str(made[index])
-        made[index] += 1
+        if is_again:
+            os.environ[MADE_BEFORE] = "1"
         try:
             env = build_env(config, order.env_class, worker_index, fn, is_hardware=hardware)
         finally:
-            os.environ.pop(RESTARTS, None)
+            os.environ.pop(MADE_BEFORE, None)
         env.trainer_pid = None if inline else order.trainer_pid
         return env
 
-    env = make()
+    env = make(is_again=order.is_again)
     if says_hardware(env) and not order.is_hardware:
         raise ConfigError(
             f"env {env.env_id!r} moves something real, as its attribute `hardware` says, and the "
@@ -159,7 +151,7 @@ def built_env(
     kind = _runner_class(env, config)
     # Others are replaced by their host, with a runner of their own.
     rebuilt = not (kind.is_awaitable or order.is_hardware)
-    rebuild = make if rebuilt else None
+    rebuild = partial(make, is_again=True) if rebuilt else None
     renews = rebuilt and config.on_env_error == "restart"
     return kind(env, inline=inline, rebuild=rebuild, renews=renews, is_hardware=order.is_hardware)
 
