@@ -61,8 +61,8 @@ def runs_here(config: EnvConfig) -> bool:
 def check_entry(entry: Entry, problems: Problems) -> None:
     """Compare the fields of one entry with each other and with what its placement supports."""
     for name, check in _CHECKS.items():
-        if {name, *_COMPARED_WITH.get(name, ())} & entry.faulty:
-            continue
+        if name in entry.faulty or (name == "task" and "num_workers" in entry.faulty):
+            continue  # A task of several callables is compared with their number.
         if (text := check(entry.config)) is not None:
             problems.add(f"{entry.place}, {name}", text)
     for name, why in _refused(entry.config).items():
@@ -168,10 +168,6 @@ def _check_recycle(config: EnvConfig) -> str | None:
     return None
 
 
-_COMPARED_WITH = {
-    "task": ("num_workers",),
-}
-"""Other fields that a check reads; it is left out if one of them is wrong."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,

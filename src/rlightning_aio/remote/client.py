@@ -158,8 +158,9 @@ class RemoteEnvClient:
                 hardware=hardware,
                 compression=compression,
             )
-        self._bare_step = fast_path_of(env).bare_step()
-        self._env_step = step_of(env)
+        bare = fast_path_of(env).bare_step()
+        self._is_bare = bare is not None
+        self._env_step: Callable[[Any], Any] = bare or step_of(env)
         self._input = checked_input_of(env) if hardware else input_of(env)
         # The one that uses the sockets: the caller's thread, or the one that stops hardware.
         self._using_sockets = Lock()
@@ -466,19 +467,16 @@ class RemoteEnvClient:
 
     def _step(self, request: Step) -> None:
         began_ns = time.perf_counter_ns()
-        if self._bare_step is not None:
-            with self._at_work():
-                returned = self._bare_step(self._input(request.action, request.extras))
+        with self._at_work():
+            returned = self._env_step(self._input(request.action, request.extras))
+        busy_ns = time.perf_counter_ns() - began_ns
+        self.num_steps += 1
+        if self._is_bare:
             observation, reward, terminated, truncated, info = returned
             outcome = ResultFields(observation, reward, terminated, truncated)
-            busy_ns = time.perf_counter_ns() - began_ns
-            self.num_steps += 1
             self._session.answer(request.number, outcome, info, {}, busy_ns, time.time_ns())
-            return
-        with self._at_work():
-            ret = self._env_step(self._input(request.action, request.extras))
-        self.num_steps += 1
-        self._answer(request.number, "step", ret, time.perf_counter_ns() - began_ns)
+        else:
+            self._answer(request.number, "step", returned, busy_ns)
 
     def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
         self._session.finish(number, one_result(self._env, method, returned), busy_ns)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, StartOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completions
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.exchange import Ring
     from rlightning_aio.protocol.rings import TrainerBell
@@ -343,11 +343,3 @@ class Shared(Protocol):
 
         Nothing is to be done where it belongs to threads, which only the parent has.
         """
-
-
-class HostFactory(Protocol):
-    """Makes a host, as its class does."""
-
-    def __call__(
-        self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring
-    ) -> Host: ...

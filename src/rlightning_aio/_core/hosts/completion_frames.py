@@ -28,8 +28,7 @@ def frame_of(completion: Completion) -> Frame:
     try:
         if isinstance(completion, Result):
             payload = completion.out_of_band
-            if type(payload) is not bytes:
-                payload = dumped(payload, "the result")
+            assert type(payload) is bytes  # As `completion_of` has made it.
             return Frame(FrameKind.RESULT, completion.entry, payload)
         entry = completion.entry if isinstance(completion, Value) else 0
         return Frame(FrameKind.OTHER, entry, dumped(completion, "what it returned"))
@@ -37,7 +36,7 @@ def frame_of(completion: Completion) -> Frame:
         if isinstance(completion, Built):
             last = len(completion.started) - 1
             return frame_of(NotBuilt(SENDER, last, ErrorText.of(error)))
-        if isinstance(completion, Result | Value):
+        if isinstance(completion, Value):
             return frame_of(Raised(SENDER, completion.entry, ErrorText.of(error)))
         raise
 

@@ -18,7 +18,8 @@ from rlightning_aio.registry import load, placement_of
 from rlightning_aio.types import PolicyResponse, default_env_preprocess_fn
 
 if TYPE_CHECKING:
-    from rlightning_aio._core.hosts.base import HostFactory
+    from rlightning_aio._core.hosts.base import Host, Wiring
+    from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.registry import Placement
 
 PreprocessFn = Callable[[PolicyResponse], Any]
@@ -71,8 +72,8 @@ def placement_for(config: EnvConfig) -> Placement:
     return placement_of(config.backend, config.placement)
 
 
-def host_class(config: EnvConfig) -> HostFactory:
-    """The factory of the hosts of an entry.
+def host_class(config: EnvConfig) -> Callable[[int, int, StartOrder, Wiring], Host]:
+    """The class of the hosts of an entry, which makes them of what `base.Host` says.
 
     Raises:
         ConfigError: a package that the placement needs is missing.
