@@ -1,6 +1,7 @@
 """`collect_async` on real workers, whose envs step when the test opens their gates.
 
-Rules that need an exact order of events and a clock are in `tests/simulator/test_moments.py`.
+Random programs show how many results a collect returns, and that it loses none. Rules that need an
+exact order of events and a clock are in `tests/simulator/test_moments.py`.
 """
 
 from __future__ import annotations
@@ -86,15 +87,7 @@ async def open_gates(*gates: Gate) -> None:
 # -- the rules, synchronously
 
 
-def test_a_collect_respects_its_minimum_and_maximum(sync_group: Any, gates: list[Gate]) -> None:
-    """A minimum above the number of pending results means all of them; leftovers come first."""
-    sync_group.step_async(responses(0, 1, 2, 3))
-    with opened(*gates[:2]):
-        batch, _ = sync_group.collect_async(min_results=2)
-    assert batch.ids() == IDS[:2]
-    with opened(*gates[2:]):
-        batch, _ = sync_group.collect_async(min_results=50)
-    assert batch.ids() == IDS[2:]
+def test_leftovers_of_a_collect_come_first(sync_group: Any, gates: list[Gate]) -> None:
     sync_group.step_async(responses(3, 1, 0))
     with opened(gates[3], gates[1], gates[0]):
         pass
@@ -141,18 +134,6 @@ def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gat
         assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
 
 
-def test_a_collect_that_times_out_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:
-    """The next call returns results that were ready, and those that become ready later."""
-    sync_group.step_async(responses(0, 1))
-    with pytest.raises(TimeoutError, match="0 of the 1"):
-        sync_group.collect_async(deadline=0.02)
-    with opened(gates[0]), pytest.raises(TimeoutError, match="nothing is lost"):
-        sync_group.collect_async(min_results=2, deadline=0.2)
-    with opened(gates[1]):
-        batch, _ = sync_group.collect_async(min_results=2, deadline=60)
-    assert batch.ids() == IDS[:2]
-
-
 @pytest.mark.parametrize(
     ("rules", "said"),
     [
@@ -189,39 +170,6 @@ async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gat
     await open_gates(gates[2])
     batch, _ = await waiting
     assert batch.ids() == IDS[:3]
-
-
-async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate]) -> None:
-    """Neither ready results nor outstanding ones."""
-    group.step_async(responses(0, 1, 2))
-    with pytest.raises(TimeoutError):
-        async with asyncio.timeout(0.02):
-            await group.collect_async()
-    waiting = asyncio.create_task(group.collect_async(min_results=3))
-    await open_gates(gates[1])
-    waiting.cancel()
-    await asyncio.wait([waiting])
-    assert waiting.cancelled()
-    await open_gates(gates[0], gates[2])
-    batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(batch.ids()) == IDS[:3]
-
-
-async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gate]) -> None:
-    """A step, a reset, a method call and a collect at once each return with their own envs."""
-    group.step_async(responses(0))
-    collecting = asyncio.create_task(group.collect_async())
-    stepping = asyncio.create_task(group.step(responses(1)))
-    await asyncio.sleep(0)
-    batch, _ = await group.reset(env_ids=["gated-2"])
-    assert batch.ids() == ["gated-2"]
-    assert await group["gated-3"].call("double", 21) == 42
-    assert not collecting.done()
-    assert not stepping.done()
-    await open_gates(gates[1])
-    assert (await stepping)[0].ids() == ["gated-1"]
-    await open_gates(gates[0])
-    assert (await collecting)[0].ids() == ["gated-0"]
 
 
 async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:

@@ -50,15 +50,6 @@ def test_results_and_errors_that_nobody_has_collected_are_dropped(entry: dict[st
         assert batch.observation.tolist() == [[1]] * 3
 
 
-def test_a_reset_of_some_envs_drops_nothing(entry: dict[str, Any]) -> None:
-    with rlightning_aio.sync.build_env_group(entry) as group:
-        batch, _ = group.reset()
-        group.step_async(batch.respond(action=np.ones(3, int)))
-        with pytest.raises(EnvBusy, match=r"'a-1'.*collect it first"):
-            group.reset(env_ids=["a-1"])
-        assert len(group.collect_async(wait_all=True)[0]) == 3
-
-
 async def test_what_a_cancelled_call_has_left_is_dropped(entry: dict[str, Any]) -> None:
     """Steps go on in their envs, and so do calls of methods; a reset waits for both."""
     async with rlightning_aio.build_env_group(entry) as group:
