@@ -216,35 +216,6 @@ def test_a_bell_that_is_read_with_a_frame_can_be_armed_again(started: Scene) -> 
         assert bell.unread() == 0
 
 
-def test_frames_come_before_later_reports(started: Scene) -> None:
-    """A row can be read only with a known schema, and the trainer reads by either way."""
-    for number, look in ((1, started.host.poll), (2, started.read)):
-        started.host.submit(steps(number))
-        started.send(*frame_of(NewSchema(0, number, SCHEMA)))
-        started.send(FrameKind.RESULT, step(number, 0), b"out of band")
-        started.serve(step(number, 1))
-        look()
-        assert started.posted() == [
-            NewSchema(0, number, SCHEMA),
-            Result(0, step(number, 0), b"out of band"),
-            ("reported", [step(number, 1)]),
-        ]
-
-
-def test_a_partial_frame_is_posted_when_it_is_whole(started: Scene) -> None:
-    """Reports that arrive meanwhile were sent before it."""
-    frame = encode(FrameKind.RESULT, step(1, 0), b"out of band")
-    started.host.submit(steps(1))
-    started.channel.send(frame[:20])
-    started.serve(step(1, 1))
-    started.read()
-    assert started.posted() == [("reported", [step(1, 1)])]
-    started.channel.send(frame[20:])
-    started.rings.count_frame()
-    started.read()
-    assert started.posted() == [Result(0, step(1, 0), b"out of band")]
-
-
 def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) -> None:
     """The order stays, and a frame is counted only when all of it is written."""
     started.received()

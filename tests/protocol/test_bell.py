@@ -5,7 +5,6 @@ That it rings in any order of events, random programs show, and `test_interleavi
 
 from __future__ import annotations
 
-import itertools
 import mmap
 import os
 import random
@@ -34,32 +33,6 @@ def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
     memory = memoryview(bytearray(bell_size(num_workers)))
     trainer = TrainerBell(memory, num_workers)
     return trainer, [WorkerBell(memory, num_workers, k) for k in range(num_workers)]
-
-
-@pytest.mark.parametrize("num_workers", [2, 13])
-@pytest.mark.parametrize("at_last", [False, True])
-def test_one_of_several_workers_that_finish_together_rings(num_workers: int, at_last: bool) -> None:
-    """In any order of reports and checks, with each worker's report before its check."""
-    events = [("publish", 0), ("look", 0), ("publish", 1), ("look", 1)]
-    orders = [
-        order
-        for order in itertools.permutations(events)
-        if all(order.index(("publish", k)) < order.index(("look", k)) for k in range(2))
-    ]
-    assert len(orders) == 6
-    for order in orders:
-        trainer, workers = bells(num_workers)
-        trainer.arm(trainer.goal(2), at_last=at_last)
-        rung = [0, 0]
-        for what, index in order:
-            if what == "publish":
-                workers[index].publish(1)
-            else:
-                rung[index] += workers[index].is_due()
-        assert sum(rung) >= 1, order
-        # Two if neither checked before both had published.
-        both_first = {what for what, _ in order[:2]} == {"publish"}
-        assert sum(rung) == 1 + both_first, order
 
 
 def test_for_all_results_workers_check_when_they_run_out_of_work() -> None:

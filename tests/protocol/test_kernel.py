@@ -282,45 +282,6 @@ def test_serve_survives_any_contents_of_the_rings(
     same(scenario)
 
 
-def test_the_request_in_execution_is_known_with_its_start() -> None:
-    """To whoever looks at the shared words, until its reply is published."""
-
-    def scenario(implementation: ModuleType) -> Any:
-        side = WorkerSide(words(5 * LINE), words(8), words(8), words(5), words(2 * LINE), LINE)
-        side.words[REQUESTS_SENT] = 3
-        requests = [entry(1, 0, Operation.STEP), entry(2, 1, Operation.STEP), entry(3, 0, 2)]
-        for position, request in enumerate(requests):
-            side.requests[position] = request
-        side.bell[ARMED] = 1 << exchange.GOAL_SHIFT | 1
-        seen: list[Any] = []
-
-        def look(*what: Any) -> bool:
-            began = side.words[exchange.CURRENT_SINCE_NS]
-            seen.append(
-                (side.words[exchange.CURRENT], before <= began <= time.monotonic_ns(), *what)
-            )
-            return True
-
-        before = time.monotonic_ns()
-        implementation.serve(
-            side, look, lambda *_: look("finish"), lambda: look("ring"), look,
-            [lambda: (look(), None)[1], lambda: {"more": look()}], 0, exchange.new_fence(),
-        )  # fmt: skip
-        look("end")
-        return seen, requests
-
-    seen, requests = same(scenario)
-    first, second, third = requests
-    assert seen == [
-        (first, True),
-        (0, True, "ring"),
-        (second, True),
-        (second, True, "finish"),
-        (third, True, third),
-        (0, True, "end"),
-    ]
-
-
 def test_what_a_worker_cannot_send_ends_its_loop() -> None:
     """An error of `finish` or `ring` is the worker's own."""
 

@@ -47,13 +47,6 @@ def test_an_entry_holds_number_slot_and_operation(number: int, slot: int, op: in
     assert (number_of(packed), slot_of(packed), op_of(packed)) == (number, slot, op)
 
 
-def test_a_batch_of_steps_becomes_resets_by_adding_a_mask() -> None:
-    """The trainer makes resets in this way."""
-    steps = np.array([entry(k + 1, k, Operation.STEP) for k in range(3)])
-    found = steps + np.array([False, True, False])
-    assert [op_of(one) for one in found.tolist()] == [STEP, Operation.RESET, STEP]
-
-
 @pytest.mark.parametrize("count", [-1, 9, 1 << 62, -(1 << 63)])
 def test_an_impossible_count_is_an_error_of_the_other_side(count: int) -> None:
     """Whoever wrote it: nothing is read, so nothing is read beyond a ring."""
@@ -67,16 +60,6 @@ def test_an_impossible_count_is_an_error_of_the_other_side(count: int) -> None:
         worker.serve(lambda _: True, unused, unused, unused, [], 0)
     with pytest.raises(RuntimeError, match="in a ring for 4"):
         worker.requests()
-
-
-def test_the_trainer_sees_the_entry_in_execution_and_its_start() -> None:
-    """The entry is 0 while nothing is executed."""
-    _, trainer, worker = both_sides(3)
-    assert trainer.current()[0] == 0
-    worker.begin(entry(7, 2, STEP), 123)
-    assert trainer.current() == (entry(7, 2, STEP), 123)
-    worker.idle()
-    assert trainer.current()[0] == 0
 
 
 def test_each_thread_has_its_own_fence() -> None:
