@@ -1,8 +1,8 @@
 """Envs for tests; workers import this module by name.
 
 Gymnasium envs: `Tree-v0` has observations and actions of every space that fits in rows, `Words-v0`
-has observations and `Speech-v0` actions of spaces that don't. Each observation is a new sample, so
-seeds matter. The other envs are registered backends.
+observations of spaces that don't. Each observation is a new sample, so seeds matter. The other envs
+are registered backends.
 """
 
 from __future__ import annotations
@@ -76,13 +76,8 @@ def words() -> DrawnEnv:
     return DrawnEnv(WORDS, spaces.Discrete(3))
 
 
-def speech() -> DrawnEnv:
-    return DrawnEnv(spaces.Box(-1, 1, (2,)), spaces.Tuple([spaces.Text(9), spaces.Discrete(2)]))
-
-
 gym.register("Tree-v0", entry_point=tree)
 gym.register("Words-v0", entry_point=words)
-gym.register("Speech-v0", entry_point=speech)
 
 
 # -- subclasses of BaseEnv

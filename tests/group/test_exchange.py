@@ -18,13 +18,11 @@ from rlightning_aio import (
     BatchedData,
     ConfigError,
     EnvMeta,
-    EnvRaised,
     MultiAgentEnvRet,
     PolicyResponse,
     build_env_group,
 )
 from rlightning_aio._core.group.state.slab_layout import check_actions
-from rlightning_aio.trees import stacked
 
 # Values are made and read independently of the loop.
 pytestmark = pytest.mark.one_driver_for_each_place
@@ -223,48 +221,6 @@ async def test_actions_of_every_space_that_fits_in_rows(start: Any) -> None:
         await group["e-0"].step(wrong)
 
 
-async def test_sent_actions_keep_their_values_in_every_form(start: Any) -> None:
-    """In one batch of results for actions sent as columns, as a list, and as single responses."""
-    group = await start(gym_entry("Tree-v0", num_workers=3))
-    batch, _ = await group.reset(seed=0)
-    drawn = [sample_envs.MOVES.sample() for _ in range(3)]
-    for first, second, third in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
-        columns = stacked([drawn[first]])
-        group.step_async(batch.take([first]).respond(action=columns))
-        group.step_async(batch.take([second]).respond(action=[drawn[second]]))
-        env_id = batch.env_ids()[third]
-        group.step_async(BatchedData([env_id], [PolicyResponse(env_id, drawn[third])]))
-        batch, _ = await group.collect_async(wait_all=True)
-        order = [int(env_id[-1]) for env_id in batch.env_ids()]
-        assert isinstance(batch.sent.action, list)
-        assert all(same(batch.sent.action[k], drawn[env]) for k, env in enumerate(order))
-        batch = batch.take(np.argsort(order).tolist())
-
-
-async def test_what_a_batch_says_was_sent_never_changes(start: Any) -> None:
-    """Rows that answer no response have the columns sent last when they were returned."""
-    group = await start(PROBE)
-    first, _ = await group.reset()
-    assert list(first.sent) == ["action"]
-    action = np.zeros((2, 2))
-    await group.step(first.respond(action=action, log_prob=np.zeros(2)))
-    second, _ = await group.reset()
-    await group.step(second.respond(action=action, value=np.zeros((2, 3))))
-    assert (list(first.sent), list(second.sent)) == (["action"], ["action", "log_prob"])
-    third, _ = await group.reset()
-    assert np.isnan(third.sent.value).shape == (2, 3)
-
-
-async def test_actions_without_a_fixed_size_are_sent_out_of_band(start: Any) -> None:
-    """For example Text in a Tuple."""
-    group = await start(gym_entry("Speech-v0"))
-    batch, _ = await group.reset(seed=0)
-    batch, _ = await group.step(batch.respond(action=[("hello", 1), ("you", 0)]))
-    assert batch.observation.shape == (2, 2)
-    with pytest.raises(EnvRaised, match=r"'e-1'.*AssertionError"):
-        await group["e-1"].step(("far too long a text", 1))
-
-
 class Echo(Counts):
     """Reports each action."""
 
@@ -303,20 +259,6 @@ async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
 
 
 # -- observations
-
-
-async def test_observations_without_a_fixed_size_arrive_unchanged(start: Any) -> None:
-    """Text, Sequence and Graph, at any depth, equal those of the bare env."""
-    group = await start(gym_entry("Words-v0"))
-    bare = [sample_envs.words(), sample_envs.words()]
-    batch, _ = await group.reset(seed=4)
-    expected = [env.reset(seed=4 + k)[0] for k, env in enumerate(bare)]
-    for _ in range(5):
-        assert all(map(same, [v.observation for v in batch.values()], expected))
-        assert batch.observation["text"] == [value["text"] for value in expected]
-        batch, _ = await group.step(batch.respond(action=np.array([0, 2])))
-        expected = [env.step(action)[0] for env, action in zip(bare, (0, 2), strict=True)]
-        assert batch["e-1"].observation["graph"].nodes.dtype == np.float32
 
 
 # -- several sub-environments, several agents, several kinds of env
@@ -369,26 +311,6 @@ async def test_agents_have_their_own_columns(start: Any) -> None:
         assert value.last_terminated == {"tall": True, "small": True}
         batch, _ = await group.step(batch.respond(action=actions))
         assert batch.observation["small"].tolist() == [0, 0]
-
-
-async def test_envs_of_different_observations_work_as_one_group(start: Any) -> None:
-    """Each entry's batch stacks and is answered separately."""
-    wide = {"name": "e", "backend": "gymnasium", "task": "Acrobot-v1"}
-    poles = {**CARTPOLE, "name": "pole"}
-    group = await start([wide, poles])
-    batch, _ = await group.reset(seed=0)
-    assert [space.shape for space in group.get_observation_spaces()] == [(6,), (4,), (4,)]
-    with pytest.raises(ValueError, match=r"by_entry\(\)"):
-        batch.observation  # noqa: B018
-    split = batch.by_entry()
-    assert split["e"].observation.shape == (1, 6)
-    assert split["pole"].observation.shape == (2, 4)
-    group.step_async(split["pole"].respond(action=np.array([1, 0])))
-    group.step_async(split["e"].respond(action=np.array([2])))
-    batch, _ = await group.collect_async(wait_all=True)
-    assert sorted(batch.by_entry()) == ["e", "pole"]
-    batch, _ = await group.step(batch.respond(action=np.zeros(3, int)))
-    assert len(batch.info()) == 3
 
 
 UNFIXED = ["words", "lines", "titled count", "titled value", "value of two titles", "further keys"]

@@ -90,20 +90,6 @@ def test_fresh_observations_are_handed_over_uncopied() -> None:
         assert np.shares_memory(batch.observation, group["array-0"].get_attr("given"))
 
 
-@pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
-def test_envs_of_different_spaces_stack_each_for_itself() -> None:
-    """Observations of different spaces are not stacked, handed over or not."""
-    with rlightning_aio.sync.build_env_group([fresh(t) for t in sample_envs.Fresh.SPACES]) as group:
-        batch = step(group, group.reset()[0])
-        by_name = batch.by_entry()
-        for task, space in sample_envs.Fresh.SPACES.items():
-            (value,) = by_name[task].values()
-            assert value.observation in space
-        assert by_name["array"].observation.shape == (1, 3)
-        assert by_name["tree"].observation["image"].shape == (1, 4, 5, 3)
-        assert isinstance(by_name["words"].observation, list)
-
-
 def test_fresh_observations_have_the_spaces_dtype_and_shape() -> None:
     """Others are cast if that loses only precision, and otherwise refused."""
     with rlightning_aio.sync.build_env_group(

@@ -331,29 +331,6 @@ def test_an_installed_package_may_announce_them(
     assert "counters" not in sys.modules
 
 
-def test_a_class_registered_here_reaches_workers_by_value() -> None:
-    """A class defined in a function, which no worker could import."""
-
-    class Local(rlightning_aio.BaseEnv):
-        def get_observation_space(self) -> Any:
-            from gymnasium import spaces
-
-            return spaces.Discrete(100)
-
-        get_action_space = get_observation_space
-
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-            return rlightning_aio.EnvRet(env_id=self.env_id, observation=1)
-
-        def step(self, policy_resp: Any) -> Any:
-            return rlightning_aio.EnvRet(env_id=self.env_id, observation=policy_resp.action)
-
-    rlightning_aio.ENVS.register("local")(Local)
-    with sync.build_env_group({"name": "l", "backend": "local", "task": "x"}) as group:
-        group.reset()
-        assert group["l-0"].step(42).observation == 42
-
-
 def test_workers_collect_garbage() -> None:
     """The fork server disables it only while it imports."""
 

@@ -119,26 +119,6 @@ class Scripted(BaseEnv):
             await asyncio.Event().wait()
 
 
-@ENVS.register("meeting")
-class Meeting(Scripted):
-    """A step ends when all of the worker's envs are in one; its reward is how many that are."""
-
-    here: ClassVar[set[str]] = set()
-    all_here: ClassVar[asyncio.Event | None] = None
-
-    async def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        kind = Meeting
-        if kind.all_here is None:
-            kind.all_here = asyncio.Event()
-        event = kind.all_here
-        kind.here.add(self.env_id)
-        if len(kind.here) == len(self.built):
-            kind.all_here, kind.here = None, set()
-            event.set()
-        await event.wait()
-        return self._result(last_reward=float(len(self.built)))
-
-
 @ENVS.register("half awaitable")
 class HalfAwaitable(Scripted):
     def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:  # type: ignore[override]

@@ -47,7 +47,6 @@ from rlightning_aio.errors import (
     WorkerDied,
 )
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
-from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -105,16 +104,6 @@ async def test_all_envs_of_an_entry_are_in_flight_at_once() -> None:
         gate.set()
         batch, _ = await group.collect_async(wait_all=True)
         assert batch.observation[:, 2].tolist() == [1.0] * count
-
-
-async def test_awaitable_envs_of_one_worker_are_in_flight_at_once() -> None:
-    """Each waits for all others to begin, which only happens if none holds the worker."""
-    config = entry("m", "process", num_workers=8, envs_per_process=8) | {"backend": "meeting"}
-    with rlightning_aio.sync.build_env_group(config) as group:
-        batch, _ = group.reset()
-        for _ in range(3):
-            batch, _ = group.step(batch.respond(action=np.zeros(8, int)))
-        assert batch.reward.tolist() == [8.0] * 8
 
 
 async def test_looks_for_late_requests_do_not_multiply(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,20 +319,6 @@ async def test_a_call_that_waits_for_an_env_learns_that_it_was_aborted(
             await collecting
         batch, _ = await group.reset()
         assert batch.observation[:, 0].tolist() == [1, 2, 2]
-
-
-async def test_an_abort_that_is_cancelled_ends_the_step_all_the_same(place: dict[str, Any]) -> None:
-    async with rl.build_env_group(entry(num_workers=2, **place)) as group:
-        await group.reset()
-        group.step_async(steps(e_0=HANG))
-        aborting = asyncio.ensure_future(group.abort())
-        await asyncio.sleep(0)
-        aborting.cancel()
-        await asyncio.wait({aborting})
-        assert group.pending == []
-        await group.drain()
-        batch, _ = await group.reset()
-        assert batch.observation[0].tolist() == [2, 1, 0, -1]
 
 
 async def test_a_step_that_is_cancelled_and_tried_again_leaves_its_env_idle() -> None:
@@ -682,17 +657,6 @@ async def test_a_worker_waits_until_the_trainer_has_read_a_big_info() -> None:
 # -- the end
 
 
-async def test_a_group_can_be_closed_during_a_step() -> None:
-    group = rl.build_env_group(entry(num_workers=3))
-    await group.init()
-    batch, _ = await group.reset()
-    Scripted.gates.update({env_id: asyncio.Event() for env_id in group.env_ids})
-    group.step_async(batch.respond(action=np.full(3, GATE)))
-    await until_at_gate(*group.env_ids)
-    await group.close()
-    assert sorted(Scripted.closed) == ["e-0", "e-1", "e-2"]
-
-
 @pytest.mark.parametrize("wrong", [{"close": "hangs"}, {}], ids=["close hangs", "step goes on"])
 async def test_closing_ends_whatever_envs_do(wrong: dict[str, Any]) -> None:
     """Within the time that a group gives its hosts; the env is named in a warning."""
@@ -752,28 +716,6 @@ async def test_an_object_with_gymnasiums_methods_will_do(place: dict[str, Any]) 
             for _ in range(30):
                 batch, _ = await group.step(batch.respond(action=np.array([1, 5, 8])))
         assert batch.observation.tolist() == [40, 45, 0]
-
-
-class Chat:
-    """Texts in and out, and no spaces."""
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return {"said": "hello"}, {}
-
-    async def step(self, action: Any) -> Any:
-        return {"said": f"{action}?"}, 1.0, action == "bye", False, {}
-
-
-async def test_an_awaitable_env_without_spaces_takes_plain_values(place: dict[str, Any]) -> None:
-    """Its spaces are `Anything`, so nobody has to say it."""
-    async with rl.build_env_group(Chat, num_workers=2, **place) as group:
-        for space in (*group.get_observation_spaces(), *group.get_action_spaces()):
-            assert isinstance(space, Anything)
-        batch, _ = await group.reset()
-        assert batch.observation == [{"said": "hello"}] * 2
-        batch, _ = await group.step(batch.respond(action=["tea", "bye"]))
-        assert batch.observation == [{"said": "tea?"}, {"said": "bye?"}]
-        assert batch.terminated.tolist() == [False, True]
 
 
 class Slotted:
