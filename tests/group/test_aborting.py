@@ -19,7 +19,6 @@ from rlightning_aio import (
     build_env_group,
     sync,
 )
-from rlightning_aio._core.group.state.conditions import DEATH, LOST_EPISODE
 from rlightning_aio.errors import EnvRaised, EpisodeLost, GroupClosed
 
 if TYPE_CHECKING:
@@ -145,22 +144,6 @@ async def test_wrong_arguments_end_nothing(start: Any, entry: Any) -> None:
     for ending in (group.abort, group.drain):
         with pytest.raises(GroupClosed):
             await ending()
-
-
-@pytest.mark.one_driver_for_each_place
-async def test_ordinary_steps_go_on_after_an_abort(start: Any, entry: Any) -> None:
-    """Once the aborted env has begun an episode, nothing is left of it."""
-    group = await start(entry)
-    await group.reset(seed=3)
-    group.step_async(steps(*IDS))
-    await group.abort()
-    before, _ = await group.reset(seed=3)
-    for _ in range(3):
-        batch, _ = await group.step(before.respond(action=np.full((4, 2), [DO_NOTHING, 1.0])))
-        assert batch.reward.tolist() == [1] * 4
-        before = batch
-    conditions = getattr(group, "wrapped", group)._core.tables.conditions
-    assert not conditions.unusual & (DEATH | LOST_EPISODE)
 
 
 def test_the_seed_of_an_aborted_reset_is_nobody_elses() -> None:

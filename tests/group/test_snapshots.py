@@ -195,42 +195,6 @@ def test_a_snapshot_can_be_restored_in_another_run(tmp_path: Path) -> None:
     assert output_of(program, folder=tmp_path).strip() == batch.observation.tobytes().hex()
 
 
-async def test_some_envs_of_an_asynchronous_group() -> None:
-    """The others continue; an env can be restored into another's place."""
-    async with rl.build_env_group(entry_of("gymnasium", num_workers=3)) as group:
-        first, _ = await group.reset(seed=0)
-        snapshot = await group.snapshot(env_ids=["e-1"])
-        batch, _ = await group.step(first.respond(action=[0, 1, 0]))
-        shown, _ = await group.restore(snapshot, env_ids=["e-2"])
-        assert shown.ids() == ["e-2"]
-        np.testing.assert_equal(shown.observation[0], first.observation[1])
-        twin, _ = await group.step(batch.respond(action=[0, 0, 1]))
-        np.testing.assert_equal(twin.observation[2], batch.observation[1])
-
-
-def test_sums_and_counters_are_restored() -> None:
-    """The episode ends after the same number of steps, with the same return."""
-    with sync.build_env_group(entry_of("gymnasium", num_workers=1, placement="inline")) as group:
-        batch, _ = group.reset(seed=0)
-        with group.auto_reset(4):
-            for _ in range(4):
-                batch, flags = group.step(batch.respond(action=[0]))
-            assert flags == [True]
-            due = group.snapshot()  # A reset is due in the next step.
-            for _ in range(3):
-                batch, _ = group.step(batch.respond(action=[0]))
-            assert batch.info()[0] == {}
-            shown, flags = group.restore(due)
-            assert flags == [False]
-            assert group.get_env_stats()["e-0"]["episodes"] == 1
-            batch, flags = group.step(shown.respond(action=[0]))
-            assert batch.is_reset.all()
-            for _ in range(4):
-                batch, flags = group.step(batch.respond(action=[0]))
-            assert (flags, batch.info()[0]["episode"]) == ([True], {"r": 4.0, "l": 4})
-            assert group.get_env_stats()["e-0"]["episodes"] == 2
-
-
 # -- misuse
 
 
@@ -373,27 +337,10 @@ async def test_an_episode_that_had_ended_is_not_begun_again_after_a_failed_resto
     assert (batch.restarted.tolist(), batch.observation) == ([True], [None])
 
 
-def test_a_state_is_branched_into_many_envs() -> None:
-    """Into all envs of the entry, or some of any equal entry; they go on alike."""
-    entry = entry_of("of its own", num_workers=4, placement="inline")
-    with sync.build_env_group(entry) as group:
-        batch, _ = group.reset(seed=3)
-        with group.auto_reset(9):
-            batch, _ = Run(group, 0).proceed(batch, 5, 0)
-            snapshot = group.snapshot(["e-2", "e-0"])
-            shown, flags = group.restore(snapshot, source="e-2")
-            assert (shown.ids(), flags) == (group.env_ids, [False] * 4)
-            for observation in shown.values():
-                np.testing.assert_equal(observation.observation, batch["e-2"].observation)
-            for _ in range(20):
-                shown, flags = group.step(shown.respond(action=[1] * 4))
-                rows = list(shown.values())
-                for row in rows[1:]:
-                    np.testing.assert_equal(row.observation, rows[0].observation)
-                assert len(set(flags)) == 1
-            some, _ = group.restore(snapshot, ["e-3", "e-1"], source="e-0")
-            assert some.ids() == ["e-3", "e-1"]
-            np.testing.assert_equal(some["e-3"].observation, batch["e-0"].observation)
+def test_a_snapshot_without_the_state_to_branch_is_refused() -> None:
+    with sync.build_env_group(entry_of("of its own", num_workers=3, placement="inline")) as group:
+        group.reset(seed=3)
+        snapshot = group.snapshot(["e-2", "e-0"])
         with pytest.raises(SnapshotError, match="no state of 'e-1', only of e-2, e-0; nothing"):
             group.restore(snapshot, source="e-1")
 
