@@ -18,7 +18,7 @@ from rlightning_aio._core.group.api.aio import ServerHandle
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.errors import ConfigError, RLightningError
-from rlightning_aio.policies.answers import answers_of, check_policies, parts_by_policy
+from rlightning_aio.policies.answers import answers_of, check_policies, parts_by_policy, policies_of
 from rlightning_aio.policies.predicting import PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
@@ -107,14 +107,11 @@ class Responder:
         self._space_of = {meta.env_id: meta.action_space for meta in group.metas}.get
         self._group = group
         by_chance = RandomPolicy(self._space_of, seed)
-        self._by_entry: dict[str, Any] | None = policy if isinstance(policy, dict) else None
-        if self._by_entry is not None:
-            try:
-                check_policies((one["entry"] for one in group.get_workers()), self._by_entry)
-            except ValueError as error:
-                raise ConfigError(f"--policy: {error}") from error
-        given: dict[str, Any] = {"": policy} if self._by_entry is None else self._by_entry
-        self._policies = {name: one or by_chance for name, one in given.items()}
+        self._policies = {name: one or by_chance for name, one in policies_of(policy).items()}
+        try:
+            check_policies((one["entry"] for one in group.get_workers()), self._policies)
+        except ValueError as error:
+            raise ConfigError(f"--policy: {error}") from error
 
     async def __call__(self, batch: BatchedData) -> list[BatchedData]:
         """Return batches of responses that together answer `batch`.
@@ -124,7 +121,7 @@ class Responder:
         """
         found: list[BatchedData] = []
         with self._group.span("policy"):
-            for name, part in parts_by_policy(batch, self._by_entry):
+            for name, part in parts_by_policy(batch, self._policies):
                 found += await self._answers(self._policies[name], part)
         return found
 

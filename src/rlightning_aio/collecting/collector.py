@@ -8,7 +8,6 @@ results, and the next `collect` continues there. Ctrl-C may stop it at any point
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from contextlib import suppress
 from enum import Enum, auto
 from functools import partial
@@ -28,11 +27,11 @@ from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvAway, EnvFault, ResetNeeded, RLightningError, WorkerDied
-from rlightning_aio.policies.answers import parts_by_policy
+from rlightning_aio.policies.answers import parts_by_policy, policies_of
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
 
     import gymnasium as gym
 
@@ -159,10 +158,7 @@ class Collector(Generic[G, R]):
         self.policy_version = 0
         self._group = group
         self._infos = infos
-        self._policy: Any = policy
-        self._policies: Mapping[str, Callable[[BatchedData], Any] | None] | None = (
-            policy if isinstance(policy, Mapping) else None
-        )
+        self._policies: dict[str, Callable[[BatchedData], Any] | None] = policies_of(policy)
         self._quota = num_transitions
         self._min_results = min_results
         self._block = wait_all
@@ -348,15 +344,11 @@ class Collector(Generic[G, R]):
             self._lay_out()
 
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
-        policies = self._policies
-        return [
-            (self._kind(name, self._policy if policies is None else policies[name]), part)
-            for name, part in parts_by_policy(batch, policies)
-        ]
+        return [(self._kind(name), part) for name, part in parts_by_policy(batch, self._policies)]
 
-    def _kind(self, name: str, policy: Callable[[BatchedData], Any] | None) -> EnvKind:
+    def _kind(self, name: str) -> EnvKind:
         if name not in self._kinds:
-            policy = policy or RandomPolicy(
+            policy = self._policies[name] or RandomPolicy(
                 self._action_space_of, self._seed if isinstance(self._seed, int) else None
             )
             self._kinds[name] = EnvKind(policy, self._quota, self._meta_of, self._infos)
@@ -510,4 +502,4 @@ class Collector(Generic[G, R]):
             )
             for name, kind in self._kinds.items()
         }
-        return cast("R", found[""] if self._policies is None else found)
+        return cast("R", found.get("", found))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import closing
 from operator import index
-from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, cast, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, TypeAlias, overload
 
 from rlightning_aio._core.group.api.facade import (
     default_min_results,
@@ -17,16 +16,15 @@ from rlightning_aio.attempts.rules import Rules
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.evaluation.films import Films
-from rlightning_aio.evaluation.playing import Options, PolicyPlay
-from rlightning_aio.policies.answers import check_policies
+from rlightning_aio.evaluation.playing import PolicyPlay
+from rlightning_aio.policies.answers import check_policies, policies_of
 from rlightning_aio.policies.predicting import Model, PredictPolicy
 from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
     import os
-    from collections.abc import Callable, Coroutine, Iterable
+    from collections.abc import Callable, Coroutine, Iterable, Mapping
 
     from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
     from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
@@ -34,6 +32,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.queue import TaskInPlay
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.evaluation.evaluation import Evaluation
 
 Function: TypeAlias = "Callable[[BatchedData], Any]"
 Policy: TypeAlias = "Callable[[BatchedData], Any] | Model | None"
@@ -123,10 +122,10 @@ def evaluate(
     """
     number = index(episodes) if isinstance(episodes, SupportsIndex) else None
     _check(group, min_results, number, films=video is not None)
-    films = None if video is None else Films(group, video)
+    films = Films(group, video)
     queue = AttemptQueue(group, Rules(retries=retries), results)
-    options = Options(min_results or default_min_results(group), films, on_episode)
-    play = PolicyPlay(group, _by_entry(policy, group, seed), queue, Evaluation(), options)
+    least, policies = min_results or default_min_results(group), _by_entry(policy, group, seed)
+    play = PolicyPlay(group, policies, queue, films, least, on_episode)
     play.note_known(_filled(group, queue, episodes, seed))
     return run(_resetting(play, group), group)
 
@@ -174,9 +173,7 @@ def _resetting(play: PolicyPlay, group: Any) -> Procedure[Evaluation]:
 
 def _by_entry(policy: Any, group: Any, seed: int | None) -> dict[str, Function]:
     """Return policies as functions of a batch, by entry; one for all envs has the name ``""``."""
-    if not isinstance(policy, Mapping):
-        return {"": _called(policy, group, seed)}
-    given = cast("Mapping[str, Policy]", policy)
+    given = policies_of(policy)
     check_policies((worker["entry"] for worker in group.get_workers()), given)
     return {name: _called(one, group, seed) for name, one in given.items()}
 

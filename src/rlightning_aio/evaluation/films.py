@@ -40,25 +40,31 @@ class Films:
 
     Args:
         group: its envs have no sub-environments.
-        folder: for the files, created if missing.
+        folder: for the files, created if missing; None for no films.
+
+    Attributes:
+        are_wanted: there is a folder.
+        filmed: the encoder by env; None before the first frame.
 
     Raises:
         ImportError: the encoder isn't installed.
         OSError: nothing can be written into the folder.
     """
 
-    def __init__(self, group: Any, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, group: Any, folder: str | os.PathLike[str] | None) -> None:
+        self._group, self._folder = group, Path(folder or "")
+        self.are_wanted = folder is not None
+        self._first: dict[tuple[str, str], tuple[Any, ...]] = {}
+        """The episode to film, by entry and task."""
+        self.filmed: dict[str, Generator[None, Any] | None] = {}
+        if folder is None:
+            return
         try:
             self._encoder: Any = importlib.import_module("imageio_ffmpeg")
         except ImportError as error:
             hint = "films need imageio-ffmpeg: pip install 'rlightning-aio[video]'"
             raise ImportError(hint) from error
         check_folder(folder)
-        self._group, self._folder = group, Path(folder)
-        self._first: dict[tuple[str, str], tuple[Any, ...]] = {}
-        """The episode to film, by entry and task."""
-        self._filmed: dict[str, Generator[None, Any] | None] = {}
-        """The encoder by env; None before the first frame."""
 
     def check(self) -> Procedure[None]:
         """Ask each env whether it renders frames.
@@ -66,7 +72,7 @@ class Films:
         Raises:
             ValueError: one doesn't.
         """
-        for env_id in self._group.env_ids:
+        for env_id in self._group.env_ids if self.are_wanted else ():
             mode = yield from self._attribute(env_id, "render_mode")
             if mode != "rgb_array":
                 raise ValueError(
@@ -76,30 +82,30 @@ class Films:
 
     def begin(self, env_id: str, job: Job) -> None:
         """Film the episode that begins, if it is the first of its task, or that one once more."""
+        if not self.are_wanted:
+            return
         episode = job.spec, job.index
         if self._first.setdefault((job.spec.entry, job.spec.task), episode) == episode:
-            self._filmed[env_id] = None
+            self.filmed[env_id] = None
 
     def see(self, env_id: str) -> Procedure[None]:
-        """Add a frame of an idle env to its film, if it is filmed.
+        """Add a frame of an idle env to its film.
 
         Raises:
             EnvFault: it can't be rendered.
             ValueError: what it renders is no frame, or of another size than the ones before.
             OSError: the encoder has ended, as on a full disk.
         """
-        if env_id not in self._filmed:
-            return
         frame = np.asarray(as_numpy((yield self._group[env_id].render)))
         if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
             raise ValueError(
                 f"{env_id} can't be filmed: render() gives {frame.dtype}{list(frame.shape)}, not a "
                 "uint8 array [height, width, 3]"
             )
-        film = self._filmed[env_id]
+        film = self.filmed[env_id]
         if film is None:
             metadata: dict[str, Any] = (yield from self._attribute(env_id, "metadata")) or {}
-            film = self._filmed[env_id] = self._encoder.write_frames(
+            film = self.filmed[env_id] = self._encoder.write_frames(
                 str(self._partial(env_id)),
                 (frame.shape[1], frame.shape[0]),
                 fps=float(metadata.get("render_fps") or _DEFAULT_FPS),
@@ -111,19 +117,19 @@ class Films:
 
     def keep(self, attempt: Attempt) -> None:
         """Close the film of an episode that has ended, and give it its name."""
-        if (film := self._filmed.pop(attempt.env_id, None)) is not None:
+        if (film := self.filmed.pop(attempt.env_id, None)) is not None:
             film.close()
             finish_file(self._partial(attempt.env_id), self._folder / _name(attempt))
 
     def drop(self, env_id: str) -> None:
         """Delete what was filmed of an episode that was lost."""
-        if (film := self._filmed.pop(env_id, None)) is not None:
+        if (film := self.filmed.pop(env_id, None)) is not None:
             film.close()
             self._partial(env_id).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Delete the films of episodes that have no end."""
-        for env_id in [*self._filmed]:
+        for env_id in [*self.filmed]:
             self.drop(env_id)
 
     def _attribute(self, env_id: str, name: str) -> Procedure[Any]:

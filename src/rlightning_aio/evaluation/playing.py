@@ -12,7 +12,7 @@ import logging
 import math
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,6 +24,7 @@ from rlightning_aio.attempts.records import Attempt, success_of
 from rlightning_aio.batch.contents import lost_rows, readable
 from rlightning_aio.batch.parts import all_agents, summed_rewards
 from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
+from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
 from rlightning_aio.policies.answers import answers_of, parts_by_policy
 
@@ -35,22 +36,12 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.queue import AttemptQueue, Job, TaskInPlay
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting.procedure import Procedure
-    from rlightning_aio.evaluation.evaluation import Evaluation
     from rlightning_aio.evaluation.films import Films
     from rlightning_aio.types import EnvMeta
 
 _PATIENCE_SECONDS: Final = 1.0
 """For results of an evaluation that ends in an error; what takes longer is aborted."""
 _log = logging.getLogger("rlightning_aio")
-
-
-@dataclass(frozen=True, slots=True)
-class Options:
-    """The options of an evaluation; see `evaluate`."""
-
-    min_results: int | None
-    films: Films | None
-    on_episode: Callable[[Attempt], None] | None
 
 
 class PolicyPlay:
@@ -60,8 +51,8 @@ class PolicyPlay:
         group: an initialised group.
         policies: functions of a batch by entry; one for all envs has the name ``""``.
         queue: of the episodes.
-        found: what comes of the episodes is added to it.
-        options: see `Options`.
+        films: of the first episodes.
+        min_results, on_episode: see `evaluate`.
     """
 
     def __init__(
@@ -69,12 +60,13 @@ class PolicyPlay:
         group: Any,
         policies: dict[str, Callable[[BatchedData], Any]],
         queue: AttemptQueue,
-        found: Evaluation,
-        options: Options,
+        films: Films,
+        min_results: int,
+        on_episode: Callable[[Attempt], None] | None,
     ) -> None:
         self._group, self._policies, self._queue = group, policies, queue
-        self._given = None if "" in policies else policies
-        self._found, self._options = found, options
+        self._films, self._min_results, self._on_episode = films, min_results, on_episode
+        self._found = Evaluation()
         metas: list[EnvMeta] = group.metas
         self._metas = {meta.env_id: meta for meta in metas}
         ends = np.cumsum([meta.num_envs for meta in metas]).tolist()
@@ -97,15 +89,13 @@ class PolicyPlay:
         self._ended: deque[tuple[Job, Attempt]] = deque()
         """Episodes that the last results ended, to be noted."""
         self._has_warned = False
-        self._films = options.films
         self._health = Health()
 
     # -- the loop ---------------------------------------------------------------------
 
     def to_the_end(self) -> Procedure[Evaluation]:
         """Play all episodes."""
-        if self._films is not None:
-            yield from self._films.check()
+        yield from self._films.check()
         while True:
             self._begin_episodes()
             self._queue.check_players()
@@ -116,9 +106,7 @@ class PolicyPlay:
                 continue
             try:
                 batch: BatchedData
-                batch, _ = yield lambda: self._group.collect_async(
-                    min_results=self._options.min_results
-                )
+                batch, _ = yield lambda: self._group.collect_async(min_results=self._min_results)
             except EnvFault as fault:
                 self._note_fault(fault)
             else:
@@ -133,8 +121,7 @@ class PolicyPlay:
 
     def close(self) -> None:
         """Delete the films of episodes that have no end."""
-        if self._films is not None:
-            self._films.close()
+        self._films.close()
 
     def _begin_episodes(self) -> None:
         """Note ended episodes, and begin others in idle envs."""
@@ -182,13 +169,12 @@ class PolicyPlay:
         self._group.reset_async(seed=seeds, options=options, env_ids=[env_id])
         self._pending.add(env_id)
         self._begun[env_id] = request_number(self._group, env_id)
-        if self._films is not None:
-            self._films.begin(env_id, job)
+        self._films.begin(env_id, job)
 
     def _keep(self, job: Job, attempt: Attempt, *, is_last: bool = False) -> None:
         """Note what came of an episode."""
         self._health.note_env(attempt.outcome, time.monotonic())
-        if self._films is not None and not attempt.outcome.is_failure:
+        if not attempt.outcome.is_failure:
             self._films.keep(attempt)
         if not self._queue.end(job, attempt, is_last=is_last):
             return
@@ -211,8 +197,8 @@ class PolicyPlay:
 
     def _note(self, attempt: Attempt) -> None:
         self._found.attempts.append(attempt)
-        if self._options.on_episode is not None:
-            self._options.on_episode(attempt)
+        if self._on_episode is not None:
+            self._on_episode(attempt)
 
     def _continue(self, batch: BatchedData) -> Procedure[None]:
         """Add results to their episodes, and begin others or step their envs."""
@@ -223,8 +209,7 @@ class PolicyPlay:
         if not len(batch):
             return
         env_ids = batch.env_ids()
-        if self._films is not None:
-            yield from self._film(self._films, env_ids)
+        yield from self._film(env_ids)
         for part in batch.by_entry().values() if self._separate else (batch,):
             self._record(part)
         for env_id in env_ids:
@@ -237,16 +222,16 @@ class PolicyPlay:
         ]
         if rows:
             stepped = batch if len(rows) == len(batch) else batch.take(rows)
-            for name, part in parts_by_policy(stepped, self._given):
+            for name, part in parts_by_policy(stepped, self._policies):
                 answer = yield partial(self._policies[name], part)
                 space = self._metas[part.env_ids()[0]].action_space
                 for responses in answers_of(part, answer, lambda space=space: space):
                     self._step(responses)
 
-    def _film(self, films: Films, env_ids: list[str]) -> Procedure[None]:
-        for env_id in env_ids:
+    def _film(self, env_ids: list[str]) -> Procedure[None]:
+        for env_id in [one for one in self._films.filmed if one in env_ids]:
             try:
-                yield from films.see(env_id)
+                yield from self._films.see(env_id)
             except EnvFault as fault:
                 self._note_fault(fault)
 
@@ -315,7 +300,7 @@ class PolicyPlay:
 
     def _take_next(self, env_id: str, sub_env: int) -> None:
         """Give a sub-environment that resets itself its next episode."""
-        if self._films is None and self._metas[env_id].autoreset != "disabled":
+        if not self._films.are_wanted and self._metas[env_id].autoreset != "disabled":
             job = self._queue.take_next(env_id, sub_env)
             if job is not None:
                 self._jobs[self._places[env_id][sub_env]] = job
@@ -366,8 +351,7 @@ class PolicyPlay:
 
     def _lose(self, env_id: str, outcome: Outcome) -> None:
         """Note that an env has lost its episodes."""
-        if self._films is not None:
-            self._films.drop(env_id)
+        self._films.drop(env_id)
         for sub_env in range(len(self._places[env_id])):
             self._end(env_id, sub_env, outcome)
         self._queue.players.note(replace(outcome, env_id=env_id))

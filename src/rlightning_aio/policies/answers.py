@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
 
+def policies_of(given: Any) -> dict[str, Any]:
+    """Return policies by the name of a config entry; one for all envs has the name ``""``."""
+    return {**given} if isinstance(given, Mapping) else {"": given}
+
+
 def check_policies(entries: Iterable[str], policies: Mapping[str, object]) -> None:
     """Check that each of some entries has a policy.
 
@@ -28,7 +33,7 @@ def check_policies(entries: Iterable[str], policies: Mapping[str, object]) -> No
         ValueError: one has none.
     """
     for name in entries:
-        if name not in policies:
+        if name not in policies and "" not in policies:
             raise ValueError(
                 f"no policy was given for the envs of entry {name!r}; those given are for "
                 f"{', '.join(policies)}"
@@ -36,20 +41,14 @@ def check_policies(entries: Iterable[str], policies: Mapping[str, object]) -> No
 
 
 def parts_by_policy(
-    batch: BatchedData, policies: Mapping[str, object] | None
+    batch: BatchedData, policies: Mapping[str, object]
 ) -> list[tuple[str, BatchedData]]:
-    """Split a batch of results by policy.
-
-    Args:
-        batch: of results.
-        policies: by the name of a config entry; None for one policy for all envs.
-
-    Returns the results of each entry; all of them for the name ``""`` if there is one policy.
+    """Split a batch of results by policy, as `policies_of` has them.
 
     Raises:
         ValueError: an entry has no policy.
     """
-    if policies is None:
+    if "" in policies:
         return [("", batch)]
     parts = batch.by_entry()
     check_policies(parts, policies)
