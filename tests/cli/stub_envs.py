@@ -17,6 +17,7 @@ from kit.scripted import Awaitable, Counts
 import rlightning_aio as rl
 
 
+@rl.ENVS.register("stub")
 class Stub(rl.BaseEnv):
     """Observes its number of steps; ends after ``episode_length`` of them, reward 1 each."""
 
@@ -57,11 +58,6 @@ class Stub(rl.BaseEnv):
         return self._ret(last_reward=1.0, last_terminated=ended)
 
 
-@rl.ENVS.register("stub")
-class PlainStub(Stub):
-    """An env without faults."""
-
-
 @rl.ENVS.register("nan")
 class NotANumber(Stub):
     """Has rewards that are none."""
@@ -83,10 +79,10 @@ class Raising(Stub):
 
 @rl.ENVS.register("dying")
 class Dying(Stub):
-    """Its process ends with ``status``, or by that signal, in the step after ``steps`` of them."""
+    """Its process ends with ``status``, or by that signal, in its third step."""
 
     def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        if self.count == self.options.get("steps", 2):
+        if self.count == 2:
             status = self.options.get("status", 7)
             if status < 0:
                 os.kill(os.getpid(), -status)
@@ -104,28 +100,24 @@ class Unbuildable(Stub):
 
 @rl.ENVS.register("stuck")
 class Stuck(Stub):
-    """Hangs when built or in the step after ``steps``, after writing its process id to a file."""
+    """Hangs when it is built or in its third step, after writing its process id to a file.
+
+    ``env_kwargs``: `where`, ``init`` or ``step``; `only` in that placement.
+    """
 
     def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
-        Path(self.options["pid_file"]).write_text(str(os.getpid()))
-        if self.options["where"] == "init":
-            threading.Event().wait()
+        self._hang_in("init")
 
-    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        if self.count == self.options.get("steps", 2):
-            threading.Event().wait()
-        return super().step(policy_resp)
-
-
-@rl.ENVS.register("stuck_inline")
-class StuckInline(Stub):
-    """Hangs in its third step outside of a worker, after writing its process id to a file."""
-
-    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        if self.config.placement == "inline" and self.count == 2:
+    def _hang_in(self, place: str) -> None:
+        here = self.config.placement
+        if (place, here) == (self.options["where"], self.options.get("only", here)):
             Path(self.options["pid_file"]).write_text(str(os.getpid()))
             threading.Event().wait()
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.count == 2:
+            self._hang_in("step")
         return super().step(policy_resp)
 
 

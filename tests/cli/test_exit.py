@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+import re
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, run, write_config
+
+from rlightning_aio.cli import bench
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -23,54 +26,118 @@ def test_a_wrong_config_shows_no_traceback(tmp_path: Path) -> None:
     assert "num_workers" in done.stderr
 
 
-@pytest.mark.parametrize("words", [["--steps", "0"], ["--min-results", "none"], ["--nonsense"]])
-def test_a_wrong_option_is_code_2(tmp_path: Path, words: list[str]) -> None:
-    """It is refused before anything starts."""
-    done = invoke("rollout", write_config(tmp_path, CARTPOLE), *words)
-    assert done.exit_code == 2
-    assert words[0] in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("policy", "message"),
-    [
-        ("nonsense", "should look like my_policies:greedy"),
-        ("no_such_module:f", "No module named 'no_such_module'"),
-        ("cli.stub_policies:nothing", "has no 'nothing'"),
-        ("cli.stub_policies:not_callable", "is a int, neither a callable nor with a predict()"),
-    ],
+POLICIES = {
+    "nonsense": "should look like my_policies:greedy",
+    "no_such_module:f": "No module named 'no_such_module'",
+    "cli.stub_policies:nothing": "has no 'nothing'",
+    "cli.stub_policies:not_callable": "is a int, neither a callable nor with a predict..",
+}
+QUEUES = {
+    "--tasks a": "add --seeds 0:50",
+    "--seeds 3:1": "should look like 0:50 or 1,2,5",
+    "--seeds a": "should look like 0:50 or 1,2,5",
+    f"--seeds {2**62}": "should look like 0:50 or 1,2,5",
+    "--seeds 0:2 --episodes 3": "--episodes and --seed are for a number",
+}
+SWEEPS = {
+    "num_workers": "should be FIELD=A,B",
+    "num_workers=": "should be FIELD=A,B",
+    "num_worker=1": "did you mean 'num_workers'",
+    "num_workers=0": "num_workers: should be greater",
+    "min_results=0": "should be a number from 1 on",
+    "placement=ray": "its envs live elsewhere",
+}
+ADDRESSES = (
+    *("robot", "tcp://robot", "tcp://:5555", "udp://robot:1", "tcp://robot:0", "tcp://robot:65536"),
 )
-def test_an_invalid_policy_is_code_2(tmp_path: Path, policy: str, message: str) -> None:
-    """It is named before any env starts."""
-    done = invoke("rollout", write_config(tmp_path, CARTPOLE), "--policy", policy)
-    assert done.exit_code == 2
-    assert f"--policy '{policy}': " in done.stderr
-    assert message in done.stderr
-    assert "starting" not in done.stderr
+SWITCHING = {"name": "many", "task": "cli.judged_env:switching", "placement": "inline"}
+SERVER = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
+REFUSED: list[tuple[str, dict[str, Any], str, str]] = [
+    ("rollout", CARTPOLE, "--steps 0", "--steps"),
+    ("rollout", CARTPOLE, "--min-results none", "--min-results"),
+    ("rollout", CARTPOLE, "--nonsense", "--nonsense"),
+    *(
+        ("rollout", CARTPOLE, f"--policy {k}", f"--policy '{k}': .*{v}")
+        for k, v in POLICIES.items()
+    ),
+    *((name, STUB, f"--seed {2**61 + 1}", str(2**61)) for name in ("rollout", "eval", "bench")),
+    ("eval", STUB, "--resume absent/file", "can't be written"),
+    *(("eval", SWITCHING, words, said) for words, said in QUEUES.items()),
+    *(("bench", STUB, f"--sweep {sweep}", said) for sweep, said in SWEEPS.items()),
+    ("bench", STUB, "--plot plot.txt", "should end in"),
+    ("bench", {**STUB, "num_worker": 2}, "", "did you mean 'num_workers'"),
+    # Clients choose where their envs live, and a plain loop can't stop hardware.
+    ("bench", SERVER, "", "'robots'"),
+    ("bench", {"name": "arm", "backend": "piper", "task": "any"}, "", "move something real"),
+    *(("client", STUB, f"--connect {where}", f"{where!r}") for where in ADDRESSES),
+    ("client", STUB, "--connect robot", "tcp://127.0.0.1:5555"),
+]
 
 
-@pytest.mark.parametrize("placement", ["process", "inline"])
-def test_an_env_that_raises_is_code_1(tmp_path: Path, placement: str) -> None:
-    """The message names the env and the line; the table has the results so far."""
-    raising = {"name": "cracked", "backend": "raising", "task": "any", "placement": placement}
-    done = invoke("rollout", write_config(tmp_path, raising))
+@pytest.mark.parametrize(("command", "entry", "words", "said"), REFUSED)
+def test_a_wrong_word_is_refused_before_anything_starts(
+    tmp_path: Path,
+    command: str,
+    entry: dict[str, Any],
+    words: str,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The message names the option or field, and what to do."""
+    monkeypatch.setattr(bench, "_run_in_child", lambda work: work(lambda _: None))
+    done = invoke(command, write_config(tmp_path, entry), *words.split())
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert re.search(said, done.stderr)
+    assert not {"starting", "measuring", "Traceback"} & {*done.stderr.split()}
+
+
+RAISED = ("env 'robot-0'", "ZeroDivisionError: the floor is missing", "stub_envs.py")
+UNBUILT = ("robot-0", "FileNotFoundError: no such robot", "stub_envs.py")
+AWAY = ("no client has dialled in for robots-0/0 within 0.01 s",)
+TOO_FEW = "--policy cli.stub_policies:too_few"
+FAILED: list[tuple[str, dict[str, Any], str, str, tuple[str, ...]]] = [
+    *(
+        (command, {"backend": backend, "placement": place}, "", table, said)
+        for place in ("process", "inline")
+        for command, backend, table, said in (
+            ("rollout", "raising", "2 steps in ", RAISED),
+            ("check", "raising", "", RAISED),
+            ("rollout", "unbuildable", "", UNBUILT),
+        )
+    ),
+    (
+        *("rollout", {"backend": "dying", "on_worker_death": "raise"}, "", "2 steps in "),
+        ("'robot-0'", "exited with code 7"),
+    ),
+    ("client", {"backend": "unbuildable"}, "--connect tcp://127.0.0.1:9", "", UNBUILT),
+    ("rollout", SERVER, "", "", AWAY),
+    ("eval", SERVER, "", "", AWAY),
+    (
+        *("rollout", {**STUB, "placement": "inline", "num_workers": 3}, TOO_FEW, ""),
+        ("2 rows for a batch of 3",),
+    ),
+]
+
+
+@pytest.mark.parametrize(("command", "entry", "words", "table", "said"), FAILED)
+def test_what_fails_is_code_1_and_one_message(
+    tmp_path: Path,
+    command: str,
+    entry: dict[str, Any],
+    words: str,
+    table: str,
+    said: tuple[str, ...],
+) -> None:
+    """It names the env and the cause; the table has the results so far, if there are any."""
+    config = write_config(tmp_path, {"name": "robot", "task": "any", **entry})
+    done = invoke(command, config, *words.split())
     assert done.exit_code == 1
-    assert done.stdout.startswith("2 steps in ")
-    message = done.stderr.splitlines()[-1]
-    assert "env 'cracked-0'" in message
-    assert "ZeroDivisionError: the floor is missing" in message
-    assert "stub_envs.py" in message
+    assert done.stdout.startswith(table)
+    assert bool(done.stdout) == bool(table)
+    message = done.stderr.partition("error: ")[2]
+    assert [one for one in said if one not in message] == []
     assert "Traceback" not in done.stderr
-
-
-def test_a_dead_worker_is_code_1(tmp_path: Path) -> None:
-    """The config asks for it with on_worker_death: raise."""
-    dying = {"name": "frail", "backend": "dying", "task": "any", "on_worker_death": "raise"}
-    done = invoke("rollout", write_config(tmp_path, dying), "--json")
-    assert done.exit_code == 1
-    assert json.loads(done.stdout)["steps"] == 2
-    assert "'frail-0'" in done.stderr
-    assert "exited with code 7" in done.stderr
+    assert "above" not in done.stderr
 
 
 @pytest.mark.filterwarnings("ignore:close.. of env 'frail-0' raised WorkerDied")
@@ -87,18 +154,6 @@ def test_a_rollout_continues_after_a_worker_is_replaced(tmp_path: Path) -> None:
     assert numbers["envs/restarts"] == numbers["envs/frail/restarts"] == 1
 
 
-@pytest.mark.parametrize("placement", ["process", "inline"])
-def test_an_env_that_cannot_be_built_is_code_1(tmp_path: Path, placement: str) -> None:
-    """There is no table; the message has the cause."""
-    entry = {"name": "robot", "backend": "unbuildable", "task": "any", "placement": placement}
-    done = invoke("rollout", write_config(tmp_path, entry))
-    assert done.exit_code == 1
-    assert done.stdout == ""
-    assert "'robot-0'" in done.stderr
-    assert "FileNotFoundError: no such robot" in done.stderr
-    assert "above" not in done.stderr
-
-
 def test_a_missing_simulator_is_code_2_with_the_command_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,14 +164,6 @@ def test_a_missing_simulator_is_code_2_with_the_command_that_installs_it(
     done = invoke("rollout", write_config(tmp_path, CARTPOLE))
     assert done.exit_code == 2
     assert "pip install" in done.stderr
-
-
-def test_actions_that_do_not_fit_are_code_1(tmp_path: Path) -> None:
-    """A policy may return too few, for example."""
-    config = write_config(tmp_path, {**STUB, "placement": "inline", "num_workers": 3})
-    done = invoke("rollout", config, "--policy", "cli.stub_policies:too_few")
-    assert done.exit_code == 1
-    assert "2 rows for a batch of 3" in done.stderr
 
 
 def test_an_exception_of_a_policy_shows_its_own_code(tmp_path: Path) -> None:
@@ -130,15 +177,6 @@ def test_an_exception_of_a_policy_shows_its_own_code(tmp_path: Path) -> None:
     assert ["stub_policies.py" in place for place in places] == [True]
 
 
-@pytest.mark.parametrize("command", ["rollout", "eval"])
-def test_missing_clients_are_one_message(tmp_path: Path, command: str) -> None:
-    """It has the server, its address and the time waited."""
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
-    done = invoke(command, write_config(tmp_path, server))
-    assert (done.exit_code, done.stdout) == (1, "")
-    assert "no client has dialled in for robots-0/0 within 0.01 s" in done.stderr
-
-
 def test_a_warning_is_one_line(tmp_path: Path) -> None:
     """It leaves out the line of code that raised it."""
     entry = {"name": "box", "backend": "unclosable", "task": "any"}
@@ -147,13 +185,6 @@ def test_a_warning_is_one_line(tmp_path: Path) -> None:
     (warning,) = [line for line in done.stderr.splitlines() if "the lid is stuck" in line]
     assert warning.startswith("warning: close() of env 'box-0' raised")
     assert "self." not in done.stderr
-
-
-@pytest.mark.parametrize("command", ["rollout", "eval", "bench"])
-def test_a_seed_that_is_too_large_is_code_2(tmp_path: Path, command: str) -> None:
-    done = invoke(command, write_config(tmp_path, STUB), "--seed", 2**61 + 1)
-    assert done.exit_code == 2
-    assert str(2**61) in done.stderr
 
 
 def test_the_largest_seed_is_taken(tmp_path: Path) -> None:

@@ -28,11 +28,11 @@ def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
 def test_after_an_error_only_episodes_of_the_queue_are_reported(tmp_path: Path) -> None:
     """The results file has others besides."""
     config, file = write_config(tmp_path, POLE), tmp_path / "results.jsonl"
-    policy = "cli.stub_policies:breaks_later"
+    policy = "cli.stub_policies:breaks_soon"
     words = ("eval", config, "--policy", policy, "--resume", file)
     assert invoke_json(*words, "--seeds", "0:6")["episodes"] == 6
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cli.stub_policies.breaks", True)
+        patch.setattr("cli.stub_policies.calls_left", 0)
         done = invoke(*words, "--seeds", "4:8")
     assert done.exit_code == 1
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("CartPole-v1 ")]

@@ -195,28 +195,6 @@ def test_a_config_that_a_client_cannot_use_is_refused(
     assert [words for words in named if words not in done.stderr] == []
 
 
-@pytest.mark.parametrize(
-    "address",
-    ["robot", "tcp://robot", "tcp://:5555", "udp://robot:1", "tcp://robot:0", "tcp://robot:65536"],
-)
-def test_an_invalid_address_is_refused(tmp_path: Path, address: str) -> None:
-    """The message has an example."""
-    done = invoke("client", write_config(tmp_path, STUB), "--connect", address)
-    assert done.exit_code == 2
-    assert repr(address) in done.stderr
-    assert "tcp://127.0.0.1:5555" in done.stderr
-
-
-def test_an_env_that_cannot_be_built_is_one_message(tmp_path: Path) -> None:
-    """It has the env, its exception and the place in its code; the exit code is 1."""
-    config = write_config(tmp_path, {**STUB, "backend": "unbuildable"})
-    done = invoke("client", config, "--connect", NOBODY)
-    assert (done.exit_code, done.stdout) == (1, "")
-    assert "stub-0" in done.stderr
-    assert "FileNotFoundError: no such robot" in done.stderr
-    assert "stub_envs.py" in done.stderr
-
-
 def test_unreadable_keys_close_the_env(tmp_path: Path) -> None:
     """The message names their directory."""
     config, missing = finishing(tmp_path, 1), tmp_path / "missing"
