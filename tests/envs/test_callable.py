@@ -90,23 +90,6 @@ def test_one_callable_makes_every_env_of_an_entry() -> None:
         ]
 
 
-def test_workers_have_the_tasks_that_the_program_has_registered() -> None:
-    """By name in an entry and in a callable, even if another task can't be pickled."""
-    gym.register("Here-v0", wrapped_pendulum, max_episode_steps=3)
-    gym.register("Locked-v0", wrapped_pendulum, kwargs={"lock": threading.Lock()})
-    try:
-        entries = [
-            {"name": "named", "backend": "gymnasium", "task": "Here-v0"},
-            {"name": "made", "task": lambda: gym.make("Here-v0")},
-        ]
-        with build_env_group(entries) as group:
-            assert [meta.max_episode_steps for meta in group.metas] == [3, 3]
-        with pytest.raises(StartFailed, match="NameNotFound: Environment `Nowhere`"):
-            build_env_group([lambda: gym.make("Nowhere-v0")]).init()
-    finally:
-        del gym.registry["Here-v0"], gym.registry["Locked-v0"]
-
-
 def test_errors_name_the_callable_of_the_env() -> None:
     """If there is no task."""
     makers = [wrapped_pendulum, lambda: wrapped_pendulum(5.0)]

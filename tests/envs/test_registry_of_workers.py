@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import sys
+import threading
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -102,15 +103,6 @@ def test_groups_have_the_task_as_the_program_has_it(change: Callable[[], None]) 
             assert first_end(act) == LIMIT
 
 
-@pytest.mark.parametrize("change", CHANGES)
-def test_vector_envs_have_the_task_as_the_program_has_it(change: Callable[[], None]) -> None:
-    change()
-    envs = VectorEnv([lambda: gym.make(ID)] * 2)
-    envs.reset(seed=1)
-    assert first_end(lambda: envs.step(envs.action_space.sample())[2:4]) == LIMIT
-    envs.close()
-
-
 def test_a_module_that_a_worker_imports_does_not_undo_what_the_program_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,7 +163,7 @@ def test_workers_import_a_task_of_the_program_when_they_make_it(
 
 
 def test_envs_of_a_worker_have_the_same_class_of_the_program() -> None:
-    """A class may hold what its envs share."""
+    """A class may hold what its envs share. Another task may hold what no worker can have."""
 
     class Numbered(Told):
         made = 0
@@ -181,6 +173,7 @@ def test_envs_of_a_worker_have_the_same_class_of_the_program() -> None:
             super().__init__(told=str(self.made))
 
     gym.register("Numbered-v0", Numbered)
+    gym.register("Locked-v0", Told, kwargs={"lock": threading.Lock()})
     envs = VectorEnv([lambda: gym.make("Numbered-v0")] * 2, max_concurrency=1)
     assert list(envs.reset()[1]["told"]) == ["1", "2"]
     envs.close()

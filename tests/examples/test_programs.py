@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import csv
 import importlib
 import re
@@ -118,16 +117,3 @@ def test_the_program_of_the_training_page_learns(tmp_path: Path) -> None:
         )
     )
     assert "steps to an episode" in output_of("-W", "error", program, asyncio_debug=False)
-
-
-def test_the_asynchronous_example_is_short() -> None:
-    """Beside its classes of arguments; the network is in ppo.py."""
-    text = (EXAMPLES / "ppo_async.py").read_text()
-    arguments = {
-        line
-        for node in ast.parse(text).body
-        if isinstance(node, ast.ClassDef) and node.decorator_list
-        for line in range(node.decorator_list[0].lineno, (node.end_lineno or 0) + 1)
-    }
-    lines = enumerate(text.splitlines(), 1)
-    assert len([line for k, line in lines if line.strip() and k not in arguments]) <= 120
