@@ -8,7 +8,6 @@ results, and the next `collect` continues there. Ctrl-C may stop it at any point
 from __future__ import annotations
 
 import asyncio
-from contextlib import suppress
 from enum import Enum, auto
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
@@ -314,10 +313,7 @@ class Collector(Generic[G, R]):
             for env_id in self._failed:
                 if not is_resettable(self._group, env_id):
                     raise self._refusal(env_id, "restart() has the next collect reset all envs")
-            if self._group.pending:  # By a start that was cancelled, or before `restart`.
-                with suppress(EnvFault):
-                    yield self._group.drain
-            try:
+            try:  # It drops what a start that was cancelled, or a call before `restart`, has left.
                 self._received, _ = yield partial(self._group.reset, seed=self._seed)
             except EnvFault as fault:
                 self._note(fault)
