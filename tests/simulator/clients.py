@@ -36,23 +36,29 @@ class Lent(ScriptedBase):
         kwargs = {"first_code": code, "layout": entry.layout, "controls": entry.controls}
         config = EnvConfig(name="lent", backend="simulated", task="-", env_kwargs=kwargs)
         super().__init__(config)
-        self.is_finished = False
+        self.is_finished = self.is_over = False
         self._client = client
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> EnvRet:
         before = State(self._client.env.codes, self._client.env.entry)
         before.scripts.subs = [self.env.scripts.subs[0]]
         self._client.befores.append(before.copy())
+        self.is_over = False
         with self._ending():
             return super().reset(seed=seed, options=options)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         act = self.act_of(policy_resp)
+        if self.is_over:
+            self._client.note_wrong("is stepped though its session is over")
         self._client.done.append(act)
         if act[0] == "hang":
             self._client.note_hang()
         with self._ending():
             return super().step(policy_resp)
+
+    def on_disconnect(self) -> None:
+        self.is_over = True
 
     @contextlib.contextmanager
     def _ending(self) -> Iterator[None]:
@@ -137,6 +143,10 @@ class Client:
     def note_trouble(self) -> None:
         """Note what may end a session."""
         self.troubles += 1
+
+    def note_wrong(self, what: str) -> None:
+        """Note what its env should not have been asked."""
+        self._world.wrongs.append(f"client {self.name} {what}")
 
     def note_hang(self) -> None:
         """Note that its env does not return any more."""

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts import Attempt
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting import Rollout
+    from rlightning_aio.evaluation import Evaluation
 
 
 class PolicyFailed(Exception):
@@ -366,6 +367,11 @@ class Evaluations(InContext):
 
     def choose(self, words: Words) -> Act:
         kind = mixed(words.seed, words.step, words.mix)
+        if "infos" in self.features and kind % 3 == 1:
+            return (
+                "info",
+                kind // 3 % 9 * 7,
+            )  # It says how far it has succeeded, which counts at an end.
         return ("end" if kind % 6 == 0 else "cut" if kind % 11 == 0 else "plain"), kind % TOKENS
 
     def policy(self, batch: BatchedData) -> Any:
@@ -443,6 +449,7 @@ class Evaluations(InContext):
         found = await self._found(rng, evaluate(self.group, self.policy, count, seed=seed))
         if found is None:
             return
+        self.check_rate(found)
         width = sum(len(env.codes) for env in self.envs)
         places = {(one.env_id, one.sub_env, one.index): one for one in found.attempts}
         require(len(places) == len(found.attempts) == count * width, "as many of each", found)
@@ -461,6 +468,7 @@ class Evaluations(InContext):
         found = await self._found(rng, evaluate(self.group, self.policy, specs))
         if found is None:
             return
+        self.check_rate(found)
         keys = sorted(one.spec.key for one in found.attempts)
         require(keys == sorted(spec.key for spec in specs), "other episodes", keys)
         for attempt in found.attempts:
@@ -468,6 +476,14 @@ class Evaluations(InContext):
             require(env.entry.name == attempt.spec.entry, "an env of another entry", attempt)
             self.check(attempt, env, 0, attempt.spec.seed)
         self.counts["episodes"] += len(specs)
+
+    def check_rate(self, found: Evaluation) -> None:
+        """It is that of the attempts whose success is known; `check` looks at each."""
+        known = [one.success for one in found.attempts if one.success is not None]
+        shown = None if found.success is None else (found.success.mean, found.success.count)
+        right = (sum(known) / len(known), len(known)) if known else None
+        require(shown == right, "another rate", shown, right)
+        self.counts["successes"] += sum(known)
 
     def check(self, attempt: Attempt, env: Env, k: int, seed: int | None) -> None:
         """An episode ends as it does alone, or has failed and says why."""
