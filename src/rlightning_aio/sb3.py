@@ -300,11 +300,8 @@ class VecEnv(_Base):
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the outermost wrapper of envs."""
         chosen = list(dict.fromkeys(self._places(indices)))
-        if self._ours is not None:
-            self._ours.ask(chosen, "call_wrapped", "__setattr__", attr_name, value)
-        elif self._separate is not None:
-            for k in chosen:
-                setattr(self._separate[k], attr_name, value)
+        if self._ours is not None or self._separate is not None:
+            self.env_method("__setattr__", attr_name, value, indices=chosen)
         else:
             self._check_all(chosen, f"set {attr_name} of")
             self._inner.set_attr(attr_name, [value] * self.num_envs)

@@ -1,10 +1,11 @@
-"""The wrappers of a Gymnasium environment, found and put on."""
+"""The wrappers of a Gymnasium environment, found and put on, and what it says of itself."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import gymnasium as gym
+from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.registry import is_of_simulator
@@ -72,6 +73,16 @@ def autoreset_mode_of(env: Any) -> AutoresetMode:
         "its episode. Set it in the callable, before it returns env: env.metadata = "
         "{**env.metadata, 'autoreset_mode': AutoresetMode.SAME_STEP}, or NEXT_STEP or DISABLED"
     )
+
+
+def check_running(env: Any) -> None:
+    """Check that a vector env is not closed.
+
+    Raises:
+        ClosedEnvironmentError: it is.
+    """
+    if env.closed:
+        raise ClosedEnvironmentError(f"this {type(env).__name__} is closed")
 
 
 def wrappers_of(env: Any) -> Iterator[gym.Wrapper[Any, Any, Any, Any]]:

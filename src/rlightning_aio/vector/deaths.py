@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from rlightning_aio.batch.contents import reported_info_list
 from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.trees import index
-from rlightning_aio.vector.batching import replaced
+from rlightning_aio.vector.spaces import replaced
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

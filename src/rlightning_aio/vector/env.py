@@ -21,28 +21,24 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import lost_rows, reported_info_list, reported_infos
 from rlightning_aio.batch.infos import listed, vector_infos
 from rlightning_aio.envs.adapted.makers import adapted
-from rlightning_aio.envs.wrappers import name_of
+from rlightning_aio.envs.wrappers import check_running, name_of
 from rlightning_aio.errors import BadAction, EnvFault, ResetNeeded, SnapshotError
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.trees import index
 from rlightning_aio.types import PolicyResponse
-from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Stepped, with_deaths, without_cause
 from rlightning_aio.vector.interface import (
     CalledEnvs,
     check_free,
     check_name,
-    check_running,
     check_sent,
-)
-from rlightning_aio.vector.reset_arguments import (
     checked_mode,
     mask_and_options,
     options_of_envs,
     seeds_of_envs,
 )
-from rlightning_aio.vector.spaces import adopted_spaces
+from rlightning_aio.vector.spaces import adopted_spaces, batched, merged, spread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -22,7 +22,7 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import is_mujocos, name_of
 from rlightning_aio.sharing import check_threads
 from rlightning_aio.vector.env import VectorEnv
-from rlightning_aio.vector.reset_arguments import checked_mode
+from rlightning_aio.vector.interface import checked_mode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

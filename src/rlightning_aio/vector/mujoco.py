@@ -19,16 +19,14 @@ from rlightning_aio._core.group.state.snapshot_format import (
     unpack,
 )
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
-from rlightning_aio.envs.wrappers import name_of
+from rlightning_aio.envs.wrappers import check_running, name_of
 from rlightning_aio.errors import SnapshotError
-from rlightning_aio.vector.interface import CalledEnvs, check_name, check_running
+from rlightning_aio.vector.interface import CalledEnvs, check_name, checked_mask, seeds_of_envs
 from rlightning_aio.vector.lazy_infos import LazyColumns
-from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
     from gymnasium.vector import AutoresetMode
     from numpy.typing import NDArray
 
@@ -78,37 +76,20 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         Raises:
             ClosedEnvironmentError: the vector env is closed.
         """
-        check_running(self)
         if options is not None and "reset_mask" in options:
             mask = checked_mask(options["reset_mask"], self.num_envs)
             options = {**options, "reset_mask": mask}
         return super().reset(seed=seeds_of_envs(seed, self.num_envs), options=options)
 
-    def step(
-        self, actions: NDArray[Any]
-    ) -> tuple[
-        NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
-    ]:  # fmt: skip
-        """Step all envs, or reset those that are over; see `MujocoBatch.step`."""
-        check_running(self)
-        return super().step(actions)
-
     # -- attributes -------------------------------------------------------------------------
 
     def call(self, name: str, /, *args: Any) -> tuple[Any, ...]:
         """Get attribute `name` of each env; see `MujocoBatch.call`."""
-        check_running(self)
         check_name(name)
         return super().call(name, *args)
 
-    def set_attr(self, name: str, values: Any) -> None:
-        """Set attribute `name` of all envs to one value, or to equal values in a list or tuple."""
-        check_running(self)
-        super().set_attr(name, values)
-
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
-        check_running(self)
         return self.is_wrapped(name_of(wrapper_class))
 
     # -- state and rendering ---------------------------------------------------------------
@@ -151,8 +132,3 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         kind = {name: str(value) for name, value in self._kind.items()}
         versions = {"version of mujoco": version("mujoco")}
         return {"backend": "simulations", "task": task, **kind, **versions}
-
-    def render_one(self, k: int) -> Any:
-        """Render a frame of env k in the render mode of the task."""
-        check_running(self)
-        return super().render_one(k)

@@ -25,7 +25,7 @@ from rlightning_aio.envs.mujoco.resets import can_draw, drawn, generator_of, noi
 from rlightning_aio.envs.mujoco.tasks import task_of
 from rlightning_aio.envs.mujoco.threads import Simulations
 from rlightning_aio.envs.state import load_state, save_state
-from rlightning_aio.envs.wrappers import ClassName, has_wrapper, wrappers_of
+from rlightning_aio.envs.wrappers import ClassName, check_running, has_wrapper, wrappers_of
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             seed: simulation k gets ``seed + k``, or element k of a sequence.
             options: passed to the task, without the mask.
         """
+        check_running(self)
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
         else:
@@ -287,6 +288,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             ResetNeeded: a simulation was not reset yet, or a call was interrupted.
             ValueError: the actions have the wrong shape.
         """
+        check_running(self)
         ended, actions = self._ended, np.asarray(actions)
         if ended is None or not self._is_whole:
             what = "before calling env.reset()" if ended is None else "after an interrupted call"
@@ -374,6 +376,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         Raises:
             NotImplementedError: it is another method, which exists once for all simulations.
         """
+        check_running(self)
         return tuple(self.call_one(k, name, *args) for k in range(self.num_envs))
 
     def call_one(self, k: int, name: str, /, *args: Any) -> Any:
@@ -405,6 +408,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             ValueError: the simulations, which share a model and all options, would differ, or there
                 isn't one value for each.
         """
+        check_running(self)
         different: Iterator[bool] = iter(())
         if isinstance(values, list | tuple):
             each = cast("list[Any]", values)
@@ -479,6 +483,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         Raises:
             ResetNeeded: there was no reset yet.
         """
+        check_running(self)
         if self._ended is None:
             raise ResetNeeded("Cannot call env.render() before calling env.reset()")
         mujoco.mj_copyData(self._data, self.env.model, self._simulations.data_of(k))
