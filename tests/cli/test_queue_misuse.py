@@ -37,13 +37,3 @@ def test_after_an_error_only_episodes_of_the_queue_are_reported(tmp_path: Path) 
     assert done.exit_code == 1
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("CartPole-v1 ")]
     assert line.split()[1] == "2"
-
-
-def test_episodes_without_a_task_are_filmed(tmp_path: Path) -> None:
-    """They have the task of the config."""
-    render = {"env_kwargs": {"render_mode": "rgb_array"}}
-    config = write_config(tmp_path, {**POLE, **render})
-    done = invoke("eval", config, "--seeds", "0:2", "--video", tmp_path / "films")
-    assert done.exit_code == 0, done.stderr
-    films = sorted(path.name for path in (tmp_path / "films").iterdir())
-    assert films == ["pole-CartPole-v1-seed-0.mp4"]

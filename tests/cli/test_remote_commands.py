@@ -116,21 +116,6 @@ def test_keygens_keys_let_a_client_in(tmp_path: Path) -> None:
     assert json.loads(server_stdout)["steps"] == 5
 
 
-def test_clients_are_evaluated(tmp_path: Path) -> None:
-    """Their places are envs like any other; the evaluation begins when all are taken."""
-    config = server_config(tmp_path, connect_timeout=HANG)
-    words = ["--episodes", 3, "--seed", 0, "--json"]
-    with start("eval", config, *words) as server:
-        address = line_with(server, "listens at").split()[-1]
-        with start("client", ROOT / "configs" / "cartpole.yaml", "--connect", address) as client:
-            stdout, stderr = server.communicate(timeout=HANG)
-            client.send_signal(signal.SIGINT)
-            client.communicate(timeout=HANG)
-    assert server.returncode == 0, stderr
-    attempts = json.loads(stdout)["attempts"]
-    assert [one["env_id"] for one in attempts] == ["robots-0/0"] * 3
-
-
 def test_each_change_of_a_connection_is_one_line_on_both_sides(tmp_path: Path) -> None:
     """A client without a valid key logs it once for all attempts, then connects with one."""
     keys = tmp_path / "keys"

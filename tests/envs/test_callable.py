@@ -50,31 +50,6 @@ class Counter(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=np.zeros(4, np.float32), last_reward=action)
 
 
-def test_wrapped_envs_behave_as_in_a_plain_loop() -> None:
-    """One callable for each env, in workers, over episode ends."""
-    gravities = [1.0, 5.0, 10.0]
-    # A lambda with a captured number, which can't be imported.
-    makers = [lambda g=g: wrapped_pendulum(g) for g in gravities]
-    loop = [wrapped_pendulum(g) for g in gravities]
-    actions = np.random.default_rng(0).uniform(-3, 3, (12, 3, 1)).astype(np.float32)
-    with build_env_group(makers) as group, group.auto_reset():
-        assert group.env_ids == ["env-0", "env-1", "env-2"]
-        batch, _ = group.reset(seed=7)
-        expected = [env.reset(seed=7 + k)[0] for k, env in enumerate(loop)]
-        np.testing.assert_array_equal(batch.observation, np.stack(expected))
-        for turn, action in enumerate(actions):
-            batch, _ = group.step(batch.respond(action=action))
-            for k, env in enumerate(loop):
-                if turn in (5, 11):
-                    observation, reward, info = env.reset()[0], 0.0, {}
-                else:
-                    observation, reward, _, _, info = env.step(action[k])
-                np.testing.assert_array_equal(batch.observation[k], observation)
-                assert batch.reward[k] == reward
-                if "episode" in info:
-                    assert batch.info("episode")["r"][k] == info["episode"]["r"]
-
-
 def test_one_callable_makes_every_env_of_an_entry() -> None:
     """With the ``env_kwargs`` and the step limit of the entry."""
     fields = {"task": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}

@@ -28,8 +28,6 @@ from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerGone
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rlightning_aio.collecting import Rollout
-
 ENVS = 4
 
 
@@ -37,8 +35,8 @@ def on_asyncio(test: Any) -> Any:
     """Run a coroutine function on asyncio's loop only: uvloop keeps a descriptor of a server."""
 
     @wraps(test)
-    def run() -> None:
-        asyncio.run(test())
+    def run(*args: Any, **kwargs: Any) -> None:
+        asyncio.run(test(*args, **kwargs))
 
     return run
 
@@ -58,12 +56,9 @@ FATES = ("idle loss", "lost before", "lost after", "restart", "half a frame", "n
 
 
 @pytest.mark.parametrize("fate", [*FATES, "another type"])
-def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
+@on_asyncio
+async def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
     """The step is answered by the first result of a new episode; its action is not sent again."""
-    asyncio.run(_lose(fate))
-
-
-async def _lose(fate: str) -> None:
     async with (
         Misbehaving(capacity=1) as server,
         rl.build_env_group(entry(server.url, num_workers=1)) as group,
@@ -109,12 +104,9 @@ async def test_a_reply_that_nobody_waits_for_answers_no_other_request() -> None:
 
 
 @pytest.mark.parametrize("fate", ["never", "no JSON", "another type"])
-def test_a_session_is_over_once_nobody_waits_for_a_reply(fate: str) -> None:
+@on_asyncio
+async def test_a_session_is_over_once_nobody_waits_for_a_reply(fate: str) -> None:
     """Whatever its env does: the next frame would be taken for the reply to another request."""
-    asyncio.run(_stop_waiting(fate))
-
-
-async def _stop_waiting(fate: str) -> None:
     async with Misbehaving(capacity=1) as server:
         session = OpenEnvSession(server.url)
         await session.open({"type": "reset", "data": {"episode_id": None}})
@@ -131,11 +123,8 @@ async def _stop_waiting(fate: str) -> None:
 
 
 @pytest.mark.parametrize("code", ERRORS)
-def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
-    asyncio.run(_fail(code))
-
-
-async def _fail(code: str) -> None:
+@on_asyncio
+async def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
     async with (
         Misbehaving(capacity=1) as server,
         rl.build_env_group(entry(server.url, num_workers=1)) as group,
@@ -327,7 +316,8 @@ async def test_fields_become_columns_of_their_spaces() -> None:
         ([None, None, None], [0.0, 0.0, math.nan]),
     ],
 )
-def test_an_episode_without_any_reward_has_none(
+@on_asyncio
+async def test_an_episode_without_any_reward_has_none(
     monkeypatch: pytest.MonkeyPatch, rewards: list[float | None], expected: list[float]
 ) -> None:
     """A reward of 0 would look like a verdict."""
@@ -342,40 +332,35 @@ def test_an_episode_without_any_reward_has_none(
 
     monkeypatch.setattr(Misbehaving, "_executed", with_rewards)
 
-    async def played() -> list[float]:
-        async with (
-            Misbehaving(capacity=1) as server,
-            rl.build_env_group(entry(server.url, num_workers=1)) as group,
-        ):
-            await group.reset()
-            return [(await group.step(steps_of("o-0")))[0].reward.item() for _ in rewards]
-
-    assert np.array_equal(asyncio.run(played()), expected, equal_nan=True)
+    async with (
+        Misbehaving(capacity=1) as server,
+        rl.build_env_group(entry(server.url, num_workers=1)) as group,
+    ):
+        await group.reset()
+        found = [(await group.step(steps_of("o-0")))[0].reward.item() for _ in rewards]
+    assert np.array_equal(found, expected, equal_nan=True)
 
 
 @pytest.mark.parametrize("placement", ["loop", "process"])
 @pytest.mark.parametrize("wait_all", [True, False])
-def test_a_collector_has_no_row_of_a_step_whose_session_was_lost(
+@on_asyncio
+async def test_a_collector_has_no_row_of_a_step_whose_session_was_lost(
     placement: str, wait_all: bool
 ) -> None:
     """Each row is one step further than the one before, and no lost episode counts."""
+    async with Misbehaving(capacity=2) as server:
+        calls = itertools.count()
 
-    async def collected() -> Rollout:
-        async with Misbehaving(capacity=2) as server:
-            calls = itertools.count()
+        def policy(batch: rl.BatchedData) -> Any:
+            if next(calls) == 3:
+                server.fates.append("restart")
+            return {"action": [{"number": next(numbers)} for _ in batch.ids()]}
 
-            def policy(batch: rl.BatchedData) -> Any:
-                if next(calls) == 3:
-                    server.fates.append("restart")
-                return {"action": [{"number": next(numbers)} for _ in batch.ids()]}
-
-            fields = {"num_workers": 2, "placement": placement}
-            async with rl.build_env_group(entry(server.url, **fields)) as group:
-                with group.auto_reset(math.inf):
-                    collector = Collector(group, policy, num_transitions=20, wait_all=wait_all)
-                    return await collector.collect()
-
-    rollout = asyncio.run(collected())
+        fields = {"num_workers": 2, "placement": placement}
+        async with rl.build_env_group(entry(server.url, **fields)) as group:
+            with group.auto_reset(math.inf):
+                collector = Collector(group, policy, num_transitions=20, wait_all=wait_all)
+                rollout = await collector.collect()
     assert rollout.reward.tolist() == np.ones(rollout.shape).tolist()
     assert not len(rollout.episodes["length"])
     seen = rollout.observation

@@ -471,15 +471,6 @@ def test_commands_that_the_bus_loses_are_repeated(arm: WatchedArm, make: Any) ->
     assert ret.observation["joint_positions"] == pytest.approx(READY, abs=0.021)
 
 
-def test_the_step_limit_truncates(arm: WatchedArm, make: Any) -> None:
-    """At `max_episode_steps` steps; a reset restarts the count."""
-    env = make(max_episode_steps=3)
-    for _ in range(2):
-        env.reset()
-        flags = [env.step(respond([*READY, 0.0])).last_truncated for _ in range(3)]
-        assert flags == [False, False, True]
-
-
 def test_one_channel_has_one_env(arm: WatchedArm, make: Any, port: SlcanPort) -> None:
     """A second env on the channel raises, until the first is closed."""
     env = make()
@@ -614,17 +605,6 @@ def test_errors_of_the_config_are_named(
     """Before the channel is opened."""
     with pytest.raises(ConfigError, match=message):
         make(**env_kwargs)
-
-
-def test_a_virtual_channel_makes_its_own_arm(make: Any) -> None:
-    """`can_interface: virtual` needs no hardware and no second process, also repeatedly."""
-    for _ in range(2):
-        env = make(can_interface="virtual", channel="dry run")
-        env.reset()
-        for _ in range(40):
-            ret = env.step(respond([0.3, 0.6, -0.6, 0.0, 0.0, 0.0, 0.01]))
-        assert ret.observation["joint_positions"][0] == pytest.approx(0.3, abs=1e-3)
-        env.close()
 
 
 def test_the_arm_can_be_in_another_process(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import socket
 import threading
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from patience import HANG
-from policies.counting import QUEUE, Counting, check, group_of
+from policies.counting import QUEUE, check, group_of
 from policies.servers import OpenPiServer, packed, serving
 from websockets.sync.client import connect
 
@@ -40,19 +39,6 @@ def test_chunks_of_an_openpi_server_are_played() -> None:
     asked = {(one.seed, step) for one in QUEUE for step in range(0, one.seed + 4, 3)}
     assert seen == {(f"lift {seed}", seed, step) for seed, step in asked}
     assert server.connections == 1
-
-
-async def test_an_asynchronous_group_may_ask_it_in_a_thread() -> None:
-    """Called as it is, it would hold the event loop until the server has answered."""
-    entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": 2}
-    with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
-
-        async def asked(batch: rl.BatchedData) -> Any:
-            return await asyncio.to_thread(policy, batch)
-
-        async with rl.build_env_group(entry) as group:
-            with group.auto_reset(100):
-                check(await evaluate(group, ActionChunks(asked, 3), QUEUE))
 
 
 def test_a_lost_connection_is_an_error_and_the_next_call_connects_again() -> None:
