@@ -52,17 +52,15 @@ from rlightning_aio.protocol.net.wire import (
     DEFAULT_HEARTBEAT,
     HANDSHAKE_SECONDS,
     HARDWARE_HEARTBEAT,
-    MAX_FRAME_BYTES,
     MAX_HEARTBEAT,
     MAX_NAME_LENGTH,
     Reset,
     Step,
     Welcome,
     WireError,
-    ping_ms,
 )
 from rlightning_aio.remote.keys import read_client_keys
-from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
+from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts, set_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
@@ -275,13 +273,8 @@ class RemoteEnvClient:
         # -1 would have ZMQ drop what nobody has read when the connection ends, as a goodbye.
         dealer.set(zmq.RECONNECT_IVL, _NEVER_MS)
         dealer.set(zmq.LINGER, 0)
-        dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         dealer.set(zmq.CONNECT_TIMEOUT, int(1000 * HANDSHAKE_SECONDS))
-        dealer.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
-        interval, patience, given_to_peer = ping_ms(self._heartbeat)
-        dealer.set(zmq.HEARTBEAT_IVL, interval)
-        dealer.set(zmq.HEARTBEAT_TIMEOUT, patience)
-        dealer.set(zmq.HEARTBEAT_TTL, given_to_peer)
+        set_limits(dealer, self._heartbeat)
         if self._keys is not None:
             dealer.set(zmq.CURVE_SERVERKEY, self._keys.server)
             dealer.set(zmq.CURVE_PUBLICKEY, self._keys.public)

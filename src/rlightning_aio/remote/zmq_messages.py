@@ -1,4 +1,4 @@
-"""Messages of several parts over a ZMQ socket, without pyzmq's overhead.
+"""Messages of several parts over a ZMQ socket, without pyzmq's overhead, and the socket's limits.
 
 Rule: readiness is a hint. A connection can break between a poll and the read, so reading nothing is
 no error. Small parts are copied, which is faster than counting references to them.
@@ -9,6 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import zmq
+
+from rlightning_aio.protocol.net.wire import HANDSHAKE_SECONDS, MAX_FRAME_BYTES, ping_ms
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,6 +23,16 @@ _LAST: Final = int(zmq.NOBLOCK)
 _MORE: Final = int(zmq.NOBLOCK) | int(zmq.SNDMORE)
 _EVENTS: Final = int(zmq.EVENTS)
 _POLLIN: Final = int(zmq.POLLIN)
+
+
+def set_limits(socket: zmq.Socket[Any], heartbeat: float) -> None:
+    """Limit the size of messages, the time of handshakes, and the seconds that a peer is silent."""
+    interval, patience, given_to_peer = ping_ms(heartbeat)
+    socket.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+    socket.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
+    socket.set(zmq.HEARTBEAT_IVL, interval)
+    socket.set(zmq.HEARTBEAT_TIMEOUT, patience)
+    socket.set(zmq.HEARTBEAT_TTL, given_to_peer)
 
 
 def is_readable(socket: zmq.Socket[Any]) -> bool:

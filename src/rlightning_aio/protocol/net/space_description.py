@@ -144,7 +144,7 @@ def space_from(description: Any) -> gym.Space[Any]:
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            return _Builder().build(description, _MAX_DEPTH)
+            return _Builder().build(description)
     except WireError:
         raise
     # Gymnasium checks its arguments with assertions and by NumPy's errors.
@@ -157,7 +157,8 @@ class _Builder:
 
     def __init__(self) -> None:
         self._members_left = _MAX_MEMBERS
-        self._builders: dict[str, Callable[[Description, int], gym.Space[Any]]] = {
+        self._levels_left = _MAX_DEPTH
+        self._builders: dict[str, Callable[[Description], gym.Space[Any]]] = {
             "box": self._box,
             "discrete": self._discrete,
             "multi_binary": self._multi_binary,
@@ -167,10 +168,10 @@ class _Builder:
             "text": self._text,
         }
 
-    def build(self, description: Any, depth: int) -> gym.Space[Any]:
-        """The space that `description` describes; at most `depth` levels."""
+    def build(self, description: Any) -> gym.Space[Any]:
+        """The space that `description` describes."""
         self._members_left -= 1
-        if not isinstance(description, dict) or not depth or self._members_left < 0:
+        if not (isinstance(description, dict) and self._levels_left and self._members_left >= 0):
             raise WireError(
                 f"a space description is not a map, deeper than {_MAX_DEPTH} levels, or has more "
                 f"than {_MAX_MEMBERS} members"
@@ -179,31 +180,30 @@ class _Builder:
         build = self._builders.get(str(fields.get("type")))
         if build is None:
             raise WireError(f"a space description has the unknown type {fields.get('type')!r}")
-        return build(fields, depth - 1)
+        self._levels_left -= 1
+        space = build(fields)
+        self._levels_left += 1
+        return space
 
-    def _box(self, fields: Description, depth: int) -> gym.Space[Any]:
-        del depth
+    def _box(self, fields: Description) -> gym.Space[Any]:
         dtype = _dtype(fields)
         shape = self._shape(fields["shape"], dtype)
         low, high = (_bound_array(fields[bound], shape, dtype) for bound in ("low", "high"))
         return spaces.Box(low, high, dtype=dtype.type)
 
-    def _discrete(self, fields: Description, depth: int) -> gym.Space[Any]:
-        del depth
+    def _discrete(self, fields: Description) -> gym.Space[Any]:
         n, start = _int(fields["n"]), _int(fields.get("start", 0))
         dtype = _dtype(fields, "int64")
         if dtype.kind not in "iu" or start + n > np.iinfo(dtype).max:
             raise WireError(f"a discrete space of {n} from {start} exceeds {dtype}")
         return spaces.Discrete(n, start=start, dtype=dtype.type)
 
-    def _multi_binary(self, fields: Description, depth: int) -> gym.Space[Any]:
-        del depth
+    def _multi_binary(self, fields: Description) -> gym.Space[Any]:
         n = fields["n"]
         shape = self._shape(n if isinstance(n, list) else [n], np.dtype(np.int8))
         return spaces.MultiBinary(shape if isinstance(n, list) else shape[0])
 
-    def _multi_discrete(self, fields: Description, depth: int) -> gym.Space[Any]:
-        del depth
+    def _multi_discrete(self, fields: Description) -> gym.Space[Any]:
         dtype = _dtype(fields, "int64")
         nvec = np.array(_numbers(fields["nvec"], _MAX_AXES), dtype.type)
         self._shape(list(nvec.shape), dtype)
@@ -216,21 +216,20 @@ class _Builder:
             raise WireError(f"a multi_discrete space exceeds {dtype}")
         return space
 
-    def _dict(self, fields: Description, depth: int) -> gym.Space[Any]:
+    def _dict(self, fields: Description) -> gym.Space[Any]:
         members: dict[str, gym.Space[Any]] = {}
         for key, inner in _list(fields["spaces"]):
             if not isinstance(key, str) or key in members:
                 raise WireError(
                     f"a dict space has the key {key!r}, which is not a string or not new"
                 )
-            members[key] = self.build(inner, depth)
+            members[key] = self.build(inner)
         return spaces.Dict(list(members.items()), sort_keys=False)
 
-    def _tuple(self, fields: Description, depth: int) -> gym.Space[Any]:
-        return spaces.Tuple([self.build(inner, depth) for inner in _list(fields["spaces"])])
+    def _tuple(self, fields: Description) -> gym.Space[Any]:
+        return spaces.Tuple([self.build(inner) for inner in _list(fields["spaces"])])
 
-    def _text(self, fields: Description, depth: int) -> gym.Space[Any]:
-        del depth
+    def _text(self, fields: Description) -> gym.Space[Any]:
         longest, charset = _int(fields["max_length"]), fields["charset"]
         if longest > _MAX_TEXT or not isinstance(charset, str):
             raise WireError(f"a text space is longer than {_MAX_TEXT}, or has no charset")

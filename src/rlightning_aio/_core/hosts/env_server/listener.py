@@ -22,12 +22,7 @@ from zmq.auth import Authenticator
 from rlightning_aio._core.hosts.descriptors import READABLE, WakeUp, new_descriptor_set
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.protocol.error_text import LOG
-from rlightning_aio.protocol.net.wire import (
-    DEFAULT_HEARTBEAT,
-    HANDSHAKE_SECONDS,
-    MAX_FRAME_BYTES,
-    ping_ms,
-)
+from rlightning_aio.protocol.net.wire import DEFAULT_HEARTBEAT
 from rlightning_aio.remote.keys import ListedKeys, read_server_keys
 from rlightning_aio.remote.zmq_messages import (
     is_readable,
@@ -35,6 +30,7 @@ from rlightning_aio.remote.zmq_messages import (
     next_message,
     receive_parts,
     send_parts,
+    set_limits,
 )
 
 if TYPE_CHECKING:
@@ -127,18 +123,13 @@ class Listener:
     def _listen(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
         settings = self._settings
         router = self._router = context.socket(zmq.ROUTER)
-        interval, patience, given_to_peer = ping_ms(settings.heartbeat or DEFAULT_HEARTBEAT)
+        set_limits(router, settings.heartbeat or DEFAULT_HEARTBEAT)
         # Messages to a closed connection must fail, not vanish.
         router.set(zmq.ROUTER_MANDATORY, 1)
-        router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         router.set(zmq.SNDHWM, _MAX_UNSENT_PER_CLIENT)
         router.set(zmq.RCVHWM, _MAX_UNREAD_PER_CLIENT)
         router.set(zmq.LINGER, _LINGER_MS)
         router.set(zmq.BACKLOG, _MAX_WAITING_CONNECTIONS)
-        router.set(zmq.HANDSHAKE_IVL, int(1000 * HANDSHAKE_SECONDS))
-        router.set(zmq.HEARTBEAT_IVL, interval)
-        router.set(zmq.HEARTBEAT_TIMEOUT, patience)
-        router.set(zmq.HEARTBEAT_TTL, given_to_peer)
         self._authenticate(context, router)
         host = "127.0.0.1" if settings.host == "localhost" else settings.host
         if ":" in host:

@@ -41,17 +41,12 @@ class EpisodeSums:
     ) -> None:
         self.returns, self.lengths, self.over = returns, lengths, over
         self._autoreset = autoreset
-        self._any_over = False
 
     def begin(self) -> None:
         """Begin new episodes."""
         self.returns[...] = 0.0
         self.lengths[...] = 0
-        self.over[...] = self._any_over = False
-
-    def row_changed(self) -> None:
-        """Read what others wrote into the row."""
-        self._any_over = bool(self.over.any())
+        self.over[...] = False
 
     def step(
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None
@@ -65,7 +60,7 @@ class EpisodeSums:
         Returns:
             A mask of those that reset themselves in this step; None if none did.
         """
-        if ended is None and not self._any_over:
+        if ended is None and not np.count_nonzero(self.over):
             np.add(self.returns, reward, out=self.returns)
             np.add(self.lengths, 1, out=self.lengths)
             return None
@@ -76,7 +71,7 @@ class EpisodeSums:
     ) -> NDArray[np.bool_] | None:
         over = self.over.copy()
         same_step, next_step = self._autoreset == "same_step", self._autoreset == "next_step"
-        some = self._any_over and np.count_nonzero(over) > 0
+        some = np.count_nonzero(over) > 0
         if same_step and some:
             # These already began their next episode.
             self.returns[over] = self.lengths[over] = 0
@@ -95,5 +90,4 @@ class EpisodeSums:
         else:
             now = ended & ~over if next_step else over | ended
         self.over[...] = now
-        self._any_over = np.count_nonzero(self.over) > 0
         return over if next_step and some else None

@@ -74,7 +74,6 @@ class RowWriter:
 
     Attributes:
         holds_tensor: the last observation does, and stays in this process.
-        is_bypassed: the function of `short_stepper` writes into the row, too.
     """
 
     def __init__(
@@ -100,7 +99,6 @@ class RowWriter:
         self._infos = InfoWriter(memoryview(slab.info[row]), announce)
         self._last_out_of_band: OutOfBand = {}
         self.holds_tensor = False
-        self.is_bypassed = False
         self._times = _view(slab.times[row])
         # With an ellipsis, an element of a plain column is a view, too.
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
@@ -133,8 +131,6 @@ class RowWriter:
             ValueError: a shape doesn't fit.
         """
         self._write_times(busy_ns)
-        if self.is_bypassed:
-            self._sums.row_changed()
         self._write_ends(*unpacked(result)[1:4])
         return self._write_data(result, extra, is_fresh=self._hands_over)
 
@@ -162,7 +158,6 @@ class RowWriter:
         slab.over[row, ...] = shown_result.over
         slab.episode_return[row, ...] = shown_result.returns
         slab.episode_length[row, ...] = shown_result.lengths
-        self._sums.row_changed()
         result = shown_result.observation, 0.0, False, False, shown_result.info
         return self._write_data(result, None)
 
@@ -190,7 +185,6 @@ class RowWriter:
             return None
         if self._autoreset != "disabled" and not resets_itself:
             return None
-        self.is_bypassed = True
         one = slice(row, row + 1)
         plain = type(slab.observation) is np.ndarray
         in_row = Row(

@@ -422,9 +422,7 @@ class EnvRunner:
         """Record that the row holds a result that no transition has led to."""
         self._has_result = True
         self._slab.take_seed(self._row)  # Perhaps there still is one, of a reset that was aborted.
-        if self._writer.is_bypassed and self._writer.holds_tensor:
-            # The observations are tensors that stay here, so the writer is needed from now on.
-            self._writer.is_bypassed = False
+        if self._writer.holds_tensor:  # They stay here, so the writer is needed from now on.
             self.step = self._stepper()
 
 
