@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import AttachOrder, Completions
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.exchange import Ring
+    from rlightning_aio.protocol.net.server_session import ServerSessions
     from rlightning_aio.protocol.rings import TrainerBell
     from rlightning_aio.types import EnvMeta
 
@@ -232,10 +233,12 @@ class Server(Protocol):
     Attributes:
         server_id: the id of the entry as a whole.
         connect_timeout: seconds that a call waits for such hosts alone.
+        sessions: of the clients that are there.
     """
 
     server_id: str
     connect_timeout: float
+    sessions: ServerSessions
 
     def address(self) -> str:
         """Return the address that clients connect to, as ``tcp://host:port``.
@@ -243,14 +246,6 @@ class Server(Protocol):
         Raises:
             RuntimeError: it does not listen yet.
         """
-        ...
-
-    def clients(self) -> Mapping[str, str]:
-        """Return the names of the clients that are there, by the ids of their envs."""
-        ...
-
-    def refused(self) -> Mapping[str, str]:
-        """Return why clients were refused for good, by name."""
         ...
 
     def is_readable(self) -> bool:

@@ -431,4 +431,4 @@ class ServerHandle:
     @property
     def clients(self) -> dict[str, str]:
         """Names of the clients that are there, by the ids of their envs."""
-        return dict(self._server.clients())
+        return self._server.sessions.clients()

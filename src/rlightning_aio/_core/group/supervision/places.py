@@ -101,9 +101,9 @@ class Places:
         servers = dict.fromkeys(r.place.server for r in empty if r.place is not None)
         texts: list[str] = []
         for server in servers:
-            here = [f"{client} ({env_id})" for env_id, client in server.clients().items()]
+            here = [f"{client} ({env_id})" for env_id, client in server.sessions.clients().items()]
             texts.append(f"{server.address()} has {', '.join(here) or 'no client'}")
-            texts += [f"refused {name!r}: {why}" for name, why in server.refused().items()]
+            texts += [f"refused {name!r}: {why}" for name, why in server.sessions.refused.items()]
         texts += [one.last_loss.what for one in empty if one.last_loss is not None]
         seconds = max(server.connect_timeout for server in servers)
         away = EnvAway(

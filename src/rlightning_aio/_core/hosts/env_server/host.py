@@ -34,7 +34,7 @@ from rlightning_aio.protocol.net.server_session import ClientPlace, ServerSessio
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -57,7 +57,6 @@ class EnvServer(Shared):
 
     Attributes:
         places: of the entry, in order.
-        sessions: of the clients.
         listener: for them.
     """
 
@@ -98,12 +97,6 @@ class EnvServer(Shared):
 
     def address(self) -> str:
         return self.listener.address
-
-    def clients(self) -> Mapping[str, str]:
-        return self.sessions.clients()
-
-    def refused(self) -> Mapping[str, str]:
-        return self.sessions.refused
 
     def is_readable(self) -> bool:
         return self.listener.is_readable()

@@ -185,18 +185,21 @@ class _ForkServer:
 
     def serve(self) -> None:
         """Serve until the trainer is gone; then end all workers."""
-        while self._step(self._next_due()):
-            pass
+        while True:
+            events = select.POLLIN | select.POLLOUT if self._trainer.waiting else select.POLLIN
+            self._poll.register(self._trainer, events)
+            if not self._step():
+                break
         self._end_all()
 
     def _next_due(self) -> float | None:
         times = [one.kill_at for one in self._children.values() if one.kill_at]
         return min(times, default=None)
 
-    def _step(self, until: float | None) -> bool:
+    def _step(self) -> bool:
+        """Handle what happens next, or kill those whose time is up; False: the trainer is gone."""
+        until = self._next_due()
         timeout = None if until is None else max(0.0, until - time.monotonic()) * 1000
-        events = select.POLLIN | select.POLLOUT if self._trainer.waiting else select.POLLIN
-        self._poll.register(self._trainer, events)
         for descriptor, _ in self._poll.poll(timeout):
             if descriptor == self._trainer_process:
                 return False
@@ -204,18 +207,14 @@ class _ForkServer:
                 self._trainer.flush()
                 if not self._obey():
                     return False
+            elif descriptor == self._wakeup.fileno():
+                with contextlib.suppress(BlockingIOError):
+                    self._wakeup.recv(4096)
             else:
-                self._attend(descriptor)
+                self._forward(descriptor)
         self._kill_due()
         self._handle_exits()
         return True
-
-    def _attend(self, descriptor: int) -> None:
-        if descriptor == self._wakeup.fileno():
-            with contextlib.suppress(BlockingIOError):
-                self._wakeup.recv(4096)
-        else:
-            self._forward(descriptor)
 
     def _obey(self) -> bool:
         try:
@@ -355,17 +354,11 @@ class _ForkServer:
         now = time.monotonic()
         for child in self._children.values():
             child.kill_at = now + child.close_seconds
-        while self._children and (until := self._next_due()) is not None:
-            self._wait_for_children(until)
-            self._kill_due()
+        while self._children and self._next_due() is not None:
+            self._step()
         # The kernel ends those that can't be killed now.
         if self._children:
             kill_below(os.getpid(), but=self._left)
-
-    def _wait_for_children(self, until: float) -> None:
-        for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
-            self._attend(descriptor)
-        self._handle_exits()
 
 
 def _unread(pipe: int) -> int:
