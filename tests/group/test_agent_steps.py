@@ -129,23 +129,6 @@ async def test_a_seed_that_is_no_int_is_refused_even_an_empty_one() -> None:
         assert isinstance(found, ValueError)
 
 
-async def test_two_episodes_of_one_env_that_begin_together_are_one_too_many() -> None:
-    async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
-        one, other = group.env_ids
-        found = await begun([group.episode(one), group.episode(one), group.episode(other)])
-        assert [type(ret) is EnvBusy for ret in found] == [False, True, False]
-        assert group.pending == []
-
-
-async def test_agents_of_a_worker_that_dies_lose_their_own_episodes() -> None:
-    async with rl.build_env_group(Counter, num_workers=4, envs_per_process=2) as group:
-        playing = await episodes(group)
-        found = await stepped(playing, [DIE, GO, GO, GO])
-        assert [type(ret) is EpisodeLost for ret in found] == [True, True, False, False]
-        assert [lost.env_id for lost in found[:2]] == group.env_ids[:2]
-        assert [lost.results.ids() for lost in found[:2]] == [["Counter-0"], ["Counter-1"]]
-
-
 async def test_an_episode_whose_worker_dies_in_its_reset_is_lost() -> None:
     """Its first result is that of a replacement, which has not got its seed."""
     async with rl.build_env_group(Counter, num_workers=1) as group:
@@ -228,16 +211,6 @@ def pause(monkeypatch: pytest.MonkeyPatch, *, share: float, longest: float, many
         monkeypatch.setattr(agent_steps, name, value)
 
 
-async def test_long_steps_that_end_soon_after_each_other_are_one_batch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Where there are hundreds of them."""
-    pause(monkeypatch, share=10, longest=0.5, many=3)
-    async with rl.build_env_group(Long, num_workers=3, placement="loop") as group:
-        await stepped(await episodes(group), [0, 1, 2])
-        assert group.get_stats()["batch_size"] == (1 + 1 + 1 + 3) / 4
-
-
 async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_env(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -255,31 +228,6 @@ async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_
         assert requests.is_idle(0)
         await group.close()
         await asyncio.wait(steps)
-
-
-@pytest.mark.parametrize("place", PLACES, ids=["inline", "workers"])
-async def test_tasks_that_use_handles_have_their_own_results_values_and_errors(
-    place: dict[str, Any],
-) -> None:
-    async with rl.build_env_group(Counter, num_workers=6, **place) as group:
-        await group.reset()
-        envs = [group[env_id] for env_id in group.env_ids]
-        found = await asyncio.gather(
-            envs[0].step(RAISE),
-            envs[1].call("get_attr", "no_such"),
-            envs[2].call("close", "too", "many"),
-            envs[3].get_attr("action_space"),
-            envs[4].reset(seed=-1),
-            envs[5].step(GO),
-            return_exceptions=True,
-        )
-        assert all(isinstance(one, EnvRaised) for one in found[:3])
-        assert [one.env_id for one in found[:3]] == group.env_ids[:3]
-        assert "no_such" in str(found[1])
-        assert found[3] == Counter.action_space
-        assert isinstance(found[4], ValueError)
-        assert found[5].info["count"] == 1
-        assert group.pending == []
 
 
 @pytest.mark.parametrize("action", [GO, RAISE], ids=["result", "error"])

@@ -155,29 +155,6 @@ async def test_extras_reach_the_function_and_the_step(start: Any) -> None:
     assert batch.info()[0]["extras"]["thought"].depth == 3
 
 
-async def test_actions_with_extras_arrive_as_columns_and_one_by_one(start: Any) -> None:
-    """A column that fits the rows, one that fits in part, and an entry that reads no extras."""
-    plain = {**CARTPOLE, "num_workers": 1}
-    group = await start(
-        [PROBE, plain],
-        preprocess_fn=[lambda r: [0, np.sum(r.action) * r.weight], None],
-        mixed_actions=True,
-    )
-    batch, _ = await group.reset()
-    probes = batch.by_entry()["probe"]
-    weight = np.array([10.0, 20.0])
-    for action in (np.array([[0, 2.0], [0, 3.0]]), [[0, 2.0], 3.0], [[0, np.nan], [1, 2.0]]):
-        batch, _ = await group.step(probes.respond(action=action, weight=weight))
-        expected = [10 * np.sum(action[0]), 20 * np.sum(action[1])]
-        assert np.array_equal(batch.reward, expected, equal_nan=True)
-    values = [
-        PolicyResponse("pole-0", 1, weight=1.0),
-        PolicyResponse("probe-1", [0, 4.0], weight=2.0),
-    ]
-    batch, _ = await group.step(BatchedData(["pole-0", "probe-1"], values))
-    assert batch.reward.tolist() == [1.0, 8.0]
-
-
 async def test_extras_that_no_env_reads_are_not_sent(start: Any) -> None:
     """A built-in backend with the default function: extras stay in the trainer."""
     group = await start(CARTPOLE)
@@ -262,30 +239,6 @@ async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
 
 
 # -- several sub-environments, several agents, several kinds of env
-
-
-async def test_sub_environments_have_their_own_axis(start: Any) -> None:
-    """And their own seeds, counted through the group."""
-    batched = {**PROBE, "name": "b", "backend": "batched", "num_envs": 3}
-    group = await start(batched)
-    assert [meta.num_envs for meta in await group.init()] == [3, 3]
-    batch, _ = await group.reset(seed=10)
-    assert batch.observation[:, :, 0].tolist() == [[10, 11, 12], [13, 14, 15]]
-    assert batch.reward.shape == batch.terminated.shape == (2, 3)
-    actions = np.array([[1, 2, 3], [4, 5, 6]])
-    for _ in range(2):
-        batch, _ = await group.step(batch.respond(action=actions))
-    assert batch.reward.tolist() == [[2, 4, 6], [8, 10, 12]]
-    assert batch.terminated.tolist() == [[False] * 3, [False, True, True]]
-    assert batch.done.tolist() == batch.terminated.tolist()
-    value = batch["b-1"]
-    assert value.last_reward.tolist() == [8, 10, 12]
-    assert value.info["episode"]["ended"].tolist() == [False, True, True]
-    assert value.info["episode"]["r"][1:].tolist() == [15, 18]
-    one, _ = await group.reset(seed=10, env_ids=["b-1"])
-    assert one.observation[0, :, 0].tolist() == [13, 14, 15]
-    with pytest.raises(BadAction, match=r"\(2, 3\).*\(2, 2\)"):
-        await group.step(batch.respond(action=np.ones((2, 2), int)))
 
 
 async def test_agents_have_their_own_columns(start: Any) -> None:

@@ -36,8 +36,6 @@ INLINE = {
     "num_workers": 3,
     "placement": "inline",
 }
-# The first loop opens a pipe that libuv keeps, so it is made before the tests.
-uvloop.new_event_loop().close()
 LOOPS = pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
 
 

@@ -384,34 +384,6 @@ async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
         assert "Scripted.step" in caplog.text
 
 
-class Tasked(Scripted):
-    """Can't be reset without a task."""
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.task = options["task"]
-        return await super().reset(seed=seed)
-
-
-@pytest.mark.parametrize("options", [{"task": "a"}, {"task": "b"}], ids=str)
-async def test_a_rebuilt_env_goes_on_with_the_task_of_the_episode_that_was_lost(
-    options: dict[str, Any],
-) -> None:
-    """The one of its last reset, also if several envs were lost in a row."""
-    config = rl.EnvConfig(name="t", task=_tasked, step_timeout=SOON, placement="loop")
-    async with rl.build_env_group(config) as group:
-        await group.reset(seed=1, options={"task": "before"})
-        await group.reset(seed=5, options=options)
-        for built in (2, 3):
-            batch, _ = await group.step(steps(t_0=HANG))
-            assert batch.restarted.all()
-            assert batch.observation.tolist() == [[built, 1, 0, 5]]
-            assert await group["t-0"].get_attr("task") == options["task"]
-
-
-def _tasked() -> Tasked:
-    return Tasked(rl.EnvConfig(name="t", backend="scripted", task="-"))
-
-
 async def test_a_step_that_ends_as_its_time_is_up_has_one_end() -> None:
     """Its time is up in the turn of the loop before the one in which it would have ended."""
     async with rl.build_env_group(entry(step_timeout=SOON)) as group:
