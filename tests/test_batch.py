@@ -130,22 +130,10 @@ def test_ids_and_values_keep_their_order(pairs: list[tuple[str, int]]) -> None:
                 batch[id_]
 
 
-def test_a_batch_can_be_made_from_a_mapping() -> None:
-    """In the order of the mapping."""
-    batch = BatchedData.from_dict({"b": 1, "a": 2})
-    assert list(batch) == [("b", 1), ("a", 2)]
-
-
 def test_every_value_has_an_id() -> None:
     """Otherwise it raises."""
     with pytest.raises(ValueError, match="2 ids for 1 values"):
         BatchedData(["a", "b"], [1])
-
-
-def test_an_empty_batch_is_a_batch() -> None:
-    """It has no ids, values or columns."""
-    batch = BatchedData()
-    assert (len(batch), batch.ids(), batch.values(), list(batch)) == (0, [], [], [])
 
 
 # -- columns of results
@@ -204,42 +192,6 @@ def test_each_entry_of_a_mixed_batch_stacks() -> None:
         "grid-world": [1],
         "pendulum": [2],
     }
-
-
-def test_infos_are_decoded_with_the_schemas_of_their_env() -> None:
-    """From the row by the worker's schema, out of band, or empty."""
-    schema = InfoSchema.of({"x": 1.5})
-    assert schema is not None
-    rows = np.zeros((3, schema.size), np.uint8)
-    rows[0] = np.frombuffer(np.float64(2.5).tobytes(), np.uint8)
-    batch = results(
-        columns(
-            [0, 1, 2],
-            np.zeros((3, 2)),
-            info=rows,
-            info_marks=np.array([1, 255, 0], np.uint8),
-            schemas=[{1: schema}, {}, {}, {}, {}],
-            out_of_band={1: {"info": {"text": "hi"}}},
-        )
-    )
-    assert batch.info() == [{"x": 2.5}, {"text": "hi"}, {}]
-    assert [value.info for value in batch.values()] == batch.info()
-
-
-def test_the_last_result_of_an_episode_has_its_sums() -> None:
-    """Return and length are in the info of that result only."""
-    batch = results(
-        columns(
-            [0, 1],
-            np.zeros((2, 2)),
-            flags=flags((2,), terminated=[False, True]),
-            episode_return=np.array([9.0, 4.5]),
-            episode_length=np.array([7, 3]),
-        )
-    )
-    assert batch.info() == [{}, {"episode": {"r": 4.5, "l": 3}}]
-    assert batch.done.tolist() == [False, True]
-    assert batch["pendulum-1"].last_terminated is True
 
 
 def test_a_multi_agent_batch_has_columns_by_agent() -> None:
@@ -501,20 +453,24 @@ def test_plain_values_have_no_columns_of_a_group(name: str) -> None:
             getattr(batch, name)
 
 
-def test_an_episode_cut_by_the_step_limit_is_done() -> None:
-    """It has its sums."""
+def test_the_last_result_of_an_episode_has_its_sums() -> None:
+    """Return and length are in the info of that result only, also if the step limit has cut it."""
     batch = results(
         columns(
-            [0, 1, 2],
-            np.zeros((3, 1)),
-            flags=flags((3,), truncated=[True, True, False]),
-            limit_reached=np.array([False, True, False]),
-            episode_return=np.array([1.0, 2.0, 3.0]),
-            episode_length=np.array([4, 5, 6]),
+            [0, 1, 2, 3],
+            np.zeros((4, 1)),
+            flags=flags(
+                (4,), terminated=[True, False, False, False], truncated=[False, True, True, False]
+            ),
+            limit_reached=np.array([False, False, True, False]),
+            episode_return=np.array([4.5, 1.0, 2.0, 3.0]),
+            episode_length=np.array([3, 4, 5, 6]),
         )
     )
-    assert batch.done.tolist() == [True, True, False]
-    assert batch.info("episode", None) == [{"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
+    assert batch.done.tolist() == [True, True, True, False]
+    sums = [{"r": 4.5, "l": 3}, {"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
+    assert batch.info("episode", None) == sums
+    assert [value.info.get("episode") for value in batch.values()] == sums
 
 
 # -- sent columns
@@ -657,13 +613,6 @@ def test_a_name_without_values_raises_even_with_rows_without_requests() -> None:
         sent.valeu  # noqa: B018
 
 
-def test_sent_columns_can_be_copied_and_pickled() -> None:
-    """With their batch, for another thread or process."""
-    sent = sent_for(2, {"action": np.arange(2)}, of_rows=[0, 0], rows=[1, 0])
-    for one in (copy.copy(sent), copy.deepcopy(sent), pickle.loads(pickle.dumps(sent))):
-        assert one.action.tolist() == [1, 0]
-
-
 # -- infos
 
 
@@ -766,15 +715,6 @@ def test_no_info_changes_or_hides_another(infos: list[dict[Any, Any]]) -> None:
             assert repr(one.tolist()) == repr(other[::-1].tolist())
 
     check_reverse(found, reverse)
-
-
-def test_the_dtype_of_a_column_holds_its_widest_value() -> None:
-    """Not only the first value."""
-    infos = [{"a": 3, "b": True, "c": 1}, {"a": 3.5, "b": 3, "c": "one"}, {"a": 2}]
-    found = infos_of(infos)
-    assert found["a"].tolist() == [3.0, 3.5, 2.0]
-    assert (found["b"].dtype, found["b"].tolist()) == (np.int64, [1, 3, 0])
-    assert (found["c"].dtype, found["c"].tolist()) == (object, [1, "one", None])
 
 
 alike = {
