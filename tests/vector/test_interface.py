@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-import signal
 import threading
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -24,7 +23,7 @@ from gymnasium.error import (
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from kit.scripted import Awaited
 from patience import HANG
-from vector.toys import Toy, assert_alike, press_ctrl_c, toy
+from vector.toys import Toy, assert_alike, toy
 
 from rlightning_aio import sync
 from rlightning_aio.errors import BadAction, ConfigError, EnvRaised, StartFailed
@@ -359,63 +358,6 @@ def test_an_unknown_autoreset_mode_is_refused_with_the_known_ones() -> None:
     for make in (partial(VectorEnv, [Plain]), partial(make_vec, POLE)):
         with pytest.raises(ValueError, match=r"autoreset_mode .*'SameStep'.*not 'same_step'"):
             make(autoreset_mode="same_step")
-
-
-class Interrupting(Plain):
-    """Action 1 presses Ctrl-C while the trainer waits for it."""
-
-    def __init__(self, trainer: int) -> None:
-        super().__init__()
-        self.trainer = trainer
-
-    def step(self, action: Any) -> Any:
-        if action == 1 and self.trainer == os.getpid():
-            signal.raise_signal(signal.SIGINT)
-        elif action == 1:
-            press_ctrl_c(self.trainer)
-        return super().step(action)
-
-
-@pytest.mark.parametrize("placement", ["inline", "process"])
-def test_after_ctrl_c_it_is_reset(placement: str) -> None:
-    """A step would hide from the program what the interrupted one returned: an end, for example.
-    No other call is made, either.
-    """
-    trainer = os.getpid()
-    env = VectorEnv([lambda: Interrupting(trainer)] * 2, placement=placement)
-    first, _ = env.reset(seed=0)
-    for actions in ([1, 0], [0, 1]):
-        with pytest.raises(KeyboardInterrupt):
-            env.step(actions)
-        mask = {"reset_mask": np.array([True, False])}
-        for ask in (
-            partial(env.step, [0, 0]),
-            partial(env.step_async, [0, 0]),
-            partial(env.reset, options=mask),
-            partial(env.get_attr, "count"),
-            env.snapshot,
-        ):
-            with pytest.raises(ResetNeeded, match="interrupted"):
-                ask()
-        np.testing.assert_array_equal(env.reset(seed=0)[0], first)
-    env.step([0, 0])
-    env.close()
-
-
-@pytest.mark.parametrize("placement", ["inline", "process"])
-def test_after_ctrl_c_a_state_can_be_restored(placement: str) -> None:
-    """As a reset: it drops what was in flight."""
-    trainer = os.getpid()
-    env = VectorEnv([lambda: Interrupting(trainer)] * 2, placement=placement)
-    env.reset(seed=0)
-    kept = env.snapshot()
-    expected = env.step([0, 0])
-    env.restore(kept)
-    with pytest.raises(KeyboardInterrupt):
-        env.step([1, 0])
-    env.restore(kept)
-    assert_alike(env.step([0, 0]), expected)
-    env.close()
 
 
 def test_a_tuple_of_actions_is_one_for_each_env() -> None:

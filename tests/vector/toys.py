@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
-from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -130,10 +128,3 @@ def assert_alike(found: Any, expected: Any, where: str = "") -> None:
             assert same, f"{where}: {found}, not {expected}"
     else:
         assert found == expected, where
-
-
-def press_ctrl_c(trainer: int) -> None:
-    """Press it once that process sleeps, that is, waits for envs."""
-    while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
-        time.sleep(0.001)
-    os.kill(trainer, signal.SIGINT)
