@@ -333,31 +333,6 @@ def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
         group.collect_async()
 
 
-@pytest.mark.parametrize("placement", ["inline", "process"])
-@pytest.mark.parametrize("error", [RuntimeError("no memory"), KeyboardInterrupt()])
-def test_nothing_is_left_of_an_evaluation_that_ends_in_an_error(
-    placement: str, error: BaseException
-) -> None:
-    """The next one begins anew, with what an undisturbed one finds."""
-    calls = 0
-
-    def fails(batch: rl.BatchedData) -> Any:
-        nonlocal calls
-        calls += 1
-        if calls == 5:
-            raise error
-        return nothing(batch)
-
-    with group_of(*HALF_SUCCEED, placement=placement) as group:
-        whole = evaluate(group, nothing, 2, seed=0)
-        with pytest.raises(type(error)):
-            evaluate(group, fails, 2, seed=0, min_results=1)
-        assert group.pending == []
-        again = evaluate(group, nothing, 2, seed=0)
-    assert by_number(again) == by_number(whole)
-    assert not again.failures
-
-
 def test_a_step_that_takes_too_long_for_an_evaluation_that_has_ended_is_aborted() -> None:
     """Its episode is no loss of the next one."""
     hanging = False

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import os
 import subprocess
-import time
 from collections import Counter
 from concurrent.futures import Executor, Future
 from dataclasses import replace
@@ -17,7 +14,7 @@ import gymnasium as gym
 import imageio_ffmpeg
 import numpy as np
 import pytest
-from kit.scripted import DIE, GO, HANG, RAISE, Awaitable, Scripted
+from kit.scripted import DIE, DIE_LATER, GO, HANG, RAISE, Awaitable, Awaited, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -206,131 +203,30 @@ def test_only_the_env_at_fault_is_charged_an_attempt(breaks: int) -> None:
     assert played == [("1", 8), ("1", 9), ("3", 8), ("3", 9)]
 
 
-class Bad(gym.Env[Any, Any]):
-    """Its steps take a while, and those of the first env fail at once."""
-
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    def __init__(self, *, is_bad: bool) -> None:
-        self.is_bad = is_bad
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return 0, {}
-
-    def step(self, action: Any) -> Any:
-        if self.is_bad:
-            raise OSError("it is broken")
-        time.sleep(0.01)
-        return 0, 1.0, True, False, {}
-
-
 def test_an_env_that_is_broken_rests_while_others_play() -> None:
-    makers = [partial(Bad, is_bad=k == 0) for k in range(3)]
+    makers = [partial(Tasks, breaks={"1": RAISE}), Tasks, Tasks]
     group = sync.build_env_group(makers, envs_per_process=1, max_restarts=99)
-    queue = [EpisodeSpec("", seed) for seed in range(60)]
-    with group:
-        found = evaluate(group, None, queue, min_results=1, retries=0)
-        assert {one.env_id for one in found.failed} == {group.env_ids[0]}
+    found = evaluated(group, [EpisodeSpec("1", 40 + k) for k in range(60)], retries=0)
+    assert {one.env_id for one in found.failed} == {group.env_ids[0]}
     assert 3 <= len(found.failed) <= 6
 
 
-class AwaitableTasks:
-    """In the first life of its worker, steps wait for ever; one of task 2 then ends the worker.
-
-    It ends in the code of that step, or, if `nobodys`, while no env's code runs.
-    """
-
-    switches_task = True
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    waiting: ClassVar[int] = 0
-    both_wait: ClassVar = asyncio.Event()
-
-    def __init__(self, first_life: Path, *, nobodys: bool) -> None:
-        self._first_life, self._nobodys, self._task = first_life, nobodys, "1"
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self._task = (options or {}).get("task", self._task)
-        return np.zeros(1), {}
-
-    async def step(self, action: Any) -> Any:
-        if self._task == "2":
-            await AwaitableTasks.both_wait.wait()
-            self._first_life.unlink(missing_ok=True)
-            if not self._nobodys:
-                os._exit(3)
-            asyncio.get_running_loop().call_soon(os._exit, 3)
-            await asyncio.Event().wait()
-        elif self._first_life.exists():
-            AwaitableTasks.waiting += 1
-            if AwaitableTasks.waiting == 2:
-                self.both_wait.set()
-            await asyncio.Event().wait()
-        return np.zeros(1), 1.0, True, False, {}
-
-
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
-@pytest.mark.parametrize("nobodys", [False, True])
 def test_all_that_waited_are_charged_an_attempt_where_no_env_is_at_fault(
-    tmp_path: Path, nobodys: bool, on_worker_death: str
+    on_worker_death: str,
 ) -> None:
-    """Of awaitable envs that share a worker, only the one whose code ran, or all that waited."""
-    (first_life := tmp_path / "first life").touch()
-    group = group_of(
-        3,
-        task=partial(AwaitableTasks, first_life, nobodys=nobodys),
-        placement="process",
-        envs_per_process=3,
-        on_worker_death=on_worker_death,
+    fields = {"placement": "process", "envs_per_process": 3, "on_worker_death": on_worker_death}
+    deeds = [HANG, HANG, DIE_LATER]
+    queue = [EpisodeSpec("", seed) for seed in range(3)]
+    found = evaluated(
+        group_of(3, task=Awaited, **fields),
+        queue,
+        policy=lambda batch: deeds,
+        min_results=3,
+        retries=0,
     )
-    queue = [EpisodeSpec(task, 0) for task in "123"]
-    charged = ["1", "2", "3"] if nobodys else ["2"]
-    if on_worker_death == "raise" and not nobodys:  # No env is left for the others.
-        with pytest.raises(rl.WorkerDied, match="exited with code 3"):
-            evaluated(group, queue, retries=0)
-        return
-    found = evaluated(group, queue, retries=0)
-    assert sorted(one.spec.task for one in found.failed) == charged
-    assert found.failures.total() == len(charged)
-    played = sorted(one.spec.task for one in found.played)
-    assert played == [task for task in "123" if task not in charged]
-
-
-class Poisoned:
-    """The second step of seed 1 ends its worker, while all envs in that wait."""
-
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.seed, self.steps = seed, 0
-        return 0, {}
-
-    async def step(self, action: Any) -> Any:
-        self.steps += 1
-        if (self.seed, self.steps) == (1, 2):
-            asyncio.get_running_loop().call_later(0.02, os._exit, 3)
-            await asyncio.Event().wait()
-        await asyncio.sleep(0.01)
-        return 0, 1.0, self.steps == 4, False, {}
-
-
-@pytest.mark.parametrize("pinned", [False, True])
-def test_what_was_executed_in_a_worker_that_died_is_played_again_alone(pinned: bool) -> None:
-    """So the second death names the task."""
-    with sync.build_env_group(Poisoned, num_workers=4, envs_per_process=2) as group:
-        ids = group.env_ids if pinned else [""]
-        queue = [EpisodeSpec("", k, env_id=ids[k % len(ids)]) for k in range(12)]
-        found = evaluate(group, None, queue, min_results=1)
-    (failed,) = found.failed
-    assert [one.blame for one in (*failed.failures, failed.outcome)][:2] == [
-        "infrastructure",
-        "env",
-    ]
-    assert failed.spec.seed == 1
-    assert {one.spec.seed for one in found.played} == {*range(12)} - {1}
-    assert all(len(one.failures) <= 1 for one in found.played)
+    assert [one.outcome.blame for one in found.failed] == ["infrastructure"] * 3
+    assert found.failures == {"env_died": 3}
 
 
 @pytest.mark.parametrize("together", [1, 2])
@@ -387,35 +283,6 @@ def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None
     }  # fmt: skip
     with pytest.raises(rl.ConfigError, match=r"belongs to .*nothing.*, not to .*other"):
         ResultsFile(path, {"policy": "other"})
-
-
-class Dark(Scripted):
-    """Can be reset while there is light."""
-
-    light: ClassVar[bool] = False
-
-    def observed(self) -> Any:
-        if not Dark.light:
-            raise ConnectionError("it is dark")
-        return np.zeros(1)
-
-
-def go(batch: rl.BatchedData) -> list[int]:
-    return [GO] * len(batch)
-
-
-def test_episodes_that_have_failed_are_played_again_when_it_resumes(tmp_path: Path) -> None:
-    """They failed by no fault of the policy; the others are not."""
-    entry = {"name": "e", "task": Dark, "placement": "inline", "max_episode_steps": 3}
-    queue, file = [EpisodeSpec("", seed) for seed in range(4)], tmp_path / "results.jsonl"
-    for light, failed in ((False, 4), (True, 0), (False, 0)):
-        Dark.light = light
-        with (
-            sync.build_env_group({**entry, "on_env_error": "restart"}) as group,
-            ResultsFile(file) as results,
-        ):
-            found = evaluate(group, go, queue, retries=0, results=results)
-        assert (len(found.attempts), len(found.failed)) == (4, failed)
 
 
 def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.attempts import Attempt, EpisodeSpec, ResultsFile, Rules, play
-from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.attempts.rules import is_unnamed
@@ -180,70 +179,46 @@ async def test_an_agent_that_raises(error: Exception, blame: str) -> None:
     assert len(attempt.failures) == (blame == "infrastructure")
 
 
-LIMITS = 0.3, 3.0, 30.0
-"""Of attempts, in turn, until one leaves the agent time to begin; the machine may be busy."""
+@pytest.mark.parametrize(
+    ("steps", "deed", "on_timeout", "kind", "blame", "reward"),
+    [
+        (1, "think", "fail", "timed_out", "either", None),
+        (1, "think", "end", "truncated", "policy", 1.0),
+        (0, "think", "end", "timed_out", "either", None),
+        (2, "hang", "end", "env_hung", "either", None),
+        (2, "raise", "fail", "env_raised", "either", None),
+        (2, "raise", "end", "env_raised", "either", None),
+        (0, "finish", "fail", "truncated", "policy", 7.0),
+        (2, "finish", "end", "truncated", "policy", 7.0),
+        (5, "finish", "fail", "terminated", "policy", 7.0),
+    ],
+)
+async def test_an_agent_that_takes_too_long(
+    steps: int, deed: str, on_timeout: Any, kind: str, blame: str, reward: float | None
+) -> None:
+    """Nothing to grade is no end, and what was earned counts for nothing if the env is lost. An
+    agent that has finished has its reward.
+    """
 
-
-@pytest.mark.parametrize("on_timeout", ["fail", "end"])
-async def test_an_agent_that_takes_too_long(place: dict[str, Any], on_timeout: Any) -> None:
     async def agent(episode: AttemptEpisode) -> None:
-        await episode.step(3)
+        for _ in range(steps):
+            await episode.step(1)
+        if deed == "finish":
+            episode.finish(7)
+        elif deed != "think":
+            with contextlib.suppress(rl.EnvRaised):
+                await episode.step(deed)
         thinking.append(time.monotonic())
         await asyncio.sleep(3600)
 
     thinking: list[float] = []
-    async with rooms(place) as group:
-        limits = iter(LIMITS)
-        while not thinking:
-            limit, began = next(limits), time.monotonic()
-            rules = Rules(attempt_timeout=limit, on_timeout=on_timeout, retries=0)
-            ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
-    if on_timeout == "end":
-        assert (attempt.outcome.kind, attempt.reward) == ("truncated", 3.0)
-    else:
-        assert (attempt.outcome.kind, attempt.outcome.blame) == ("timed_out", "either")
-        assert attempt.reward is None
-    assert attempt.outcome.seconds.agent > began + limit - thinking[0]
-
-
-@pytest.mark.parametrize("on_timeout", ["fail", "end"])
-async def test_the_time_of_an_agent_that_has_lost_its_env_ends_without_a_reward(
-    on_timeout: Any,
-) -> None:
-    """What it had earned before counts as little as after any other failure."""
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await episode.step(3)
-        with contextlib.suppress(rl.EnvRaised):
-            await episode.step("raise")
-        thinking.append(time.monotonic())
-        await asyncio.sleep(3600)
-
-    thinking: list[float] = []
+    rules = Rules(attempt_timeout=1.0, on_timeout=on_timeout, retries=0)
     async with rooms(PLACES["loop"]) as group:
-        limits = iter(LIMITS)
-        while not thinking:
-            rules = Rules(attempt_timeout=next(limits), on_timeout=on_timeout, retries=0)
-            ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
-    assert (attempt.outcome.kind, attempt.reward) == ("env_raised", None)
-    assert attempt.rewards == [3.0]
-
-
-async def test_an_agent_has_its_time_to_end_after_the_event_loop_was_blocked(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    async def agent(episode: AttemptEpisode) -> None:
-        try:
-            await asyncio.Event().wait()
-        finally:
-            time.sleep(1.0)  # noqa: ASYNC251  # It blocks the loop.
-            for _ in range(9):
-                await asyncio.sleep(0)
-
-    async with rooms(PLACES["loop"]) as group:
-        ((attempt,),) = await played(group, tasks(1), agent, 1, Rules(attempt_timeout=0.1))
-    assert attempt.outcome.kind == "timed_out"
-    assert "continues although it was cancelled" not in caplog.text
+        began = time.monotonic()
+        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
+    assert (attempt.outcome.kind, attempt.outcome.blame) == (kind, blame)
+    assert (attempt.reward, attempt.length) == (reward, steps)
+    assert attempt.outcome.seconds.agent > began + 1.0 - thinking[0]
 
 
 @pytest.mark.parametrize("what", ["a step", "a step that was not sent", "a call"])
@@ -323,29 +298,6 @@ async def test_an_iterator_that_is_left_open_logs_no_error(
     assert not [text for text in caplog.messages if "raised" in text or "retrieved" in text]
 
 
-async def test_an_iterator_that_is_left_does_not_wait_for_an_env_that_closes() -> None:
-    """It has raised, and another takes its place; the group waits for that, when it asks next."""
-    closing, closed = asyncio.Event(), asyncio.Event()
-
-    class Slow(AwaitedRoom):
-        async def close(self) -> None:
-            closing.set()
-            await closed.wait()
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await episode.step("raise")
-
-    fields: dict[str, Any] = {"on_env_error": "restart", "max_restarts": 0, "close_timeout": 1e3}
-    async with rl.build_env_group(task=Slow, placement="loop", num_workers=1, **fields) as group:
-        waiting = asyncio.ensure_future(anext(play(group, tasks(1), agent)))
-        await closing.wait()
-        waiting.cancel()
-        await asyncio.wait([waiting], timeout=HANG)
-        closed.set()
-        assert waiting.cancelled()
-        assert group.pending == []
-
-
 @pytest.mark.parametrize("retries", [0, 2])
 async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
     async def agent(episode: AttemptEpisode) -> None:
@@ -355,32 +307,6 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
         with pytest.raises(rl.WorkerDied) as caught:
             await played(group, tasks(9), agent, 2, Rules(retries=retries))
     assert any("it played attempt" in note and "seed=" in note for note in caught.value.__notes__)
-
-
-@pytest.mark.parametrize("deed", ["reset", "step", "call"])
-async def test_an_env_that_never_answers_is_free_for_the_next_attempt(
-    place: dict[str, Any], deed: str
-) -> None:
-    """Nothing but the attempt has a time limit."""
-    if place.get("placement") == "inline":
-        pytest.skip("a step that hangs here is the end of the test")
-    async with rooms(place, num_workers=1) as group:
-        await cut_off_and_play_on(group, deed)
-
-
-async def cut_off_and_play_on(group: rl.EnvGroup, deed: str) -> None:
-    """Cut an attempt off in whose reset, step or call the env hangs, and play another."""
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await (episode.call("stall") if deed == "call" else episode.step("hang"))
-
-    (spec,) = tasks(1, **({"reset": "hang"} if deed == "reset" else {}))
-    rules = Rules(attempt_timeout=0.3, retries=0)
-    ((cut,),) = await asyncio.wait_for(played(group, [spec], agent, 1, rules), HANG)
-    assert group.pending == []
-    ((attempt,),) = await asyncio.wait_for(played(group, tasks(2)[1:], earner), HANG)
-    assert (cut.outcome.kind, cut.reward) == ("timed_out", None)
-    assert (attempt.outcome.kind, attempt.reward) == ("terminated", 5.0)
 
 
 async def test_clients_of_an_env_server_play() -> None:
@@ -557,30 +483,6 @@ async def test_an_agent_finishes(reward: float | None, steps: int) -> None:
     assert attempt.reward == (2.0 if reward is None else reward)
 
 
-@pytest.mark.parametrize(("steps", "kind"), [(0, "truncated"), (2, "truncated"), (5, "terminated")])
-@pytest.mark.parametrize("on_timeout", ["fail", "end"])
-async def test_an_agent_that_has_finished_has_its_reward_when_its_time_is_over(
-    steps: int, kind: str, on_timeout: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It has something to do after that, which takes too long."""
-
-    def ran(attempt: AttemptInPlay) -> float:
-        return math.inf if attempt.is_finished else 0.0
-
-    monkeypatch.setattr(AttemptInPlay, "ran", ran)
-
-    async def agent(episode: AttemptEpisode) -> None:
-        for _ in range(steps):
-            await episode.step(1)
-        episode.finish(7)
-        await asyncio.Event().wait()
-
-    rules = Rules(attempt_timeout=0.05, on_timeout=on_timeout)
-    async with rooms(PLACES["loop"]) as group:
-        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
-    assert (attempt.outcome.kind, attempt.reward, attempt.length) == (kind, 7.0, steps)
-
-
 # -- what is lost ---------------------------------------------------------------------
 
 
@@ -722,22 +624,6 @@ async def test_what_moves_something_real_is_not_reset_ahead() -> None:
     async with rl.build_env_group(Slow, name="box", num_workers=4, placement="loop") as group:
         await played(group, tasks(6), agent, 1, Rules(max_concurrency=1))
     assert counts == [1, 2, 3, 4, 5, 6]
-
-
-async def test_an_attempt_whose_turn_never_came_is_cancelled() -> None:
-    async def agent(episode: AttemptEpisode) -> None:
-        while Slow.began < 2 or not episode.spec.seed:  # noqa: ASYNC110  # The others wait.
-            await asyncio.sleep(0)
-        await once(episode)
-
-    Slow.began = 0
-    async with rl.build_env_group(Slow, name="box", num_workers=4, placement="loop") as group:
-        specs = [EpisodeSpec("", 1)]
-        rules = Rules(max_concurrency=1, first=1)
-        (found,) = await played(group, specs, agent, 2, rules)
-        assert [one.outcome.kind for one in found] == ["terminated", "cancelled"]
-        assert group.pending == []
-        assert len(await played(group, specs, once, 4)) == 1
 
 
 class Poisoned(AwaitedRoom):
@@ -1075,21 +961,6 @@ async def test_time_in_the_queue_of_the_entry_is_not_the_attempts() -> None:
     async with rooms(PLACES["loop"], 8, max_concurrency=1) as group:
         (attempts,) = await played(group, tasks(1), agent, 8, Rules(attempt_timeout=2.0))
     assert [attempt.outcome.kind for attempt in attempts] == ["terminated"] * 8
-
-
-@pytest.mark.parametrize(
-    ("steps", "deed", "kind"), [(0, "think", "timed_out"), (2, "hang", "env_hung")]
-)
-async def test_nothing_to_grade_is_no_end(steps: int, deed: str, kind: str) -> None:
-    async def agent(episode: AttemptEpisode) -> None:
-        for _ in range(steps):
-            await episode.step(1)
-        await (asyncio.sleep(3600) if deed == "think" else episode.step(deed))
-
-    rules = Rules(attempt_timeout=2.0, on_timeout="end", retries=0)
-    async with rooms(PLACES["loop"]) as group:
-        ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
-    assert (attempt.outcome.kind, attempt.outcome.blame, attempt.reward) == (kind, "either", None)
 
 
 async def test_what_is_not_asynchronous_is_refused() -> None:
