@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, run, write_config
-from cli.stub_envs import Stub
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
 
 
 def test_rollout_prints_the_numbers_of_each_entry(tmp_path: Path) -> None:
@@ -51,24 +48,6 @@ def test_stdout_is_one_json_document(tmp_path: Path) -> None:
     assert numbers["envs/episode_returns"] == numbers["envs/episode_lengths"] > 1
     assert document["steps_per_second"] == pytest.approx(500 / document["seconds"])
     assert "collecting 500 steps" in done.stderr
-
-
-@pytest.mark.parametrize("num_envs", [1, 3])
-@pytest.mark.parametrize("episode_length", [1, 4, 1000])
-def test_resets_are_not_counted_as_steps(
-    tmp_path: Path, episode_length: int, num_envs: int
-) -> None:
-    """Steps of sub-environments count individually."""
-    kwargs = {"episode_length": episode_length}
-    config = write_config(
-        tmp_path, {**STUB, "num_workers": 3, "num_envs": num_envs, "env_kwargs": kwargs}
-    )
-    Stub.steps = 0
-    document = invoke_json("rollout", config, "--steps", 90, "--min-results", 1)
-    assert document["steps"] == 90
-    # Steps that were sent but not collected may have been executed or not.
-    assert 90 <= Stub.steps <= 90 + 3 * num_envs
-    assert document["metrics"]["envs/outcomes_terminated"] <= 90 // episode_length
 
 
 def test_a_seed_repeats_a_rollout(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_every_task_equals_gymnasiums(task: str) -> None:
 def test_options_have_the_same_effect_as_in_gymnasium(task: str) -> None:
     """All arguments of the constructor of a task."""
 
-    @settings(max_examples=3)
+    @settings(max_examples=settings.default.max_examples // 6)
     @given(OPTIONS[task], st.integers(0, 1000))
     def check(options: dict[str, Any], seed: int) -> None:
         compare(task, options, seed, 15)

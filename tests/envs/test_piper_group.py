@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -130,41 +126,6 @@ def test_an_invalid_action_stops_a_moving_arm(monkeypatch: pytest.MonkeyPatch, p
             assert np.abs(arm.joints - arm.targets).max() < 0.1, "it holds where it is"
             with pytest.raises(EnvRaised, match=r"the arm is stopped; reset\(\) starts it again"):
                 step([*READY[:5], 0.1, 0.0])
-
-
-@pytest.mark.parametrize(
-    ("death", "placement", "said"),
-    [
-        (signal.SIGKILL, "process", b""),
-        (signal.SIGTERM, "process", b""),
-        (signal.SIGKILL, "inline", b"has stopped it: the program that drove it has ended\n"),
-    ],
-)
-def test_the_arm_stops_when_its_trainer_dies(
-    death: signal.Signals, placement: str, said: bytes
-) -> None:
-    """By any signal; the worker makes the safe stop, or without one the watchdog, which says so."""
-    arm = WatchedArm()
-    script = Path(__file__).with_name("piper_trainer.py")
-    command, pipe = [sys.executable, script], subprocess.PIPE
-    with (
-        contextlib.closing(SlcanPort()) as port,
-        running(arm, port),
-        subprocess.Popen([*command, port.path, placement], stdout=pipe, stderr=pipe) as trainer,
-    ):
-        assert trainer.stdout
-        assert trainer.stderr
-        assert trainer.stdout.readline() == b"moving\n"
-        assert not arm.emergency_stopped
-        trainer.send_signal(death)
-        trainer.wait()
-        assert arm.wait_for(lambda: arm.emergency_stopped)
-        # Its worker, which has this pipe as well, must be gone before the port is: a stop that
-        # the lost port can't take is said again to whatever arm has its path then.
-        while trainer.stdout.readline():
-            pass
-        assert said in trainer.stderr.read()
-        assert np.abs(arm.joints - arm.targets).max() == 0
 
 
 @pytest.mark.parametrize("killed", ["worker", "fork server"])
