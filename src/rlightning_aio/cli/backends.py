@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from operator import attrgetter
+from typing import Any
 
 from rich.text import Text
 
 from rlightning_aio.cli.options import AsJson
 from rlightning_aio.cli.terminal import named_columns, print_json, print_table
 from rlightning_aio.registry import BACKENDS, Backend, plugins
-
-
-@dataclass(frozen=True, slots=True)
-class _Row:
-    name: str
-    installed: bool
-    package: str
-    version: str | None
-    install: str
 
 
 def backends(as_json: AsJson = False) -> None:
@@ -35,22 +26,29 @@ def backends(as_json: AsJson = False) -> None:
     """
     rows = [_row(backend) for backend in (*BACKENDS.values(), *_plugged_in())]
     if as_json:
-        print_json([asdict(row) for row in rows])
+        print_json(rows)
         return
     table = named_columns("Backends", "backend", "package", "install", texts=["package", "install"])
     for row in rows:
         # Texts, because Rich would take an extra's brackets for markup.
+        found = row["version"]
         table.add_row(
-            row.name,
-            Text(f"{row.package} {row.version or 'not installed'}", "" if row.version else "dim"),
-            Text(row.install, "dim" if row.version else ""),
+            row["name"],
+            Text(f"{row['package']} {found or 'not installed'}", "" if found else "dim"),
+            Text(row["install"], "dim" if found else ""),
         )
     print_table(table)
 
 
-def _row(backend: Backend) -> _Row:
+def _row(backend: Backend) -> dict[str, Any]:
     version = backend.installed_version()
-    return _Row(backend.name, version is not None, backend.module, version, backend.install)
+    return {
+        "name": backend.name,
+        "installed": version is not None,
+        "package": backend.module,
+        "version": version,
+        "install": backend.install,
+    }
 
 
 def _plugged_in() -> list[Backend]:

@@ -16,8 +16,12 @@ import numpy as np
 
 from rlightning_aio.cli.measuring import Round, Rule, as_round
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
-from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
-from rlightning_aio.policies.random_actions import sampler_of
+from rlightning_aio.policies.random_actions import (
+    allowed_action,
+    can_be_masked,
+    has_masks,
+    sampler_of,
+)
 from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvRet
 

@@ -35,8 +35,7 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.config.documents import parse_configs
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.policies.masks import allowed_action
-from rlightning_aio.policies.random_actions import sampler_of
+from rlightning_aio.policies.random_actions import allowed_action, sampler_of
 from rlightning_aio.protocol.bounds import out_of_bounds
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse

@@ -1,21 +1,24 @@
-"""`RandomPolicy`: random actions, as a policy.
+"""`RandomPolicy`: random actions, as a policy, which obey action masks.
 
-Sampling works on whole columns, so its cost hardly grows with the batch.
+Sampling works on whole columns, so its cost hardly grows with the batch. As in PettingZoo and
+Gymnasium, a mask is ``action_mask`` in the info or in a dict observation (of the agent, if there
+are several). 1 stands for an allowed action.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.policies.masks import allowed_action, can_be_masked, has_masks
-from rlightning_aio.trees import index, mapped, stacked, tree_of, walked
+from rlightning_aio.trees import index, is_dict, mapped, stacked, tree_of, walked
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from rlightning_aio.batch import BatchedData
 
@@ -30,7 +33,7 @@ class RandomPolicy:
     """Samples actions from the envs' spaces.
 
     Numbers are uniform; without a bound they are small, or near the other bound. Envs whose first
-    result has an ``action_mask`` (see `masks`) get discrete actions that it allows, or any if it
+    result has an ``action_mask`` get discrete actions that it allows, or any if it
     allows none. One generator serves all envs in the order of their results.
 
     Args:
@@ -125,3 +128,65 @@ def _box(space: Any, rng: np.random.Generator) -> Sampler:
     first = known.where(np.isfinite(low), low, np.minimum(high, _UNBOUNDED) - 2 * _UNBOUNDED)
     span = known.where(np.isfinite(span), span, 2 * _UNBOUNDED)
     return lambda n: (first + span * rng.random((n, *space.shape))).astype(space.dtype)
+
+
+# -- masks ---------------------------------------------------------------------------------
+
+
+def can_be_masked(space: gym.Space[Any]) -> bool:
+    """Return True if actions of `space`, or of an agent in it, are discrete."""
+    parts = space.spaces.values() if is_dict(space) else (space,)
+    return any(map(_is_discrete, parts))
+
+
+def has_masks(result: Any) -> bool:
+    """Return True if a result has a mask for any agent."""
+    return any(mask is not None for _, mask in _masks(result))
+
+
+def allowed_action(
+    space: gym.Space[Any], action: Any, result: Any, rng: np.random.Generator
+) -> Any:
+    """Return `action`, with a random allowed action wherever a mask of `result` forbids it.
+
+    Agents without a mask, and those whose mask allows nothing, keep their action.
+    """
+    for agent, mask in _masks(result):
+        if agent is None:
+            return _allowed(space, action, mask, rng)
+        inner = cast("Any", space)[agent]
+        action = {**action, agent: _allowed(inner, action[agent], mask, rng)}
+    return action
+
+
+def _masks(result: Any) -> Iterator[tuple[str | None, Any]]:
+    """Return each agent's mask or None; the key is None for an env without agents."""
+    if isinstance(result, MultiAgentEnvRet):
+        for agent, observation in result.observation.items():
+            yield agent, _mask(observation, result.info.get(agent))
+    elif isinstance(result, EnvRet):
+        yield None, _mask(result.observation, result.info)
+
+
+def _mask(observation: Any, info: Any) -> Any:
+    for where in (info, observation):
+        if isinstance(where, Mapping) and "action_mask" in where:
+            return cast("Any", where)["action_mask"]
+    return None
+
+
+def _is_discrete(space: gym.Space[Any]) -> bool:
+    # Gymnasium's spaces are generic over a dtype that is usually left out.
+    spaces: Any = gym.spaces
+    return isinstance(space, (spaces.Discrete, spaces.MultiDiscrete))
+
+
+def _allowed(space: gym.Space[Any], action: Any, mask: Any, rng: np.random.Generator) -> Any:
+    known = cast("Any", space)
+    if mask is None or not _is_discrete(space):
+        return action
+    # A vectorised env has one action for each sub-environment.
+    weights = np.asarray(mask, np.bool_)
+    drawn = (weights * (1.0 - rng.random(weights.shape))).argmax(axis=-1)
+    any_allowed = weights.any(axis=-1)
+    return (any_allowed * (drawn + known.start) + ~any_allowed * action).astype(known.dtype)
