@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.cli.measuring import Round, Rule, as_round
+from rlightning_aio.cli.measuring import Place, Round, Rule, as_round
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
 from rlightning_aio.policies.random_actions import (
     allowed_action,
@@ -26,9 +26,9 @@ from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import AsyncGenerator, Callable, Sequence
 
-    from rlightning_aio.cli.measuring import Stand
+    from rlightning_aio.cli.measuring import Measure
     from rlightning_aio.config import EnvConfig
 
 _PLAIN: Final = ("gymnasium", "mujoco")
@@ -42,12 +42,8 @@ _CLOSE_SECONDS: Final = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Baseline:
-    """A way to step an entry's simulations without a group.
-
-    Attributes:
-        words: its name in tables.
-    """
+class Baseline(Place):
+    """A way to step an entry's simulations without a group."""
 
     words: str
     config: EnvConfig
@@ -60,6 +56,15 @@ class Baseline:
     def as_json(self) -> dict[str, Any]:
         """Return its description for JSON."""
         return {"placement": "baseline", "num_envs": {self.config.name: self.num_sims}}
+
+    @contextlib.asynccontextmanager
+    async def opened(self, seed: int | None) -> AsyncGenerator[Measure]:
+        """Build and reset its envs; see `Place`."""
+        envs = _made(self)
+        try:
+            yield _OpenBaseline(envs, seed).measure
+        finally:
+            envs.close()
 
 
 _LOOP, _SYNC, _ASYNC = "bare loop", "SyncVectorEnv", "AsyncVectorEnv"
@@ -76,21 +81,8 @@ def baselines_of(configs: Sequence[EnvConfig]) -> list[Baseline]:
     return found if found[0].num_sims <= _MANY else found[:2]
 
 
-@contextlib.contextmanager
-def opened_baseline(baseline: Baseline, seed: int | None) -> Generator[Stand]:
-    """Build and reset its envs.
-
-    Raises what the simulator raises.
-    """
-    envs = _made(baseline)
-    try:
-        yield _BaselineStand(envs, seed)
-    finally:
-        envs.close()
-
-
-class _BaselineStand:
-    """A baseline whose envs are built; see `Stand`."""
+class _OpenBaseline:
+    """A baseline whose envs are built."""
 
     def __init__(self, envs: _Loop | _Vector, seed: int | None) -> None:
         self._envs, self._rng = envs, np.random.default_rng(seed)
@@ -99,6 +91,7 @@ class _BaselineStand:
         self._is_masked = can_be_masked(envs.action_space) and has_masks(envs.newest())
 
     async def measure(self, rule: Rule, seconds: float) -> Round:
+        """Step for `seconds`, after a tenth of that which does not count."""
         del rule
         self._round(seconds / 10)
         return self._round(seconds)

@@ -27,9 +27,9 @@ import typer
 
 from rlightning_aio._core.hosts.process.fork_server import die_with_parent
 from rlightning_aio._core.hosts.processes import ending
-from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
+from rlightning_aio.cli.baselines import Baseline, baselines_of
 from rlightning_aio.cli.measurement import in_turns, machine_facts
-from rlightning_aio.cli.measuring import Contender, Rule, opened_group
+from rlightning_aio.cli.measuring import Contender, Rule
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, Seed
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.settings import Setting, possible_settings, swept_settings
@@ -54,9 +54,8 @@ from rlightning_aio.registry import ENVS
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable, Sequence
+    from collections.abc import Callable, Sequence
 
-    from rlightning_aio.cli.measuring import Place, Stand
     from rlightning_aio.config import EnvConfig
 
 _NOTE: Final = 1024
@@ -238,12 +237,12 @@ async def _measure(order: _Order, note: Callable[[str], None], progress: Progres
         own = list(group)
         note(f"starting {place.words}")
         try:
-            async with _opened(place, order.seed) as stand:
+            async with place.opened(order.seed) as measure:
                 for _, contender in in_turns(own, order.rounds):
                     note(contender.words)
-                    contender.rounds.append(await stand.measure(contender.rule, order.seconds))
+                    contender.rounds.append(await measure(contender.rule, order.seconds))
                     done += 1
-                    rate = f"{count(contender.steps_per_second)} steps/s"
+                    rate = f"{count(contender.rates.median)} steps/s"
                     await progress.show(done, partial("{}: {}".format, contender.words, rate))
         except Exception as failure:  # noqa: BLE001  # Of a baseline, the simulator's own.
             error = failure
@@ -251,16 +250,6 @@ async def _measure(order: _Order, note: Callable[[str], None], progress: Progres
                 contender.failure = _in_words(failure)
     if error is not None and not any(contender.rounds for contender in contenders):
         raise error if isinstance(error, RLightningError) else RLightningError(_in_words(error))
-
-
-@contextlib.asynccontextmanager
-async def _opened(place: Place, seed: int | None) -> AsyncGenerator[Stand]:
-    if isinstance(place, Baseline):
-        with opened_baseline(place, seed) as stand:
-            yield stand
-    elif isinstance(place, Setting):
-        async with opened_group(place.configs, seed) as stand:
-            yield stand
 
 
 def _in_words(error: Exception) -> str:
@@ -277,7 +266,7 @@ def _report(order: _Order, configs: Sequence[EnvConfig], *, interrupted: bool) -
     contenders = order.contenders
     best = max(
         (one for one in contenders if isinstance(one.place, Setting)),
-        key=attrgetter("steps_per_second"),
+        key=attrgetter("rates.median"),
     )
     if order.as_json:
         backends = [ENVS.described(config.backend) for config in configs]
@@ -305,13 +294,13 @@ def _times(order: _Order, best: Contender) -> str:
     others = [one for one in order.contenders if one.rounds and isinstance(one.place, Baseline)]
     if not others:
         return ""
-    other = max(others, key=attrgetter("steps_per_second"))
-    times = best.steps_per_second / other.steps_per_second
+    other = max(others, key=attrgetter("rates.median"))
+    times = best.rates.median / other.rates.median
     return f": {times:.2g} times as many steps/s as {other.place.words}"
 
 
 def _print_table(order: _Order, *, interrupted: bool) -> None:
-    fastest = max(order.contenders, key=attrgetter("steps_per_second"))
+    fastest = max(order.contenders, key=attrgetter("rates.median"))
     title = (
         f"{'Interrupted: ' if interrupted else ''}{order.path}: {counted(num_cores(), 'core')}, "
         f"medians of {counted(len(fastest.rounds), 'round')}"
@@ -336,6 +325,6 @@ def _print_table(order: _Order, *, interrupted: bool) -> None:
 def _cells(contender: Contender) -> list[Any]:
     if not contender.rounds:
         return ["-"] * 4
-    spread = f"{contender.spread:.0%}" if len(contender.rounds) > 1 else "-"
-    rate = count(contender.steps_per_second)
+    spread = f"{contender.rates.spread:.0%}" if len(contender.rounds) > 1 else "-"
+    rate = count(contender.rates.median)
     return [rate, spread, *map(duration, contender.latency_us)]

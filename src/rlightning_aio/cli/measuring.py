@@ -10,7 +10,7 @@ import contextlib
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from rlightning_aio.cli.measurement import Figures
 from rlightning_aio.cli.policies import Responder, respond_to_all, steps_in
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Sequence
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
+    from contextlib import AbstractAsyncContextManager
 
     from numpy.typing import NDArray
 
@@ -63,25 +64,29 @@ class Round:
     restarts: int = 0
 
 
-class Place(Protocol):
-    """A way to place and step envs."""
+Measure: TypeAlias = "Callable[[Rule, float], Awaitable[Round]]"
+"""Measures for so many seconds, after a few steps that warm the caches."""
 
-    @property
-    def words(self) -> str:
-        """Return its name in tables."""
-        ...
+
+class Place:
+    """A way to place and step envs.
+
+    Attributes:
+        words: its name in tables.
+    """
+
+    words: str
 
     def as_json(self) -> dict[str, Any]:
         """Return its description for JSON."""
-        ...
+        raise NotImplementedError
 
+    def opened(self, seed: int | None) -> AbstractAsyncContextManager[Measure]:
+        """Build and reset its envs, and return what measures them.
 
-class Stand(Protocol):
-    """Envs that can be measured."""
-
-    async def measure(self, rule: Rule, seconds: float) -> Round:
-        """Measure once, after a few steps that warm the caches."""
-        ...
+        Raises what building them raises.
+        """
+        raise NotImplementedError
 
 
 @dataclass
@@ -99,18 +104,9 @@ class Contender:
         return f"{self.place.words}, {self.rule.words}"
 
     @property
-    def steps_per_second(self) -> float:
-        """Return the median over the rounds, or 0 without any."""
-        return self._rates.median
-
-    @property
-    def _rates(self) -> Figures:
+    def rates(self) -> Figures:
+        """Return the steps per second of the rounds."""
         return Figures([r.steps_per_second for r in self.rounds])
-
-    @property
-    def spread(self) -> float:
-        """Return half the range of the rounds, as a share of the median."""
-        return self._rates.spread
 
     @property
     def latency_us(self) -> tuple[float, float]:
@@ -132,20 +128,20 @@ class Contender:
             "min_results": self.rule.min_results,
             "failure": self.failure,
             "restarts": self.restarts,
-            "rounds": self._rates.values,
+            "rounds": self.rates.values,
         }
         if self.rounds:
             p50, p99 = self.latency_us
             document |= {
-                "steps_per_second": self.steps_per_second,
-                "spread": self.spread,
+                "steps_per_second": self.rates.median,
+                "spread": self.rates.spread,
                 "latency_us": {"p50": p50, "p99": p99},
             }
         return document
 
 
-class _GroupStand:
-    """An open group; see `Stand`.
+class _OpenGroup:
+    """An open group.
 
     Args:
         group: an initialised group that resets its envs at their ends.
@@ -159,6 +155,7 @@ class _GroupStand:
         self._sent_at = np.zeros(len(latest))
 
     async def measure(self, rule: Rule, seconds: float) -> Round:
+        """Collect by a rule for `seconds`, after a tenth of that which does not count."""
         least, before = rule.min_results, self._restarts()
         one_round = self._step if least is None else partial(self._collect, least)
         await one_round(seconds / 10)
@@ -212,7 +209,7 @@ def _joined(responses: list[BatchedData]) -> BatchedData:
 
 
 @contextlib.asynccontextmanager
-async def opened_group(configs: Sequence[EnvConfig], seed: int | None) -> AsyncGenerator[Stand]:
+async def opened_group(configs: Sequence[EnvConfig], seed: int | None) -> AsyncGenerator[Measure]:
     """Build a group, and reset its envs.
 
     Raises:
@@ -221,4 +218,4 @@ async def opened_group(configs: Sequence[EnvConfig], seed: int | None) -> AsyncG
     async with rlightning_aio.build_env_group(list(configs), mixed_actions=True) as group:
         latest, _ = await group.reset(seed=seed)
         with ensure_auto_reset(group):
-            yield _GroupStand(group, latest, seed)
+            yield _OpenGroup(group, latest, seed).measure

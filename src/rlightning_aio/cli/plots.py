@@ -66,9 +66,9 @@ def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) ->
         own = [contender for contender in measured if contender.rule.words == rule]
         axes.barh(
             [places.index(c.place.words) + index * height for c in own],
-            [c.steps_per_second for c in own],
+            [c.rates.median for c in own],
             height,
-            xerr=[c.spread * c.steps_per_second for c in own],
+            xerr=[c.rates.spread * c.rates.median for c in own],
             ecolor="gray",
             label=rule,
         )

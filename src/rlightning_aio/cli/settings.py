@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.group.setup.start_orders import nums_hosts
+from rlightning_aio.cli.measuring import Place, opened_group
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.config import load_config, moved
 from rlightning_aio.errors import ConfigError
@@ -20,8 +21,10 @@ from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+    from contextlib import AbstractAsyncContextManager
     from pathlib import Path
 
+    from rlightning_aio.cli.measuring import Measure
     from rlightning_aio.config import EnvConfig
 
 _MANY_WORKERS: Final = 32
@@ -29,12 +32,11 @@ _MANY_WORKERS: Final = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class Setting(Place):
     """A placement of a config's envs. Compared by identity, as configs may not be hashable.
 
     Attributes:
         configs: the entries with their placement, envs_per_process, num_workers and num_envs.
-        words: its name in tables.
     """
 
     configs: tuple[EnvConfig, ...]
@@ -70,6 +72,9 @@ class Setting:
             for k, config in enumerate(self.configs)
             for name in fields
         )
+
+    def opened(self, seed: int | None) -> AbstractAsyncContextManager[Measure]:
+        return opened_group(self.configs, seed)
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields that define it, for JSON."""
