@@ -229,41 +229,6 @@ class Chunked(Probe):
         return self._result(last_reward=float(np.sum(chunk)), info={"type": type(action).__name__})
 
 
-ADDING = {"name": "one", "backend": "adding", "task": "-", "placement": "inline"}
-
-
-@ENVS.register("adding")
-class Adding(BaseEnv):
-    """Adds up its actions, in the trainer's process."""
-
-    RAISE = 8
-
-    def get_observation_space(self) -> gym.Space[Any]:
-        return spaces.Box(-np.inf, np.inf, (2,), np.float64)
-
-    def get_action_space(self) -> gym.Space[Any]:
-        return spaces.Discrete(10)
-
-    def _observation(self) -> Any:
-        return np.array([self.seed, self.total], float)
-
-    def reset(
-        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> EnvRet:
-        self.seed, self.total = (-1 if seed is None else seed), 0
-        info = {"nested": {"options": options}}
-        return EnvRet(env_id=self.env_id, observation=self._observation(), info=info)
-
-    def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        action = int(policy_resp.action)
-        if action == self.RAISE:
-            raise ValueError("no end")
-        self.total += action
-        info = {"nested": {"total": self.total}, "success": self.total == 20}
-        parts = self._observation(), float(action), self.total >= 20, False, info
-        return result_of(self.env_id, parts)
-
-
 @ENVS.register("fresh")
 class Fresh(FastPath, BaseEnv):
     """Returns observations of the task's space without keeping references to them.

@@ -23,9 +23,6 @@ class Dice(Scripted):
         return np.array([np.random.random(), random.random()])  # noqa: NPY002
 
 
-DICE = pytest.mark.parametrize("make", [Dice, partial(Awaitable, Dice)])
-
-
 def rolled(make: Any, seed: int | None, *, count: int = 2) -> list[Any]:
     """The numbers of a reset, three steps, a death, three steps, and all of it again, by env."""
     found: list[Any] = []
@@ -40,17 +37,13 @@ def rolled(make: Any, seed: int | None, *, count: int = 2) -> list[Any]:
     return np.array(found).tolist()
 
 
-@DICE
-def test_every_worker_and_every_replacement_has_other_numbers(make: Any) -> None:
-    """No number comes twice, also in another group of the same program."""
-    found = np.array([rolled(make, None), rolled(make, None)])
-    assert len(set(found.ravel().tolist())) == found.size
-
-
-@DICE
-def test_a_seeded_reset_seeds_the_env_and_nothing_else(make: Any) -> None:
-    """Attempts at one task would draw the same random port otherwise."""
-    found = np.array([rolled(make, 5), rolled(make, 5)])
+@pytest.mark.parametrize("make", [Dice, partial(Awaitable, Dice)])
+@pytest.mark.parametrize("seed", [None, 5])
+def test_every_worker_and_every_replacement_has_other_numbers(make: Any, seed: int | None) -> None:
+    """No number comes twice, also in another group of the same program: a seed is the env's, and
+    attempts at one task would draw the same random port otherwise.
+    """
+    found = np.array([rolled(make, seed), rolled(make, seed)])
     assert len(set(found.ravel().tolist())) == found.size
 
 

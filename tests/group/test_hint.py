@@ -14,7 +14,7 @@ from kit.scripted import Counts
 
 from rlightning_aio import EnvConfig, sync
 from rlightning_aio._core.group.state.host_record import HostRecord
-from rlightning_aio._core.group.supervision.hint import LAST_LOOK, Hint, advice
+from rlightning_aio._core.group.supervision.hint import Hint, advice
 from rlightning_aio._core.hosts.base import Host
 
 MS = 1e-3
@@ -189,15 +189,6 @@ def test_one_look_is_no_reason(caplog: pytest.LogCaptureFixture) -> None:
     assert "times as fast, set placement: inline (in VectorEnv" in text
     assert "SyncVectorEnv is faster still" in text
     assert hint.due == float("inf")
-
-
-def test_looks_come_early_and_then_ever_more_rarely() -> None:
-    tables: Any = SimpleNamespace(records=[], num_cores=2, sums=None)
-    hint, found = Hint(tables), []
-    while hint.due < float("inf"):
-        found.append(hint.due)
-        hint.look()
-    assert found == [8, 16, 32, 64, 128, 256, 512, LAST_LOOK]
 
 
 class Sleeper(Counts):

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from group.sample_envs import ADDING, Adding
+from group.sample_envs import Probe
 from kit.driven import INLINE
 
 import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio.errors import EnvRaised
+
+PROBE = {"name": "one", "backend": "probe", "task": "-", "placement": "inline"}
 
 
 def test_inline_entries_take_turns() -> None:
@@ -92,22 +94,22 @@ async def test_other_tasks_have_their_turns() -> None:
             turns += 1
             await asyncio.sleep(0)
 
-    async with rlightning_aio.build_env_group(ADDING) as group:
+    async with rlightning_aio.build_env_group(PROBE) as group:
         batch, _ = await group.reset()
         task = asyncio.create_task(count())
         for _ in range(50):
-            batch, _ = await group.step(batch.respond(action=np.array([0])))
+            batch, _ = await group.step(batch.respond(action=np.zeros((1, 2))))
         task.cancel()
     assert turns >= 50
 
 
 def test_a_step_that_raises_counts_towards_no_limit() -> None:
     """The limit counts completed steps."""
-    with rlightning_aio.sync.build_env_group(ADDING) as group:
+    with rlightning_aio.sync.build_env_group(PROBE) as group:
         batch, _ = group.reset()
         with group.auto_reset(max_episode_steps=3):
             with pytest.raises(EnvRaised):
-                group.step(batch.respond(action=np.array([Adding.RAISE])))
+                group.step(batch.respond(action=np.array([[Probe.RAISE, 0]])))
             for expected in (False, False, True):
-                batch, flags = group.step(batch.respond(action=np.array([1])))
+                batch, flags = group.step(batch.respond(action=np.zeros((1, 2))))
                 assert flags == [expected]

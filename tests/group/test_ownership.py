@@ -180,24 +180,6 @@ def link_of(group: rlightning_aio.EnvGroup) -> Any:
     return group._core.supervisor.hosts[0]
 
 
-@LOOPS
-def test_an_error_in_a_callback_is_raised_once_in_the_waiting_call(
-    new_loop: Callable[[], asyncio.AbstractEventLoop],
-) -> None:
-    """The group continues; the next call returns the results."""
-
-    async def main() -> None:
-        async with rlightning_aio.build_env_group(PROBE) as group:
-            link = link_of(group)
-            Broken(link, 1)
-            with pytest.raises(MemoryError):
-                await group["probe-0"].call("get_attr", "label")
-            assert await use(group) == [4.0] * 3
-            del link.on_readable
-
-    run_in(new_loop, main())
-
-
 @pytest.mark.parametrize("times", [1, 10**9])
 def test_an_error_that_was_not_raised_yet_does_not_prevent_closing(times: int) -> None:
     """`close` closes first, then raises; a source that never reads is released by force."""

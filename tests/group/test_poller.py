@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,25 +94,6 @@ class Scene:
 # -- orders
 
 
-@pytest.mark.parametrize("wanted", [32, 40])
-def test_for_all_results_workers_look_when_they_have_nothing_left(wanted: int) -> None:
-    """The last worker to finish rings; none looks in between."""
-    scene = Scene(16, 16)
-    assert not scene.arm(wanted)
-    assert scene.orders == [(32, True)]
-
-
-def test_results_read_meanwhile_do_not_change_the_order() -> None:
-    """The wait is for the same result."""
-    scene = Scene(16, 16)
-    scene.arm(32)
-    armed = scene.bell._armed
-    scene.report(0, 16)
-    scene.take()
-    scene.arm(16)
-    assert scene.bell._armed == armed
-
-
 @given(
     in_flight=st.lists(st.integers(1, 64), min_size=1, max_size=8),
     wanted=st.integers(1, 512),
@@ -138,17 +118,6 @@ def test_the_last_wanted_result_rings_the_bell(
         if worker.publish(scene.counts[host_id]) or not left[host_id]:
             rung += worker.is_due()
         assert (rung > 0) == (number >= least)
-
-
-def test_results_that_are_ready_count_at_once() -> None:
-    """Also those that came between two polls."""
-    scene = Scene(4, 4)
-    scene.report(0, 4)
-    scene.report(1, 1)
-    assert scene.arm(5)
-    assert not scene.arm(6)
-    scene.report(1, 3)
-    assert scene.arm(8)
 
 
 def test_the_bell_is_not_armed_if_all_workers_are_idle() -> None:

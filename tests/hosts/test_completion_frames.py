@@ -1,4 +1,4 @@
-"""What can't be pickled, or unpickled, is an error of its request, or of its env."""
+"""Descriptions of envs that can't be pickled, or unpickled; tests/faults has values and results."""
 
 from __future__ import annotations
 
@@ -8,15 +8,10 @@ from rlightning_aio._core.hosts.completion_frames import completion_in, frame_of
 from rlightning_aio._core.hosts.messages import (
     Built,
     NotBuilt,
-    Raised,
-    Value,
 )
-from rlightning_aio.protocol.entries import Operation, entry
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import Completion
-
-CALL = entry(8, 3, Operation.CALL)
 
 
 class Unreadable:
@@ -28,19 +23,8 @@ def sent(completion: Completion) -> Completion:
     return completion_in(5, frame_of(completion))
 
 
-def test_what_cannot_be_pickled_is_an_error_of_its_request() -> None:
-    """So the request ends nevertheless."""
-    arrived = sent(Value(5, CALL, (each for each in ())))
-    assert isinstance(arrived, Raised)
-    assert arrived.entry == CALL
-    assert "what it returned can't be pickled" in arrived.error.text
-
-
-def test_what_cannot_be_unpickled_is_an_error_of_its_request() -> None:
-    """The class may be missing in the trainer; of a description, it is an error of its env."""
-    arrived = sent(Value(5, CALL, Unreadable()))
-    assert isinstance(arrived, Raised)
-    assert (arrived.entry, arrived.error.summary) == (CALL, "SystemExit: not here")
+def test_a_description_that_cannot_be_unpickled_is_an_error_of_its_env() -> None:
+    """A class may be missing in the trainer."""
     built: Any = [Unreadable()]
     arrived = sent(Built(5, built))
     assert isinstance(arrived, NotBuilt)

@@ -213,20 +213,6 @@ def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
 # -- what has no place in the row
 
 
-def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
-    """They are copied if they stay in this process, because the env may write to them again."""
-    layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_out_of_band=True)
-    slab, observation = new_slab(layout, 1), np.array([1.0, 2.0])
-    writer = RowWriter(
-        slab, 0, env_id="e-0", autoreset="disabled", announce=infos_out_of_band, stays_here=True
-    )
-    found = begin(writer, {"x": [1]}, observation)
-    assert found is not None
-    observation[:] = 9
-    assert found["observation"].tolist() == [1, 2]
-    assert found["info"] == {"x": [1]}
-
-
 @pytest.mark.parametrize(
     ("head", "agents", "value"),
     [
