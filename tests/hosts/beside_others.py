@@ -1,15 +1,12 @@
-"""Checks that every kind of host passes in one group with others; callers choose the hosts."""
+"""What tests of hosts need that share a group with others; callers choose the hosts."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import pytest
-from group.sample_envs import Probe
 
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio.errors import EnvRaised
 
 
 def entry(name: str, backend: str, placement: str, **fields: Any) -> Any:
@@ -43,27 +40,3 @@ def check_three_are_equal(batch: Any, flags: Any) -> None:
     infos = [ret.info for ret in batch.values()]
     third = len(infos) // 3
     assert infos[:third] == infos[third : 2 * third] == infos[2 * third :]
-
-
-async def check_usable_after_an_error(group: Any) -> None:
-    """Check a group of ``one-0`` and ``one-1``, which share a host."""
-    await group.reset()
-    with pytest.raises(EnvRaised, match=r"env 'one-1'.* raised in step") as caught:
-        await group.step(steps(one_0=[0.0, 5.0], one_1=[Probe.RAISE, 0.0]))
-    assert caught.value.exception_type == "group.sample_envs.OddError"
-    assert "sample_envs.py" in caught.value.traceback_text
-    assert caught.value.results.reward.tolist() == [5]
-    batch, _ = await group.step(steps(one_0=[0.0, 6.0], one_1=[0.0, 7.0]))
-    assert batch.reward.tolist() == [6, 7]
-
-
-async def check_methods(group: Any) -> None:
-    """Check that calls of ``one-0`` return values, and that only the caller gets their errors."""
-    handle = group["one-0"]
-    assert await handle.call("double", [4], times=3) == [4, 4, 4]
-    with pytest.raises(EnvRaised, match=r"raised in the call of double\(\): TypeError"):
-        await handle.call("double", None)
-    await handle.set_attr("label", "changed")
-    assert await handle.get_attr("label") == "changed"
-    await group.reset()
-    assert (await handle.step([0.0, 2.0])).last_reward == 2

@@ -6,7 +6,6 @@ Here it runs in one group with processes and inline envs.
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,16 +13,13 @@ import pytest
 from hosts import beside_others, thread_host
 from hosts.beside_others import (
     both_ways,
-    check_methods,
     check_three_are_equal,
-    check_usable_after_an_error,
     steps,
 )
 from hosts.thread_host import EnvThread
 from kit.driven import Place
 
 import rlightning_aio.sync
-from rlightning_aio.errors import StartFailed
 from rlightning_aio.registry import PLACEMENTS, Placement
 
 if TYPE_CHECKING:
@@ -60,11 +56,6 @@ def entry(name: str, backend: str = "probe", placement: str = "thread", **fields
     return beside_others.entry(name, backend, placement, **fields)
 
 
-def test_it_is_short() -> None:
-    """CONTRIBUTING.md promises fewer than 250 lines."""
-    assert len(Path(thread_host.__file__).read_text().splitlines()) < 250
-
-
 # -- envs in a thread
 
 
@@ -92,45 +83,7 @@ async def test_trajectories_equal_those_of_inline_envs_and_processes(facade: Pla
     assert ends > 30
 
 
-async def test_an_env_that_raises_stays_usable(facade: Place) -> None:
-    """The result of its neighbour comes with the error, and both continue."""
-    async with facade.build(entry("one", num_workers=2, envs_per_process=2)) as group:
-        await check_usable_after_an_error(group)
-
-
-async def test_methods_are_called_in_the_thread(facade: Place) -> None:
-    """Calls return values, and only the caller gets their errors."""
-    async with facade.build([entry("one"), entry("two", placement="process")]) as group:
-        await check_methods(group)
-
-
 # -- beginnings and ends
-
-
-async def test_a_thread_that_cannot_be_started_fails_the_start(
-    facade: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As a process would."""
-
-    def refuse(_: EnvThread) -> None:
-        raise RuntimeError("can't start new thread")
-
-    monkeypatch.setattr(EnvThread, "start", refuse)
-    with pytest.raises(StartFailed, match="entry 'one': can't start new thread"):
-        await facade.build(entry("one")).init()
-
-
-async def test_a_thread_that_ends_while_it_starts_fails_the_start(
-    facade: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """No caller waits for its completions."""
-
-    def attach(*_: Any) -> None:
-        raise MemoryError("no more rows")
-
-    monkeypatch.setattr(EnvThread, "attach", attach)
-    with pytest.raises(StartFailed, match=r"'one-0'.* ended in MemoryError: no more rows"):
-        await facade.build(entry("one")).init()
 
 
 async def test_a_thread_that_ends_is_replaced(
@@ -150,12 +103,3 @@ async def test_a_thread_that_ends_is_replaced(
         batch, _ = await group.step(steps(one_0=[0.0, 1.0]))
         assert batch.reward.tolist() == [1]
         assert len(env_threads()) == 1
-
-
-def test_a_group_that_is_dropped_ends_its_threads() -> None:
-    """It ends its workers in the same way."""
-    groups = [rlightning_aio.sync.build_env_group(entry("one", num_workers=2))]
-    groups[0].init()
-    with pytest.warns(ResourceWarning, match="was not closed"):
-        groups.clear()
-    assert env_threads() == []
