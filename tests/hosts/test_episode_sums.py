@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio._core.hosts.running.episode_sums import EpisodeSums
+from rlightning_aio._core.hosts.running.row_writer import EpisodeSums
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,7 +16,7 @@ import numpy as np
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.results import step_of
-from rlightning_aio.protocol.bounds import out_of_bounds
+from rlightning_aio.protocol.columns import out_of_bounds
 from rlightning_aio.registry import ENVS
 from rlightning_aio.trees import as_numpy, mapped
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.protocol.bounds import out_of_bounds
+from rlightning_aio.protocol.columns import out_of_bounds
 
 BOX = spaces.Box(-1.0, 1.0, (2,), np.float32)
 LEAVES = [

@@ -23,8 +23,7 @@ from rlightning_aio.protocol.net.wire import Reset, Step, Welcome
 from rlightning_aio.types import EnvMeta, EnvRet
 
 if TYPE_CHECKING:
-    from rlightning_aio.protocol.net.announcements import Announcement
-    from rlightning_aio.protocol.net.server_session import Answer
+    from rlightning_aio.protocol.net.server_session import Announcement, Answer
 
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 ACTION = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)

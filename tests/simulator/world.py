@@ -56,7 +56,6 @@ from rlightning_aio._core.group.setup import start_orders
 from rlightning_aio._core.group.supervision import hint, workers
 from rlightning_aio._core.hosts import descriptors
 from rlightning_aio._core.hosts.awaiting import awaited_envs
-from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.running import build_env, renewal
@@ -242,7 +241,7 @@ class World:
             (awaited_envs, "awaited_calls", lambda _: "calls"),
             (start_orders, "StartOrder", partial(start_orders.StartOrder, trainer_pid=1)),
             *self.network.replacements(),
-            (awaiting, "run_loop", lambda main: run_in_process(self, main)),
+            (awaited_envs, "run_loop", lambda main: run_in_process(self, main)),
             *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
         ]
 

@@ -36,7 +36,7 @@ from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.config.documents import parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.random_actions import allowed_action, sampler_of
-from rlightning_aio.protocol.bounds import out_of_bounds
+from rlightning_aio.protocol.columns import out_of_bounds
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 

@@ -1,10 +1,15 @@
-"""Reads a configuration: a file or a Python value with entries, and what its entries share."""
+"""Reads a configuration: a file or a Python value with entries, and what its entries share.
+
+OmegaConf is imported only where a file is read: it takes a tenth of a second, and workers import
+this package, too.
+"""
 
 from __future__ import annotations
 
 import difflib
 import itertools
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -15,9 +20,10 @@ from pydantic import ValidationError
 from rlightning_aio.config.checks import Entry, check_entry, check_imports, check_names
 from rlightning_aio.config.entry import EnvConfig, completed
 from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
-from rlightning_aio.config.yaml_files import TOP_LEVEL, imports_above, plain, read_yaml, sections
 from rlightning_aio.errors import ConfigError
 
+TOP_LEVEL = ("envs", "env", "imports")
+"""Sections of a file that are read."""
 _OF_ENTRIES = EnvConfig.model_fields.keys() - {"imports"}
 """Keys of an entry that a document of entries has not."""
 _TYPO = 0.8
@@ -41,7 +47,7 @@ def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
             The message lists every problem.
     """
     source = os.fspath(path)
-    return _parse(read_yaml(source, overrides), source)
+    return _parse(_read_yaml(source, overrides), source)
 
 
 def parse_configs(
@@ -86,8 +92,8 @@ def _parse(env_cfgs: object, source: str) -> list[EnvConfig]:
     imports = _shared_imports(imports, problems)
     entries: list[Entry] = []
     for place, given in listed:
-        shared = (*imports, *_shared_imports(imports_above(given, source), problems))
-        entry = _read_entry(plain(given, source), place, problems)
+        shared = (*imports, *_shared_imports(_imports_above(given, source), problems))
+        entry = _read_entry(_plain(given, source), place, problems)
         if entry is not None:
             entry.config = _with_imports(entry.config, shared)
             entries.append(entry)
@@ -102,11 +108,11 @@ def _split(env_cfgs: object, source: str, problems: Problems) -> tuple[list[tupl
     """Return the entries, each with its place, and the imports they share."""
     if isinstance(env_cfgs, EnvConfig | str) or callable(env_cfgs):
         return [("envs.0", env_cfgs)], ()
-    document = sections(env_cfgs, source)
+    document = _sections(env_cfgs, source)
     if not isinstance(document, Mapping):
         if isinstance(document, list | tuple):
             document = _entries_of_callables(cast("Sequence[Any]", document))
-        return _listed(document, "envs", problems), imports_above(env_cfgs, source)
+        return _listed(document, "envs", problems), _imports_above(env_cfgs, source)
     fields = cast("Mapping[Any, Any]", document)
     if not {"env", "envs"} & fields.keys():
         if _OF_ENTRIES & fields.keys():
@@ -122,8 +128,8 @@ def _split(env_cfgs: object, source: str, problems: Problems) -> tuple[list[tupl
     key = "envs" if "envs" in fields or "env" not in fields else "env"
     if {"env", "envs"} <= fields.keys():
         problems.add("env", "means the same as envs, which is given, too; keep one of them")
-    listed = _listed(plain(fields.get(key, ()), source), key, problems)
-    return listed, plain(fields.get("imports", ()), source)
+    listed = _listed(_plain(fields.get(key, ()), source), key, problems)
+    return listed, _plain(fields.get("imports", ()), source)
 
 
 def _listed(entries: object, key: str, problems: Problems) -> list[tuple[str, Any]]:
@@ -176,7 +182,7 @@ def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
         return None
     given = cast("Mapping[Any, Any]", entry)
     known = EnvConfig.model_fields
-    fields = completed({k: plain(v, place) for k, v in given.items() if k in known})
+    fields = completed({k: _plain(v, place) for k, v in given.items() if k in known})
     if isinstance(name := fields.get("name"), str) and name:
         place = f"{place} ({name!r})"
     for unknown in (k for k in given if k not in known):
@@ -190,3 +196,116 @@ def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
     faulty = {str(fault["loc"][0]) for fault in faults}
     right = {k: v for k, v in fields.items() if k not in faulty}
     return Entry(place, EnvConfig.model_validate({"name": "?", "backend": "?"} | right), faulty)
+
+
+# -- YAML files and OmegaConf nodes, as plain Python values --------------------------
+
+
+def _plain(value: object, source: str) -> Any:
+    """Return `value`, with an OmegaConf node turned into plain containers."""
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.Container):
+        return value
+    try:
+        return omegaconf.OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
+    except omegaconf.errors.OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+
+
+def _sections(value: object, source: str) -> Any:
+    """Return `value` as plain containers, with None for other sections of an OmegaConf document.
+
+    Other sections are not resolved, because what they refer to may be missing here.
+    """
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.DictConfig):
+        return _plain(value, source)
+    document: Any = value
+    if not {"env", "envs"} & document.keys():
+        return _plain(value, source)
+    try:
+        return {k: _plain(document[k], source) if k in TOP_LEVEL else None for k in document}
+    except omegaconf.errors.OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+
+
+def _imports_above(value: object, source: str) -> Any:
+    """Return ``imports:`` of the document that contains the OmegaConf node `value`."""
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.Container):
+        return ()
+    node: Any = value
+    while (node := node._get_parent()) is not None:  # noqa: SLF001
+        if isinstance(node, omegaconf.DictConfig) and "imports" in node:
+            return _plain(node["imports"], source)
+    return ()
+
+
+def _first_line(error: Exception) -> str:
+    where = getattr(error, "full_key", None)
+    text = str(error).partition("\n")[0]
+    return f"{where}: {text}" if where else text
+
+
+def _read_yaml(source: str, overrides: Sequence[str]) -> Any:
+    """Read a YAML file and apply overrides to it.
+
+    Raises:
+        ConfigError: the file can't be read, or an override fits nothing.
+    """
+    import yaml  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    try:
+        document = OmegaConf.load(source)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{source}: {_not_yaml(error)}") from None
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+    except OSError as error:
+        # OmegaConf itself raises one, without errno, for a file that holds a bare value.
+        reason = error.strerror or "should hold envs: and a list of entries"
+        raise ConfigError(f"{source}: {reason}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{source}: not a UTF-8 text file ({error.reason})") from None
+    _override(document, source, overrides)
+    return document
+
+
+def _not_yaml(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error)
+    where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+    return f"{where}not valid YAML: {problem}"
+
+
+def _override(document: Any, source: str, overrides: Sequence[str]) -> None:
+    problems = Problems(source)
+    for override in overrides:
+        if (problem := _apply(document, override)) is not None:
+            problems.add(f"override {override!r}", problem)
+    problems.raise_any()
+
+
+def _apply(document: Any, override: str) -> str | None:
+    """Apply one override in place. Return a description of what is wrong with it, or None."""
+    import yaml  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    key, equals, text = override.partition("=")
+    top, dot, below = key.partition(".")
+    if not equals or not (top in TOP_LEVEL or (OmegaConf.is_dict(document) and top in document)):
+        return "should look like envs.0.num_workers=8"
+    if top in ("env", "envs"):
+        # Either name works, whichever of them the file uses.
+        top = "env" if "env" in document and "envs" not in document else "envs"
+    try:
+        value = OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]), resolve=False)
+        OmegaConf.update(document, top + dot + below, cast("dict[str, Any]", value)["value"])
+    except yaml.YAMLError as error:
+        return f"the value is {_not_yaml(error)}"
+    except (OmegaConfBaseException, TypeError, ValueError) as error:
+        return f"names nothing in the file ({_first_line(error)})"
+    return None

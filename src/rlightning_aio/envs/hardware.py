@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rlightning_aio.envs.fast_path import FastPath
 from rlightning_aio.envs.results import has_preprocess_fn, input_of, is_async_first, is_awaitable
 from rlightning_aio.errors import BadAction, ConfigError
-from rlightning_aio.protocol.bounds import out_of_bounds
-from rlightning_aio.protocol.columns import Misfit, fitted_tree, leaves
+from rlightning_aio.protocol.columns import Misfit, fitted_tree, leaves, out_of_bounds
 from rlightning_aio.trees import as_numpy, mapped
 
 if TYPE_CHECKING:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Rows: TypeAlias = "slice | NDArray[np.intp]"
 """A selection of rows: a slice for a contiguous range, else an index array."""
 
+_NUMBERS = (np.ndarray, np.generic, int, float)
 _FIXED = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
 
@@ -261,3 +262,52 @@ def row_reader(tree: Tree, row: int) -> Callable[[], Any]:
 
     readers = mapped(of_array, tree)
     return readers if callable(readers) else lambda: mapped(lambda read: read(), readers)
+
+
+# -- bounds. Nothing here raises, because some simulators violate the bounds that they declare.
+# Values of another structure, shape or dtype are skipped, and so are tensors, which may be on
+# another device.
+
+
+def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
+    """Describe the first number of `value` outside the bounds of `space`; None without any."""
+    return next(_faults(space, value, what), None)
+
+
+def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
+    for path, part in walked(tree_of(space)):
+        bounds, found = _bounds(part), _held(value, path)
+        if bounds is None or not isinstance(found, _NUMBERS):
+            continue
+        array = np.asarray(found)
+        if array.shape != part.shape or array.dtype.kind not in "biuf":
+            continue
+        low, high = (np.broadcast_to(bound, array.shape) for bound in bounds)
+        # In this form NaN is outside.
+        outside = ~((array >= low) & (array <= high))
+        if outside.any():
+            name = in_brackets(path)
+            number, least, most = (one[outside][0] for one in (array, low, high))
+            yield f"{what}{name} holds {number}, and the space goes from {least} to {most}"
+
+
+def _held(value: Any, path: Path) -> Any:
+    for key in path:
+        try:
+            value = value[key]
+        except (LookupError, TypeError):
+            return None
+    return value
+
+
+def _bounds(space: gym.Space[Any]) -> tuple[Any, Any] | None:
+    # Gymnasium's spaces are generic over dtypes, which aren't known here.
+    spaces: Any = gym.spaces
+    known = cast("Any", space)
+    if isinstance(space, spaces.Box):
+        return known.low, known.high
+    if isinstance(space, spaces.Discrete):
+        return known.start, known.start + known.n - 1
+    if isinstance(space, spaces.MultiDiscrete):
+        return known.start, known.start + known.nvec - 1
+    return (0, 1) if isinstance(space, spaces.MultiBinary) else None

@@ -1,10 +1,14 @@
 """`AwaitedEnvs`: executes requests on awaitable envs, all at once, on one event loop.
 
-The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each env has
+The trainer's loop host and a worker with awaitable envs are both thin layers over it; a worker has
+an event loop of its own, which its channel wakes. Each env has
 a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
 is then closed, and the group hears that it is lost; the next request makes another. So it is if a
 step raises `EnvAway`: the env has lost what it talks to.
 Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
+A worker says whose code runs, and that none does while all envs wait: if it dies, the trainer knows
+which env is at fault. While envs have time limits, it also says every now and then that its loop is
+alive: the trainer kills a worker whose loop an env blocks for longer than the limit.
 Left out: how requests and completions travel.
 """
 
@@ -31,6 +35,7 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     leave_behind,
     log,
     new_task,
+    run_loop,
     watched,
 )
 from rlightning_aio._core.hosts.limits import hung, limits_of
@@ -46,6 +51,7 @@ from rlightning_aio.protocol.entries import entry as entry_of
 from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import Callable, Coroutine
     from contextvars import Context
 
@@ -148,11 +154,61 @@ class AwaitedEnvs:
 
     # -- life ---------------------------------------------------------------------
 
-    def adopt(self, runners: list[AwaitedRunner]) -> None:
-        """Take over envs that were built elsewhere, by index; they belong to the running loop.
+    def serve(
+        self,
+        runners: list[AwaitedRunner],
+        channel: socket.socket,
+        take_requests: Callable[[], bool],
+    ) -> list[tuple[int, ErrorText]]:
+        """Execute requests on an event loop until there are no more, and close the envs.
 
-        The list is that of `runners` from now on.
+        Args:
+            runners: of the envs, by index, built elsewhere; the list changes when one takes the
+                place of another.
+            channel: readable when there are requests.
+            take_requests: submits them; False if there will be no more. If it raises, the trainer
+                is gone: the envs come to a safe stop before they are closed.
+
+        Returns what closing has raised, with the env's index.
         """
+        return run_loop(self._serve(runners, channel, take_requests))
+
+    async def _serve(
+        self,
+        runners: list[AwaitedRunner],
+        channel: socket.socket,
+        take_requests: Callable[[], bool],
+    ) -> list[tuple[int, ErrorText]]:
+        self._adopt(runners)
+        loop = self._loop
+        ended: asyncio.Future[None] = loop.create_future()
+
+        def look() -> None:
+            try:
+                if take_requests() or ended.done():
+                    return
+            except BaseException as error:
+                loop.remove_reader(channel)
+                ended.set_exception(error)
+            else:
+                ended.set_result(None)
+
+        loop.add_reader(channel, look)
+        # uvloop has made it non-blocking; a reply that the socket can't hold waits for the trainer.
+        channel.setblocking(True)
+        look()
+        try:
+            await ended
+        except BaseException:
+            disconnect_all([record.runner for record in self._records if record.env is not None])
+            await self.close()
+            raise
+        finally:
+            loop.remove_reader(channel)
+        return await self.close()
+
+    def _adopt(self, runners: list[AwaitedRunner]) -> None:
+        """Take over envs that were built elsewhere; they belong to the running loop."""
         self.runners = runners
         self._loop = asyncio.get_running_loop()
         context = copy_context()
@@ -240,10 +296,6 @@ class AwaitedEnvs:
             for task in env.tasks():
                 leave_behind(task)
         return errors
-
-    def disconnect(self) -> None:
-        """Bring the envs to a safe state: the trainer is gone."""
-        disconnect_all([record.runner for record in self._records if record.env is not None])
 
     def release(self) -> None:
         """Cancel everything without waiting. Idempotent."""

@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.protocol.net.announcements import Announcement
     from rlightning_aio.protocol.net.payload import ResultFields
-    from rlightning_aio.protocol.net.server_session import Answer
+    from rlightning_aio.protocol.net.server_session import Announcement, Answer
     from rlightning_aio.protocol.net.wire import ClientResult
     from rlightning_aio.types import EnvMeta
 

@@ -3,7 +3,7 @@
 Rule: one thread, no asyncio. Requests are executed in the order of sending, and every
 request gets exactly one reply with its own entry. An idle worker spins for a moment (see
 `spinner`), then sleeps on its channel. Left out: awaitable envs, whose requests
-`awaiting.worker_loop` executes at the same time, on an event loop.
+`AwaitedEnvs` executes at the same time, on an event loop.
 """
 
 from __future__ import annotations
@@ -111,7 +111,6 @@ class Worker:
         """Serve envs whose `reset` and `step` are coroutine functions concurrently."""
         # Not at the top: no other worker needs asyncio.
         from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs  # noqa: PLC0415
-        from rlightning_aio._core.hosts.awaiting.worker_loop import serve  # noqa: PLC0415
 
         rings, ring = self._rings, self._ring
         self._awaited = awaited = AwaitedEnvs(
@@ -124,7 +123,7 @@ class Worker:
         )
         runners = cast("list[AwaitedRunner]", self._runners)
         try:
-            errors = serve(awaited, runners, self._channel, self._take_requests)
+            errors = awaited.serve(runners, self._channel, self._take_requests)
         finally:
             self._closing = True  # The event loop has closed them.
             self._end_watch()
