@@ -1,10 +1,10 @@
 """`AwaitedEnvs`: executes requests on awaitable envs, all at once, on one event loop.
 
 The trainer's loop host and a worker with awaitable envs are both thin layers over it; a worker has
-an event loop of its own, which its channel wakes. Each env has
-a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
-is then closed, and the group hears that it is lost; the next request makes another. So it is if a
-step raises `EnvAway`: the env has lost what it talks to.
+an event loop of its own, which its channel wakes. Each env has a task of its own (`AwaitedEnv`). A
+request that takes longer than its limit is cancelled; the env is then closed, and the group hears
+that it is lost; the next request makes another. So it is if a step raises `EnvAway`: the env has
+lost what it talks to.
 Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
 A worker says whose code runs, and that none does while all envs wait: if it dies, the trainer knows
 which env is at fault. While envs have time limits, it also says every now and then that its loop is

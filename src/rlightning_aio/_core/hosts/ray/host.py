@@ -25,8 +25,7 @@ from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.descriptors import Inbox
 from rlightning_aio._core.hosts.limits import limits_of
 from rlightning_aio._core.hosts.messages import Attached, Built, Closed, Death, Died, Reported
-from rlightning_aio._core.hosts.ray.actor import Batch, EnvActor, Reply
-from rlightning_aio._core.hosts.ray.row_table import RowTable
+from rlightning_aio._core.hosts.ray.actor import Batch, EnvActor, Reply, RowTable
 from rlightning_aio._core.hosts.running.runner import placed
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.entries import op_of
