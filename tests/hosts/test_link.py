@@ -25,6 +25,7 @@ from rlightning_aio._core.hosts.messages import (
 )
 from rlightning_aio._core.hosts.process.host import ForkServerHandle, ProcessHost, _surroundings
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema
@@ -133,9 +134,9 @@ class Scene:
 
     def serve(self, *in_rows: int) -> None:
         """Execute waiting requests; report those of `in_rows`, by default all."""
-        self.rings.serve(
-            lambda one: not in_rows or one in in_rows, unused, self.ring, unused, [], 0
-        )
+        is_in_row = lambda one: not in_rows or one in in_rows  # noqa: E731
+        side, fence = self.rings.side, self.rings.fence
+        kernel.serve(side, is_in_row, unused, self.ring, unused, [], 0, fence)
 
     def ring(self) -> None:
         self.rung += 1

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from protocol.memory_of_rings import unused
 
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.rings import (
     TrainerBell,
@@ -76,7 +77,8 @@ def test_a_released_bell_is_silent() -> None:
 def _work(rings: WorkerRings, channel: socket.socket) -> None:
     """A worker without envs, which ends when the trainer closes the channel."""
     while True:
-        if rings.serve(lambda _: True, unused, lambda: channel.send(b"!"), unused, [], 0):
+        ring, parts = lambda: channel.send(b"!"), (unused, [], 0, rings.fence)
+        if kernel.serve(rings.side, lambda _: True, unused, ring, *parts):
             continue
         if rings.fall_asleep():
             if not channel.recv(1 << 16):

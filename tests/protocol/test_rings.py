@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from protocol.memory_of_rings import both_sides, memory_size, unused
 
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
     SLOT_MASK,
@@ -57,7 +58,7 @@ def test_an_impossible_count_is_an_error_of_the_other_side(count: int) -> None:
         trainer.reports()
     memory[bell_size(1) :].cast("q")[REQUESTS_SENT] = count
     with pytest.raises(RuntimeError, match="in a ring for 4"):
-        worker.serve(lambda _: True, unused, unused, unused, [], 0)
+        kernel.serve(worker.side, lambda _: True, unused, unused, unused, [], 0, worker.fence)
     with pytest.raises(RuntimeError, match="in a ring for 4"):
         worker.requests()
 

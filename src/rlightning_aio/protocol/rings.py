@@ -50,7 +50,6 @@ from rlightning_aio.protocol.exchange import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -199,6 +198,7 @@ class WorkerRings:
     """The worker's side: reads requests, appends reports, publishes when it sleeps.
 
     Attributes:
+        side, fence: for `kernel.serve`, which takes entries, executes and reports them.
         own: the worker's own counts; see `exchange`.
     """
 
@@ -206,10 +206,10 @@ class WorkerRings:
         self._words, requests, reports = _split(buffer, num_envs)
         self._reports = reports
         self._mask = _capacity(num_envs) - 1
-        self._fence = new_fence()
+        self.fence = new_fence()
         self._bell = bell
         self.own = bell.own
-        self._side = WorkerSide(self._words, requests, reports, self.own, bell.words, bell.counter)
+        self.side = WorkerSide(self._words, requests, reports, self.own, bell.words, bell.counter)
         self._frames_sent = 0
         self._stops = _stops(self._words, num_envs)
         self._stopped = [0] * num_envs
@@ -231,7 +231,7 @@ class WorkerRings:
 
     def requests(self) -> list[int]:
         """Read all waiting entries, in order."""
-        return take(self._side, self._fence)
+        return take(self.side, self.fence)
 
     def has_frame(self) -> bool:
         """Return True if the channel has a frame that `frame_seen` has not counted."""
@@ -245,7 +245,7 @@ class WorkerRings:
         """Publish that an entry is being executed which `serve` does not execute."""
         self._words[CURRENT_SINCE_NS] = now_ns
         if not IN_ORDER:
-            self._fence()
+            self.fence()
         self._words[CURRENT] = current
 
     def pause(self) -> int:
@@ -262,27 +262,13 @@ class WorkerRings:
         """Publish that nothing is being executed."""
         self._words[CURRENT] = 0
 
-    def serve(
-        self,
-        execute: Callable[[int], bool],
-        finish: Callable[[int, Any], object],
-        ring: Callable[[], object],
-        receive: Callable[[], object],
-        steps: list[Callable[[], Any]],
-        first_slot: int,
-    ) -> bool:
-        """Read waiting entries and execute them in order; see `exchange.serve`."""
-        return kernel.serve(
-            self._side, execute, finish, ring, receive, steps, first_slot, self._fence
-        )
-
     def report(self, request: int, ring: Callable[[], object]) -> None:
         """Report an entry whose reply is in its row, and which `serve` has not executed."""
         sent = self.own[REPORTED]
         self._reports[sent & self._mask] = request
         self.own[REPORTED] = sent + 1
         if not IN_ORDER:
-            self._fence()
+            self.fence()
         self._bell.publish(sent + 1)
         if self._bell.is_due():
             ring()
@@ -300,7 +286,7 @@ class WorkerRings:
     def fall_asleep(self) -> bool:
         """Publish that this worker sleeps; False if an entry or a frame has just come."""
         self._words[WORKER_ASLEEP] = 1
-        self._fence()
+        self.fence()
         if self.has_news():
             self._words[WORKER_ASLEEP] = 0
             return False

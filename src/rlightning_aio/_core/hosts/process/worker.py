@@ -31,6 +31,7 @@ from rlightning_aio._core.hosts.running.runner import attach_all, close_all, dis
 from rlightning_aio._core.hosts.spinner import Spinner
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.envs.results import is_awaitable
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.entries import entry, slot_of
 from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
@@ -147,13 +148,15 @@ class Worker:
         while not self._closing:
             if rings.has_frame():
                 self._receive_some()
-            elif not rings.serve(
+            elif not kernel.serve(
+                rings.side,
                 self._run,
                 self._finish,
                 self._ring,
                 self._receive_some,
                 self._steps,
                 self._first_slot,
+                rings.fence,
             ):
                 break
 
