@@ -79,17 +79,3 @@ class Starting(gym.Env[int, int]):
         while action == HANG:
             time.sleep(1)
         return 0, 0.0, False, False, {}
-
-
-class Awaitable:
-    """An env whose methods are coroutine functions."""
-
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        self.env = env
-        self.observation_space, self.action_space = env.observation_space, env.action_space
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return self.env.reset(seed=seed, options=options)
-
-    async def step(self, action: int) -> Any:
-        return self.env.step(action)

@@ -148,24 +148,6 @@ def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_p
     assert batch.restarted.tolist() == [True, False, False]
 
 
-async def test_an_agent_that_is_cancelled_gives_its_env_back() -> None:
-    """A plain env in a worker of its own, whose step would never end."""
-    config = entry(2, envs_per_process=1)
-    async with rl.build_env_group(config) as group:
-
-        async def agent() -> None:
-            async with asyncio.timeout(0.05), group.episode("faulty-0") as episode:
-                await episode.step(Tokens().steps(["faulty-0"], {"faulty-0": "sleep"})["faulty-0"])
-
-        for _ in range(2):
-            with pytest.raises(TimeoutError):
-                await agent()
-        tokens = Tokens()
-        batch, _ = await group.reset()
-        assert not batch.restarted[1]
-        tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
-
-
 async def test_a_wait_for_an_aborted_step_ends_though_nothing_else_happens() -> None:
     """A call that waits without a look at the clock is woken, even if the abort is cancelled."""
     tokens = Tokens()

@@ -42,17 +42,6 @@ def results_of(group: Driven, count: int) -> dict[str, Any]:
     return found
 
 
-def test_the_env_whose_code_ran_is_at_fault(start: Start) -> None:
-    """Not those that waited longer; all that owed a reply have lost their episodes."""
-    group = start(waits())
-    let_wait(group, "w-0", "w-1")
-    group.step_async(steps({"w-2": DIE}))
-    found = results_of(group, 3)
-    assert {ret.info["env_at_fault"] for ret in found.values()} == {"w-2"}
-    found = group.step(steps(dict.fromkeys(group.group.env_ids, GO)))[0].values()
-    assert ["worker_restarted" in ret.info for ret in found] == [False, False, False, True]
-
-
 def test_of_envs_that_only_waited_nobody_is_named(start: Start) -> None:
     """The machine may be at fault as well as any of them."""
     group = start(waits())

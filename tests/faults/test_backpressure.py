@@ -35,28 +35,6 @@ def loaded(batch: Any) -> Any:
     return batch
 
 
-def test_worker_that_is_stopped_for_a_while_loses_nothing(start: Start) -> None:
-    """Requests before, during and after the stop each get their own reply."""
-    group, tokens = start(two_workers()), Tokens()
-    pid = pid_of(group, "faulty-0")
-    for _ in range(20):
-        group.step_async(tokens.steps(["faulty-0"]))
-        stop(pid)
-        group.step_async(tokens.steps(["faulty-1", "faulty-2", "faulty-3"]))
-        found: list[str] = []
-        while not {"faulty-2", "faulty-3"} <= set(found):
-            batch, _ = group.collect_async()
-            tokens.check(batch)
-            found += batch.ids()
-        assert "faulty-1" not in found
-        os.kill(pid, signal.SIGCONT)
-        while len(found) < 4:
-            batch, _ = group.collect_async()
-            tokens.check(batch)
-            found += batch.ids()
-        assert sorted(found) == group.group.env_ids
-
-
 def test_megabytes_for_a_stopped_worker_do_not_block_the_trainer(start: Start) -> None:
     """They wait until the worker reads; meanwhile the other worker replies."""
     group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()

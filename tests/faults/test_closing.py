@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from faults.slow_to_close import IMPORTS
+from faults.closing import IMPORTS, closed_in
 from patience import HANG
 
 import rlightning_aio as rl
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 pytestmark = pytest.mark.one_driver_for_each_place
-AWAITABLE, PLAIN = "slow to close, awaitable", "slow to close"
+AWAITABLE, PLAIN = "closing, awaitable", "closing"
 PLACES = {
     "loop": {"backend": AWAITABLE, "placement": "loop"},
     "awaiting worker": {"backend": AWAITABLE, "envs_per_process": 3},
@@ -28,10 +28,6 @@ def entry(place: str, folder: Path, **fields: Any) -> dict[str, Any]:
     kwargs = {"folder": str(folder), **fields.pop("env_kwargs", {})}
     fields = {"name": "e", "num_workers": 3, **IMPORTS, **PLACES[place], **fields}
     return {**fields, "env_kwargs": kwargs}
-
-
-def closed_in(folder: Path) -> list[str]:
-    return sorted(file.name for file in folder.iterdir())
 
 
 @pytest.mark.parametrize("place", PLACES)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,7 +18,6 @@ from patience import HANG
 import rlightning_aio.sync
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.protocol import kernel
-from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -174,42 +172,11 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
 
 
 class Waiting(Counts):
-    """Presses Ctrl-C in the trainer, and waits for a file."""
+    """Presses Ctrl-C in the trainer, and hangs."""
 
-    waits_for: Any = None
-
-    def wait(self, trainer: int, go_on: str) -> None:
+    def wait(self, trainer: int) -> None:
         os.kill(trainer, signal.SIGINT)
-        while not os.path.exists(go_on):  # noqa: PTH110  # In a worker.
-            time.sleep(0.001)
-
-    def save_state(self) -> Any:
-        if self.waits_for is not None:
-            self.wait(*self.waits_for)
-        return 0
-
-    def load_state(self, state: Any) -> None:
-        self.save_state()
-
-
-@pytest.mark.parametrize("interrupted", ["snapshot", "restore"])
-def test_a_vector_env_waits_for_the_rest_of_a_call_that_was_interrupted(
-    interrupted: str, tmp_path: Path
-) -> None:
-    """Its users know nothing of requests."""
-    go_on = tmp_path / "go-on"
-    env = VectorEnv([Waiting])
-    env.reset()
-    state = env.snapshot()
-    env.set_attr("waits_for", [(os.getpid(), str(go_on))])
-    with pytest.raises(KeyboardInterrupt):
-        env.snapshot() if interrupted == "snapshot" else env.restore(state)
-    timer = threading.Timer(0.1, go_on.touch)
-    timer.start()
-    env.reset()
-    env.step([1])
-    timer.join()
-    env.close()
+        time.sleep(3600)
 
 
 def test_an_interrupt_names_the_env_that_was_waited_for() -> None:
@@ -219,7 +186,7 @@ def test_an_interrupt_names_the_env_that_was_waited_for() -> None:
     group.init()
     group.reset()
     with pytest.raises(KeyboardInterrupt) as caught:
-        group["a-1"].call("wait", os.getpid(), "/never")
+        group["a-1"].call("wait", os.getpid())
     (note,) = caught.value.__notes__
     assert re.fullmatch(r"no reply yet from a-1 \(for \d\.\d s\)", note)
     with pytest.warns(UserWarning, match="did not close in time and was killed; a-1 owed a reply"):
@@ -241,10 +208,10 @@ def trainer_of_worker() -> int:
 
 
 class Starting(Waiting):
-    """Presses Ctrl-C in the trainer while it is made, and goes on making itself."""
+    """Presses Ctrl-C in the trainer while it is made, and is never done."""
 
     def __init__(self) -> None:
-        self.wait(trainer_of_worker(), "/never")
+        self.wait(trainer_of_worker())
 
 
 class ClosingHere(Counts):
@@ -271,10 +238,10 @@ def test_an_interrupted_close_of_inline_envs_closes_all_of_them() -> None:
 
 
 class Closing(Waiting):
-    """Presses Ctrl-C in the trainer while it is closed, and goes on closing."""
+    """Presses Ctrl-C in the trainer while it is closed, and is never done."""
 
     def close(self) -> None:
-        self.wait(trainer_of_worker(), "/never")
+        self.wait(trainer_of_worker())
 
 
 def test_an_interrupted_close_does_all_that_a_close_does(tmp_path: Path) -> None:

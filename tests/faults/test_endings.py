@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
 import pytest
-from faults.leaving import ABORT, HANG, SLEEP, Awaitable, Leaving, Starting
+from faults.closing import closed_in
+from faults.leaving import ABORT, HANG, SLEEP, Leaving, Starting
 from faults.test_shutdown import processes_of, trainer, watched
 from kit.processes import fork_server_pid, stop
-from kit.scripted import DIE, RAISE, Scripted
+from kit.scripted import DIE, RAISE, Awaitable, Scripted
 from patience import HANG as PATIENCE
 
 import rlightning_aio
@@ -35,7 +36,7 @@ def entry(task: Any, **fields: Any) -> dict[str, Any]:
 def test_a_worker_ends_as_python_ends(kind: str, tmp_path: Path) -> None:
     """Envs are dropped, cycles too: files are written, folders removed, daemons ended."""
     make = partial(Leaving, tmp_path)
-    task = make if kind == "plain" else lambda: Awaitable(make())
+    task = make if kind == "plain" else partial(Awaitable, make)
     with rl.build_env_group(entry(task, close_timeout=PATIENCE)) as group:
         batch, _ = group.reset()
         started = {int(pid) for pid in batch.info("started")[0]}
@@ -82,7 +83,7 @@ def test_a_callable_can_know_that_it_was_called_before(kind: str, tmp_path: Path
 
     def made(k: int) -> Any:
         env = Noting(tmp_path / str(k))
-        return Awaitable(env) if kind in ("awaitable", "loop") else env
+        return Awaitable(lambda: env) if kind in ("awaitable", "loop") else env
 
     tasks = [partial(made, k) for k in range(2)]
     config = entry(tasks, num_workers=2, on_env_error="restart", max_restarts=9, **fields)
@@ -153,7 +154,7 @@ def test_what_outlives_a_worker_is_not_killed_with_it(kill: str) -> None:
 
 SLOW = """
     import asyncio, pathlib
-    from faults.slow_to_close import IMPORTS
+    from faults.closing import IMPORTS
     fields = {"name": "e", "num_workers": 2, "envs_per_process": 2, **IMPORTS}
     kwargs = {"seconds": float(sys.argv[3]), "folder": sys.argv[2]}
     limit = {"close_timeout": float(sys.argv[4])} if sys.argv[4] else {}
@@ -173,8 +174,8 @@ SLOW = """
 @pytest.mark.parametrize(
     ("backend", "seconds", "limit"),
     [
-        ("slow to close", "1", str(PATIENCE)),  # Each of two, one after the other.
-        ("slow to close, awaitable", "2", ""),
+        ("closing", "1", str(PATIENCE)),  # Each of two, one after the other.
+        ("closing, awaitable", "2", ""),
     ],
 )
 def test_close_timeout_holds_when_the_trainer_is_gone(
@@ -186,17 +187,17 @@ def test_close_timeout_holds_when_the_trainer_is_gone(
         assert process.stdout.readline() == "ready\n"
         # The workers have it open, too.
         process.stdout.read()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["e-0", "e-1"]
+    assert closed_in(tmp_path) == ["e-0", "e-1"]
 
 
 def test_an_env_that_does_not_close_in_time_is_killed_when_the_trainer_is_gone(
     tmp_path: Path,
 ) -> None:
-    arguments = ("slow to close", str(tmp_path), "1e6", "0.1", "killed")
+    arguments = ("closing", str(tmp_path), "1e6", "0.1", "killed")
     with trainer(SLOW, *arguments) as process:
         assert process.stdout is not None
         assert process.stdout.read() == "ready\n"
-    assert not list(tmp_path.iterdir())
+    assert not closed_in(tmp_path)
 
 
 class Port:
@@ -225,20 +226,6 @@ class Port:
     async def close(self) -> None:
         await asyncio.sleep(1.6)
         Port.is_open = False
-
-
-@pytest.mark.parametrize("placement", ["loop", "process"])
-@pytest.mark.parametrize("close_timeout", [None, PATIENCE])
-async def test_a_successor_is_made_when_the_env_before_it_has_closed(
-    placement: str, close_timeout: float | None
-) -> None:
-    fields = {"placement": placement, "step_timeout": 1.0, "close_timeout": close_timeout}
-    async with rlightning_aio.build_env_group(entry(Port, **fields)) as group:
-        batch, _ = await group.reset()
-        batch, _ = await group.step(batch.respond(action=[HANG]))
-        assert batch.restarted.tolist() == [True]
-        batch, _ = await group.step(batch.respond(action=[SLEEP]))
-        assert batch.restarted.tolist() == [False]
 
 
 async def test_an_env_that_is_aborted_as_it_is_made_closes_before_the_next(

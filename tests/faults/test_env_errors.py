@@ -138,23 +138,6 @@ def test_an_error_while_starting_fails_the_start(build: Start, place: str, name:
 
 
 @on_one_driver
-def test_an_error_of_a_preprocess_function_is_reported(start: Start) -> None:
-    """The function runs in the worker, as part of the step."""
-
-    def preprocess(response: Any) -> Any:
-        if response.action[1] < 0:
-            raise SystemExit("negative")
-        return response.action
-
-    group, tokens = start(two_workers(), preprocess_fn=preprocess), Tokens()
-    batch = tokens.steps(["faulty-1"])
-    batch.values()[0].action[1] = -1
-    with pytest.raises(EnvRaised, match="SystemExit: negative"):
-        group.step(batch)
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-
-
-@on_one_driver
 def test_an_error_of_close_is_a_warning_and_others_are_closed(start: Start) -> None:
     """The program can't do anything about it, but should know."""
     group = start(entry(len(ODDLY_RAISED)))

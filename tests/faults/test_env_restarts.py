@@ -42,18 +42,12 @@ def check_marked(batch: rl.BatchedData, env_id: str, cause: str, kind: str) -> N
     assert (info["worker_restarted"], info["env_at_fault"]) == (cause, env_id)
 
 
-@pytest.mark.parametrize("form", ["step", "step_async"])
-def test_an_exception_in_a_step_ends_one_episode(start: Start, form: str) -> None:
+def test_an_exception_in_a_step_ends_one_episode(start: Start) -> None:
     """The env is rebuilt, in the same process; all others have stepped."""
     group, tokens = start(two_workers(on_env_error="restart")), Tokens()
     pids = [ret.observation[1] for ret in group.reset()[0].values()]
     for number, (name, cause) in enumerate(CAUSES.items()):
-        asked = tokens.steps(group.group.env_ids, {"faulty-1": name})
-        if form == "step":
-            batch, _ = group.step(asked)
-        else:
-            group.step_async(asked)
-            batch, _ = group.collect_async(wait_all=True)
+        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": name}))
         check_marked(batch, "faulty-1", cause, "env_raised")
         others = [k for k, key in enumerate(batch.ids()) if key != "faulty-1"]
         tokens.check(batch.take(others))

@@ -28,10 +28,13 @@ def entry(**fields: Any) -> dict[str, Any]:
     return {"name": "f", "task": Scripted, "num_workers": 2, **place, **limits, **fields}
 
 
-def step(group: Driven, *actions: int) -> rl.BatchedData:
+def actions_of(group: Driven, *actions: int) -> rl.BatchedData:
     ids = group.group.env_ids
-    values = [rl.PolicyResponse(i, action) for i, action in zip(ids, actions, strict=False)]
-    return group.step(rl.BatchedData(ids[: len(values)], values))[0]
+    return rl.BatchedData(ids, [rl.PolicyResponse(i, a) for i, a in zip(ids, actions, strict=True)])
+
+
+def step(group: Driven, *actions: int) -> rl.BatchedData:
+    return group.step(actions_of(group, *actions))[0]
 
 
 def said(outcome: Any) -> tuple[str, str, str]:
@@ -60,7 +63,7 @@ def test_a_lost_episode_says_so_and_blames_no_neighbour(
 ) -> None:
     """The result of the next reset carries it, in a column and in its info."""
     group = start(entry())
-    group.step_async(group_actions(group, deed, GO))
+    group.step_async(actions_of(group, deed, GO))
     found: dict[str, Any] = {}
     while len(found) < 2:
         batch = group.collect_async()[0]
@@ -72,11 +75,6 @@ def test_a_lost_episode_says_so_and_blames_no_neighbour(
         found["f-1"] = step(group, GO, GO).outcome[1]
     assert said(found["f-1"]) == ("env_died", "infrastructure", "f-1")
     assert "f-0" in found["f-1"].cause
-
-
-def group_actions(group: Driven, *actions: int) -> rl.BatchedData:
-    ids = group.group.env_ids
-    return rl.BatchedData(ids, [rl.PolicyResponse(i, a) for i, a in zip(ids, actions, strict=True)])
 
 
 @pytest.mark.parametrize(
@@ -113,7 +111,7 @@ def test_awaitable_envs_say_the_same(start: Start, placement: str) -> None:
 
 def test_an_aborted_request_is_the_callers(start: Start) -> None:
     group = start(entry(num_workers=1, step_timeout=None))
-    group.step_async(group_actions(group, HANG))
+    group.step_async(actions_of(group, HANG))
     group.abort(["f-0"])
     outcome = step(group, GO).outcome[0]
     assert said(outcome) == ("cancelled", "caller", "f-0")

@@ -118,14 +118,10 @@ def reset_until_recycled(group: Any) -> None:
     [
         ({"recycle": {"episode": 1}}, "should be 'episodes' or 'memory_mb'"),
         ({"recycle": {"episodes": 0}}, "greater than or equal to 1"),
+        ({"recycle": {"episodes": 1}, "placement": "inline"}, "no worker that could die"),
+        ({"recycle": {"episodes": 1}, "placement": "loop"}, "no worker that could die"),
     ],
 )
 def test_wrong_settings_are_refused(fields: dict[str, Any], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
-        EnvConfig(task=Walk, **fields)
-
-
-@pytest.mark.parametrize("placement", ["inline", "loop"])
-def test_without_workers_there_is_nothing_to_renew(placement: str) -> None:
-    with pytest.raises(ConfigError, match="no worker that could die"):
-        rl.build_env_group(Walk, placement=placement, recycle={"episodes": 1})
+        rl.build_env_group(Walk, **fields)

@@ -101,27 +101,20 @@ def test_in_an_evaluation_an_episode_of_its_env_fails(where: str) -> None:
 
 
 @WHERE
-def test_a_collector_raises_it_once_and_goes_on(where: str) -> None:
+@pytest.mark.parametrize("wait_all", [False, True])
+def test_a_collector_raises_it_once_and_goes_on(where: str, *, wait_all: bool) -> None:
+    """With all of its envs, in each block."""
     with sync.build_env_group(entries(where)) as group:
-        collector = Collector(group, policy, num_transitions=8)
+        collector = Collector(group, policy, num_transitions=8, wait_all=wait_all)
         with pytest.raises(EnvRaised, match=r"'bad-0'.*can't be read") as raised:
             collect_for_ever(collector)
         assert raised.value.env_id == "bad-0"
         seen = set[int]()
         while seen != {0, 1}:
             rollout = collector.collect()
-            assert len(rollout.reward) == 8
-            seen.update(rollout.index.tolist())
-
-
-@WHERE
-def test_a_block_has_all_envs_after_it_was_raised(where: str) -> None:
-    with sync.build_env_group(entries(where)) as group:
-        collector = Collector(group, policy, num_transitions=8, wait_all=True)
-        with pytest.raises(EnvRaised, match=r"'bad-0'.*can't be read"):
-            collect_for_ever(collector)
-        for _ in range(3):
-            assert collector.collect().index.tolist() == [[0, 1]] * 4
+            assert rollout.reward.size == 8
+            seen.update(rollout.index.ravel().tolist())
+            assert not wait_all or rollout.index.tolist() == [[0, 1]] * 4
 
 
 @WHERE

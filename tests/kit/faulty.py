@@ -196,7 +196,6 @@ FAULTS: dict[str, Callable[[], object]] = {
     # To this thread: in a process with others, this thread would run on until one of them gets it.
     "stop": lambda: signal.pthread_kill(threading.get_ident(), signal.SIGSTOP),
     "report and sleep": _report_and_sleep,
-    "interrupt the trainer": lambda: _signal_trainer(signal.SIGINT),
     "call the trainer": lambda: _signal_trainer(signal.SIGUSR1),
     # Exceptions.
     "raise": _raise(ValueError, "as asked for"),

@@ -1,4 +1,4 @@
-"""``moving_arm.py ADDRESS NAME LOG``: a client whose env moves something real.
+"""``moving_arm.py ADDRESS LOG``: a client whose env moves something real.
 
 It writes a line into the file LOG before each motion. While a file LOG.hold exists, a motion goes
 on, until the arm is stopped, which makes the file LOG.stopped. It ends with the
@@ -71,7 +71,7 @@ def end_with_parent() -> None:
 
 
 if __name__ == "__main__":
-    address, name, log = sys.argv[1:]
+    address, log = sys.argv[1:]
     threading.Thread(target=end_with_parent, daemon=True).start()
-    with RemoteEnvClient(Arm(Path(log)), address, name=name, hardware=True) as client:
+    with RemoteEnvClient(Arm(Path(log)), address, name="arm", hardware=True) as client:
         client.run()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 import zmq
@@ -16,12 +15,8 @@ from patience import HANG
 
 from rlightning_aio import sync
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.protocol.net.space_description import describe
-from rlightning_aio.protocol.net.wire import VERSION, Bye, ClientHello, Reset, Welcome, Writer
+from rlightning_aio.protocol.net.wire import Bye, Reset, Welcome, Writer
 from rlightning_aio.remote import RemoteEnvClient
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ENTRY = served(clients=["arm", "greedy"], heartbeat=60.0)
 
@@ -33,22 +28,6 @@ def dial(address: str, count: int) -> list[socket.socket]:
         one.setblocking(False)
         one.connect_ex((host, int(port)))
     return made
-
-
-def step(group: Any, batch: Any) -> Any:
-    group.step_async(batch.respond(action=np.zeros((len(batch), 2), np.float32)))
-    return group.collect_async(deadline=HANG)[0]
-
-
-@contextlib.contextmanager
-def with_a_client() -> Iterator[tuple[Any, Any, ClientThread, Any]]:
-    """Yield a group, its listener, its only client, and the first results."""
-    with sync.build_env_group(ENTRY) as group:
-        friend = ClientThread(group["robots-0"].address, "arm")
-        batch, _ = group.reset(env_ids=["robots-0/arm"])
-        yield group, group["robots-0"]._server.listener, friend, batch
-        group.close()
-        friend.join()
 
 
 def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
@@ -157,41 +136,6 @@ def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: byt
                     pass
         look(group)
         assert not listener._open
-
-
-def hello() -> list[bytes]:
-    """Return the hello of a client that never sends a result, of the kind of `CountingEnv`."""
-    env = CountingEnv()
-    observation_space = describe(env.get_observation_space(), "observation")
-    action_space = describe(env.get_action_space(), "action")
-    return Writer().write(
-        ClientHello(
-            version=VERSION,
-            name="greedy",
-            observation_space=observation_space,
-            action_space=action_space,
-        )
-    )
-
-
-@pytest.mark.parametrize("goodbye", [True, False])
-def test_a_connection_that_ends_ends_its_session_at_once(goodbye: bool) -> None:
-    """What it sent before counts, and its client may come back under its name."""
-    with with_a_client() as (group, listener, _, first), zmq.Context() as context:
-        batch = first
-        for _ in range(3):
-            with context.socket(zmq.DEALER) as peer:
-                peer.linger = 0
-                peer.connect(group["robots-0"].address)
-                peer.send_multipart(hello())
-                while not peer.poll(0):
-                    batch = step(group, batch)
-                assert msgspec.msgpack.decode(peer.recv_multipart()[0])["type"] == "welcome"
-                if goodbye:
-                    peer.linger = int(1000 * HANG)
-                    peer.send_multipart(Writer().write(Bye(reason="enough")))
-            while len(listener._sessions._by_route) == 2:
-                batch = step(group, batch)
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from rlightning_aio.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from rlightning_aio.types import EnvRet
 
@@ -120,10 +120,15 @@ def test_lengths_count_each_server_once() -> None:
 def test_a_client_that_raises_is_reset_where_exceptions_are_borne() -> None:
     """By `on_env_error: restart`; the result is marked, as of an env that is rebuilt."""
     env = CountingEnv(0)
+
+    def fail_once() -> None:
+        env.on_step = lambda: None
+        raise EnvError("not there", blame="policy")
+
     fields = entry() | {"on_env_error": "restart"}
     with sync.build_env_group(fields) as group, clients(group, env):
         batch, _ = group.reset()
-        env.on_step = raise_once(env)
+        env.on_step = fail_once
         batch, _ = group.step(batch.respond(action=actions(batch)))
         assert batch.restarted.tolist() == [True]
         assert batch.outcome[0].blame == "policy"
@@ -132,16 +137,6 @@ def test_a_client_that_raises_is_reset_where_exceptions_are_borne() -> None:
         assert (batch.restarted.tolist(), batch.is_reset.tolist()) == ([False], [False])
         assert group.metrics()["envs/restarts"] == 1
         group.close()
-
-
-def raise_once(env: CountingEnv) -> Callable[[], None]:
-    """What an env does in a step that fails by its policy."""
-
-    def fail() -> None:
-        env.on_step = lambda: None
-        raise EnvError("not there", blame="policy")
-
-    return fail
 
 
 def test_a_server_that_is_restarted_gets_its_clients_back() -> None:

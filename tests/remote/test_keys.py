@@ -6,7 +6,6 @@ import os
 import shutil
 import stat
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
@@ -90,18 +89,6 @@ def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(
     path.write_text(path.read_text().replace(arm.decode(), leg.decode()))
     os.utime(path, ns=(times, times))
     assert (keys.callback("", arm), keys.callback("", leg)) == (False, True)
-
-
-def test_files_that_have_not_changed_are_not_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A lookup only compares their stamps."""
-    keys, _, arm, _ = laid_out(tmp_path)
-    later = time.time_ns() + 2_000_000_000
-    monkeypatch.setattr(time, "time_ns", lambda: later)
-    assert keys.callback("", arm)
-    monkeypatch.setattr("rlightning_aio.remote.keys.read_public_key", None)
-    assert keys.callback("", arm)
 
 
 def test_a_file_without_a_key_is_skipped_with_one_warning(

@@ -18,7 +18,7 @@ from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 from remote.proxy import Proxy
 
-from rlightning_aio import EnvAway, ResetNeeded, sync
+from rlightning_aio import BatchedData, EnvAway, PolicyResponse, ResetNeeded, sync
 from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
@@ -30,11 +30,11 @@ _TESTS = Path(__file__).parents[1]
 class ArmProcess:
     """An arm in a process of its own, which counts its motions."""
 
-    def __init__(self, address: str, log: Path, name: str = "arm") -> None:
+    def __init__(self, address: str, log: Path) -> None:
         self._log = log
         self._hold = log.with_suffix(".hold")
         self.process = subprocess.Popen(
-            [sys.executable, str(_TESTS / "remote" / "moving_arm.py"), address, name, str(log)],
+            [sys.executable, str(_TESTS / "remote" / "moving_arm.py"), address, str(log)],
             env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_TESTS), *sys.path])},
             stderr=subprocess.DEVNULL,
         )
@@ -241,35 +241,9 @@ def test_an_empty_place_delays_nobody() -> None:
             group.collect_async(wait_all=True)
         assert time.monotonic() - began >= 0.5
         assert group.pending == []
+        step = PolicyResponse("robots-0/0", action=np.zeros(2, np.float32))
         with pytest.raises(ResetNeeded):
-            group.step_async(sync_batch(["robots-0/0"]))
-
-
-def sync_batch(env_ids: list[str]) -> Any:
-    from rlightning_aio import BatchedData, PolicyResponse
-
-    return BatchedData(
-        env_ids, [PolicyResponse(one, action=np.zeros(2, np.float32)) for one in env_ids]
-    )
-
-
-def test_seeds_and_index_go_by_place() -> None:
-    """In every order of dialling, equal to local envs."""
-    for order in ((0, 1), (1, 0)):
-        with mixed(clients=["a", "b"]) as group:
-            address = group["robots-0"].address
-            names = ["a", "b"]
-            clients = []
-            for k in order:
-                clients.append(ClientThread(address, names[k], CountingEnv(k)))
-                count = len(clients)
-                wait_for(group, lambda count=count: len(group["robots-0"].clients) == count)
-            batch, _ = group.reset(seed=100)
-            assert batch.ids()[4:] == ["robots-0/a", "robots-0/b"]
-            assert batch.take([4, 5]).observation.tolist() == [[0, 104, 0], [1, 105, 0]]
-            group.close()
-            for client in clients:
-                client.join()
+            group.step_async(BatchedData([step.env_id], [step]))
 
 
 @pytest.mark.parametrize("operation", ["step", "reset"])

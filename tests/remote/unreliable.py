@@ -164,16 +164,15 @@ class World:
     Args:
         names: of the clients.
         places: how many, or the names of their clients.
-        server: further arguments of the server.
     """
 
-    def __init__(self, names: str = "ab", places: int | str = 2, **server: Any) -> None:
+    def __init__(self, names: str = "ab", places: int | str = 2) -> None:
         listed = [""] * places if isinstance(places, int) else list(places)
         self.seen = [Recorder() for _ in listed]
         self.places = [
             ClientPlace(f"srv/{name or k}", self.seen[k], name) for k, name in enumerate(listed)
         ]
-        self.server = ServerSessions("srv", self.places, **server)
+        self.server = ServerSessions("srv", self.places)
         self.clients = {name: Client(name, k + 1) for k, name in enumerate(names)}
         self.delivered: dict[tuple[str, bool], list[list[bytes]]] = {}
 

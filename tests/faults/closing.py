@@ -1,4 +1,6 @@
-"""Envs that take their time to close, as one does that deletes a sandbox."""
+"""Envs that note how they end, and may take their time to close, as one does that deletes a
+sandbox.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,15 @@ from gymnasium import spaces
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet
 
-IMPORTS = {"task": "-", "imports": ["faults.slow_to_close"]}
+IMPORTS = {"task": "-", "imports": ["faults.closing"]}
+HANG = 1
+"""The action of an awaitable env's step that never ends."""
 
 
-@ENVS.register("slow to close")
-class SlowToClose(BaseEnv):
+@ENVS.register("closing")
+class Closing(BaseEnv):
     """``env_kwargs``: `seconds` that a close takes; `hangs`, the index of the env whose close never
-    ends; `folder`, where a closed env leaves a file of its name.
+    ends; `folder`, where a file of the env's name says that it was left alone, and that it closed.
     """
 
     def get_observation_space(self) -> Any:
@@ -36,24 +40,34 @@ class SlowToClose(BaseEnv):
         kwargs = self.config.env_kwargs
         return 1e6 if kwargs.get("hangs") == self.worker_index else kwargs.get("seconds", 0.0)
 
-    def _closed(self) -> None:
-        (Path(self.config.env_kwargs["folder"]) / self.env_id).touch()
+    def _note(self, what: str) -> None:
+        with (Path(self.config.env_kwargs["folder"]) / self.env_id).open("a") as file:
+            file.write(f"{what}\n")
+
+    def on_disconnect(self) -> None:
+        self._note("left alone")
 
     def close(self) -> Any:
         time.sleep(self._seconds)
-        self._closed()
+        self._note("closed")
 
 
-@ENVS.register("slow to close, awaitable")
-class AwaitableSlowToClose(SlowToClose):
+@ENVS.register("closing, awaitable")
+class AwaitableClosing(Closing):
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         await asyncio.sleep(0)
         return super().reset(seed=seed, options=options)
 
     async def step(self, policy_resp: Any) -> Any:
-        await asyncio.sleep(0)
+        if policy_resp.action == HANG:
+            await asyncio.Event().wait()
         return super().step(policy_resp)
 
     async def close(self) -> None:
         await asyncio.sleep(self._seconds)
-        self._closed()
+        self._note("closed")
+
+
+def closed_in(folder: Path) -> list[str]:
+    """Return the envs that have closed."""
+    return sorted(file.name for file in folder.iterdir() if "closed\n" in file.read_text())
