@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rlightning_aio.errors import ConfigError
@@ -19,60 +19,37 @@ from rlightning_aio.plugins.piper.options import (
     check_reset_position,
 )
 
-
-@pytest.mark.parametrize(
-    ("limit", "value", "sent"),
-    [
-        (Limit("gripper", 0.0, 0.07), np.float32(0.07), 0.07),
-        (Limit("gripper", 0.0, 0.07), 0.07, 0.07),
-        (Limit("joint_1", -0.8, 0.8), np.clip(np.float32(1.0), -0.8, 0.8), 0.8),
-        (Limit("joint_1", -0.8, 0.8), np.clip(np.float64(-1.0), -0.8, 0.8), -0.8),
-        (Limit("rx", -math.pi, math.pi), np.float32(np.pi), math.pi),
-        (Limit("rx", -math.pi, math.pi), math.pi + 0.01, 0.01 - math.pi),
-        (Limit("rx", 2.8, 3.5), -3.1, math.tau - 3.1),
-        (Limit("rz", -0.5, 0.5), math.tau + 0.2, 0.2),
-        (Limit("joint_1", -0.8, 0.8), 0.80001, None),
-        (Limit("joint_1", -0.8, 0.8), 0.8 + math.tau, None),
-        (Limit("rx", 2.8, 3.5), -2.0, None),
-        (Limit("gripper", 0.0, 0.07), 0.070002, None),
-        (Limit("z", 0.0, 0.8), math.nan, None),
-        (Limit("rx", -math.pi, math.pi), math.inf, None),
-        (Limit("rx", -math.pi, math.pi), math.nan, None),
-    ],
-)
-def test_values_at_a_bound_are_sent(limit: Limit, value: Any, sent: float | None) -> None:
-    """Values that round to a bound are sent as the bound; whole turns are ignored."""
-    within = limit.within(float(value))
-    if within is None or sent is None:
-        assert within == sent
-    else:
-        assert limit.low <= within <= limit.high
-        assert math.remainder(within - sent, math.tau) == pytest.approx(0, abs=1e-6)
-
-
 BOUNDS = st.tuples(st.floats(-2, 2), st.floats(0.01, 3)).map(lambda pair: (pair[0], sum(pair)))
+NAMES = st.sampled_from(["joint_2", "x", "gripper", "rx"])
+AWAY = st.floats(-2e-5, 2e-5) | st.floats(-8, 8) | st.sampled_from([math.nan, math.inf, -math.inf])
 
 
-@given(BOUNDS, st.floats(-8, 8), st.sampled_from(["joint_2", "x", "rx"]))
-def test_nothing_beyond_a_bound_is_sent(bounds: Any, value: float, name: str) -> None:
-    """The sent value is within the bounds, and equals the given one up to bus units."""
+@settings(max_examples=300)
+@given(BOUNDS, NAMES, st.booleans(), AWAY, st.integers(-1, 1), st.sampled_from([float, np.float32]))
+def test_nothing_beyond_a_bound_is_sent(
+    bounds: Any, name: str, high: bool, away: float, turns: int, kind: Any
+) -> None:
+    """The sent value is within the bounds, and equals the given one up to bus units; whole turns
+    of an orientation are ignored.
+    """
     limit = Limit(name, *bounds)
+    value = float(kind(bounds[high] + away + turns * math.tau))
     sent = limit.within(value)
     if sent is None:
-        turned = [value, value - math.tau, value + math.tau] if name == "rx" else [value]
+        turned = [value + k * math.tau for k in range(-3, 4)] if name == "rx" else [value]
         assert not any(limit.low <= v <= limit.high for v in turned)
         return
     assert limit.low <= sent <= limit.high
-    away = value - sent
+    left = value - sent
     if name == "rx":
-        away = math.remainder(away, math.tau)
-    assert abs(away) <= HALF_UNIT[limit.unit] + 1e-6
+        left = math.remainder(left, math.tau)
+    assert abs(left) <= HALF_UNIT[limit.unit] + 1e-6
 
 
-@given(BOUNDS)
-def test_members_of_the_action_space_are_within(bounds: Any) -> None:
+@given(BOUNDS, NAMES)
+def test_members_of_the_action_space_are_within(bounds: Any, name: str) -> None:
     """The space's bounds are the limits in float32, rounded outwards, and are accepted."""
-    limit = Limit("joint_2", *bounds)
+    limit = Limit(name, *bounds)
     assert float(limit.low32) <= limit.low
     assert float(limit.high32) >= limit.high
     assert limit.within(float(limit.low32)) == limit.low
