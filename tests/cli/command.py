@@ -66,3 +66,11 @@ def start(*words: object) -> subprocess.Popen[str]:
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def line_with(child: subprocess.Popen[str], words: str) -> str:
+    """Return the next line on stderr that contains `words`."""
+    assert child.stderr is not None
+    while words not in (line := child.stderr.readline()):
+        assert line, "the command has ended"
+    return line

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
+from cli.command import CARTPOLE, invoke, invoke_json, line_with, run, start, write_config
 from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
@@ -91,9 +91,7 @@ def test_a_setting_that_cannot_start_is_reported_and_the_others_are_measured(
 def test_an_interrupted_bench_prints_its_results_so_far(tmp_path: Path) -> None:
     """Ctrl-C ends it after the present measurement."""
     with start("bench", write_config(tmp_path, CARTPOLE), "--rounds", 10**6, "--json") as child:
-        assert child.stderr is not None
-        while not child.stderr.readline().startswith("measuring"):
-            pass
+        line_with(child, "measuring")
         child.send_signal(signal.SIGINT)
         stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 130

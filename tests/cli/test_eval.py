@@ -7,7 +7,7 @@ import os
 import signal
 from typing import TYPE_CHECKING, Any
 
-from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
+from cli.command import CARTPOLE, invoke, invoke_json, line_with, run, start, write_config
 from patience import HANG
 
 if TYPE_CHECKING:
@@ -80,9 +80,7 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     file, films = tmp_path / "episodes.jsonl", tmp_path / "films"
     asked = ("--episodes", 2, "--resume", file, "--video", films, "--seed", 0, "--json")
     with start("eval", config, *asked) as child:
-        assert child.stderr is not None
-        while "waits" not in (line := child.stderr.readline()):
-            assert line, "it has ended"
+        line_with(child, "waits")
         child.send_signal(signal.SIGINT)
         stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 130, stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from cli.command import CARTPOLE, run, start, write_config
+from cli.command import CARTPOLE, line_with, run, start, write_config
 from patience import HANG
 
 if TYPE_CHECKING:
@@ -78,9 +78,7 @@ def test_ctrl_c_while_an_env_hangs_in_a_step(tmp_path: Path) -> None:
     config, pid_file = stuck(tmp_path, "step")
     with start("rollout", config, "--json") as child:
         worker = int(pid_file.read_text())
-        assert child.stderr is not None
-        while child.stderr.readline() != "collecting 10,000 steps\n":
-            pass
+        line_with(child, "collecting 10,000 steps")
         stdout, _ = interrupt(child)
     assert json.loads(stdout)["steps"] <= 2
     assert not is_alive(worker)
@@ -91,9 +89,7 @@ def test_ctrl_c_while_results_are_always_ready(tmp_path: Path, placement: str) -
     """It takes effect, and the summary has the results so far."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 8, "placement": placement})
     with start("rollout", config, "--steps", 10**9, "--json", "--min-results", 1) as child:
-        assert child.stderr is not None
-        while not child.stderr.readline().startswith("collecting"):
-            pass
+        line_with(child, "collecting")
         stdout, _ = interrupt(child)
     document = json.loads(stdout)
     assert document["interrupted"]

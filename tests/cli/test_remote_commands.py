@@ -12,7 +12,7 @@ import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
-from cli.command import COMMAND, TESTS, invoke, start, write_config
+from cli.command import COMMAND, TESTS, invoke, line_with, start, write_config
 from patience import HANG
 from run_python import output_of
 
@@ -36,14 +36,6 @@ def finishing(folder: Path, wanted_steps: int) -> str:
 def server_config(folder: Path, **env_kwargs: object) -> str:
     (folder / "server").mkdir()
     return write_config(folder / "server", {**SERVER, "env_kwargs": env_kwargs})
-
-
-def line_with(child: subprocess.Popen[str], words: str) -> str:
-    """Return the next line on stderr that contains `words`."""
-    assert child.stderr is not None
-    while words not in (line := child.stderr.readline()):
-        assert line, "the command has ended"
-    return line
 
 
 def spawn(command: str) -> subprocess.Popen[str]:

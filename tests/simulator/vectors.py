@@ -281,7 +281,7 @@ class Vectors(Session):
     def keep(self, observation: Any) -> None:
         """Keep an observation, to see at the end that nobody wrote to it."""
         if self.copies:
-            self.kept.append((observation, _copied(observation)))
+            self.kept.append((observation, deepcopy(observation)))
 
     def take(self, acts: list[Any], found: Any) -> None:
         observation, rewards, ends, infos = self.results(found)
@@ -428,11 +428,3 @@ def _vec_env() -> Any:
 
 
 VecEnv = _vec_env()
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _copied(part) for key, part in value.items()}
-    if isinstance(value, tuple):
-        return tuple(map(_copied, value))
-    return value.copy() if isinstance(value, np.ndarray) else value
