@@ -45,7 +45,7 @@ _OF_SINGLE_ENVS: Final = ("wrapper_class", "wrapper_kwargs", "monitor_dir", "mon
 _IGNORED: Final = {"start_method"}
 """Arguments of `VecEnv` without a meaning."""
 _FEWEST_TOGETHER: Final = 4
-"""Envs of a MuJoCo task for which a batch is faster than a loop, with what is around them."""
+"""From this number of MuJoCo envs on, a batch is faster than a loop, with what is around it."""
 
 
 def make_vec_env(

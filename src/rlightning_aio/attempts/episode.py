@@ -165,7 +165,7 @@ class AttemptEpisode:
         return found
 
     def _in_queue(self) -> float:
-        """Seconds for which what is in flight was not executed by the env, but waited for that."""
+        """Seconds that the request in flight has waited until its env executed it."""
         if self._asked_at is None or not self._queues:
             return 0.0
         inside = self._episode.seconds_in_env or 0.0
@@ -196,7 +196,7 @@ class AttemptInPlay(AttemptEpisode):
         return sum(self.rewards) if self.graded is None else self.graded
 
     def ran(self) -> float:
-        """Seconds for which it could run: not in a queue, nor while the loop was blocked."""
+        """Seconds that it could run: not in a queue, nor while the loop was blocked."""
         return self._clock.now() - self._began - self._queued - self._in_queue()
 
     def now(self) -> float:
@@ -209,7 +209,7 @@ class AttemptInPlay(AttemptEpisode):
 
     @property
     def in_step(self) -> float:
-        """Seconds for which the env executes a step that is in flight; 0 without."""
+        """Seconds that the env has spent on a step in flight; 0 without one."""
         if self._asked_at is None:
             return 0.0
         if self._queues:

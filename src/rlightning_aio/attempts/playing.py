@@ -119,7 +119,7 @@ def _started(engine: _Engine, group: EnvGroup) -> asyncio.Task[None]:
 
 
 def _left_first(tasks: Any, group: EnvGroup, whole: int, results: ResultsFile | None) -> Any:
-    """Put those of a list first of which a file has a `whole` group that was not handed out."""
+    """Put those of a list first that have a `whole` group in a file, not handed out yet."""
     if results is None or not isinstance(tasks, Sequence):
         return tasks
     assigned, left = Players(group).assigned, results.left()

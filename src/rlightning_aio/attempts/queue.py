@@ -317,7 +317,7 @@ class AttemptQueue:
     # -- envs that are gone -----------------------------------------------------------
 
     def lacking(self) -> int:
-        """The number of attempts that wait for envs of which none is free or busy."""
+        """The number of attempts that wait for envs while none of these is free or busy."""
         entry_of = self.players.entry_of
         entries, pinned = dict.fromkeys(self._entries()), dict.fromkeys(self._pinned_to())
         for env_id in chain(self.free, self.busy):  # Few are looked at: each entry has many.

@@ -85,7 +85,7 @@ class Try:
         self._woken: asyncio.Future[None] | None = None
         self.error: BaseException | None = None
         self._has_ended = False
-        self._prepared = 0.0  # Seconds for which its env was ready before its agent could play.
+        self._prepared = 0.0  # Seconds from when its env was ready until its agent could play.
 
     @property
     def env_id(self) -> str:

@@ -91,7 +91,7 @@ class _OpenBaseline:
         self._is_masked = can_be_masked(envs.action_space) and has_masks(envs.newest())
 
     async def measure(self, rule: Rule, seconds: float) -> Round:
-        """Step for `seconds`, after a tenth of that which does not count."""
+        """Step for `seconds`, after a tenth that does not count."""
         del rule
         self._round(seconds / 10)
         return self._round(seconds)

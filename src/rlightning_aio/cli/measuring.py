@@ -65,7 +65,7 @@ class Round:
 
 
 Measure: TypeAlias = "Callable[[Rule, float], Awaitable[Round]]"
-"""Measures for so many seconds, after a few steps that warm the caches."""
+"""Measures for some seconds, after a few steps that warm the caches."""
 
 
 class Place:
@@ -155,7 +155,7 @@ class _OpenGroup:
         self._sent_at = np.zeros(len(latest))
 
     async def measure(self, rule: Rule, seconds: float) -> Round:
-        """Collect by a rule for `seconds`, after a tenth of that which does not count."""
+        """Collect by a rule for `seconds`, after a tenth that does not count."""
         least, before = rule.min_results, self._restarts()
         one_round = self._step if least is None else partial(self._collect, least)
         await one_round(seconds / 10)

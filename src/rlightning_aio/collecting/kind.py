@@ -210,8 +210,6 @@ class EnvKind:
         gathered(staging.columns, order, outs)
         columns = mapped(shaped, outs)
         columns["done"] = zipped(np.bitwise_or, columns["terminated"], columns["truncated"])
-        for name, column in staging.of_places(order).items():
-            columns[name] = column.reshape(shape)
         return columns
 
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.columns import Rows
     from rlightning_aio.trees import Tree
 
+_OF_PLACES: Final = ("index", "first", "policy_version")
+"""Columns with the env of each place, the begin of a chain, and the version of the policy."""
 _NO_PLACE: Final = -1
 _NO_ROWS: Final = np.zeros(0, np.intp)
 
@@ -65,17 +67,14 @@ class Staging:
         self.columns: dict[str, Tree] = {}
         self.complete = 0
         self.end_observation: Tree = None
-        # Names of the columns that come with a request, fixed once any were sent.
+        # Names of the columns that a policy's request has, fixed once any were sent.
         self._given: KeysView[str] = {}.keys()
         self._is_settled = False
         # True once a transition was completed; the columns of resets may be incomplete.
         self._knows_results = False
-        # By place; `_make_room` adds one for each env.
-        self._env = np.zeros(quota, np.int64)
-        self._first = np.zeros(quota, np.bool_)
-        self._version = np.zeros(quota, np.int64)
-        self._is_complete = np.zeros(quota, np.bool_)
-        self._used = 0
+        # How many places there are, and how many are complete or in flight. `_make_room` adds one
+        # for each env.
+        self._size, self._used = quota, 0
         # By env: the place of its step in flight, and of its last transition; True if the next one
         # begins a chain; True if its episode is over and waits for a reset.
         self.made = np.zeros(0, np.int64)
@@ -105,9 +104,8 @@ class Staging:
     def _make_room(self, index: NDArray[np.int64]) -> None:
         known = len(self._place)
         count = max(int(index.max()) + 1, 2 * known)
-        size = self._quota + count
-        for name in ("_env", "_first", "_version", "_is_complete", "_end_place"):
-            setattr(self, name, grown(getattr(self, name), size))
+        self._size = size = self._quota + count
+        self._end_place = grown(self._end_place, size)
         self.columns = {name: grown(column, size) for name, column in self.columns.items()}
         self.made = grown(self.made, count)
         for name in ("_place", "_last", "_fresh", "_over", "_known", "_resets_in_same_step"):
@@ -147,12 +145,13 @@ class Staging:
         The observation is one of them; `version` is that of the policy. If the request can't be
         sent, the next one to these envs overwrites it.
         """
+        ours = (index, self._fresh[index], np.full(len(index), version, np.int64))
+        given = {**given, **dict(zip(_OF_PLACES, ours, strict=True))}
         if not self._is_settled:
             for name in self._given:
                 del self.columns[name]
-            self._given = dict.fromkeys(given).keys()
-            for name, values in given.items():
-                self.columns[name] = allocated(values, len(self._env))
+            self._given = dict.fromkeys(name for name in given if name not in _OF_PLACES).keys()
+            self.columns |= allocated(given, self._size)
         places = self._place[index]
         new = places < 0
         count = len(new.nonzero()[0])
@@ -165,9 +164,6 @@ class Staging:
         scattered(self.columns, rows, given)
         self._used += count
         self._place[index] = places
-        self._env[rows] = index
-        self._first[rows] = self._fresh[index]
-        self._version[rows] = version
 
     def note_sent(self) -> None:
         """Require all further requests to have the columns of the last one."""
@@ -219,7 +215,6 @@ class Staging:
                 scattered(self.columns[name], places, mapped(lambda leaf: leaf[rows], values))
         for name in self._infos:
             scattered(self.columns[name], places, results.info(name)[rows])
-        self._is_complete[places] = True
         self._last[index] = places
         self._place[index] = _NO_PLACE
         self.made[index] += 1
@@ -255,12 +250,11 @@ class Staging:
         return final
 
     def _adopt_results(self, results: ResultRows) -> None:
-        size = len(self._env)
-        self.columns |= allocated(results.outcome, size)
+        self.columns |= allocated(results.outcome, self._size)
         single = mapped(lambda leaf: leaf.astype(np.float32), self.columns["reward"])
         self.columns["reward"] = single
         for name in self._infos:
-            self.columns[name] = np.zeros(size)
+            self.columns[name] = np.zeros(self._size)
 
     def _note_ends(self, places: NDArray[np.intp], observation: Tree) -> None:
         first, after = self._num_ends, self._num_ends + len(places)
@@ -283,9 +277,11 @@ class Staging:
             held: rows of envs that have no step in flight.
         """
         self._end_chains(held)
-        places = self._is_complete[: self._used].nonzero()[0]
-        order = places[self._env[places].argsort(kind="stable")]
-        envs = self._env[order]
+        is_complete = np.ones(self._used, np.bool_)
+        is_complete[self._place[self._place >= 0]] = False
+        places, of_places = is_complete.nonzero()[0], self.columns["index"]
+        order = places[of_places[places].argsort(kind="stable")]
+        envs = of_places[order]
         position = np.empty(self._used, np.intp)
         position[order] = np.arange(len(order))
         ends = position[self._end_place[: self._num_ends]]
@@ -309,27 +305,15 @@ class Staging:
             row[held.index] = np.arange(len(held.index))
             self._note_ends(self._last[idle], gather(held.observation, row[idle]))
 
-    def of_places(self, order: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-        """Return the properties of places that are in no column, as new arrays."""
-        return {
-            "policy_version": self._version[order],
-            "index": self._env[order],
-            "first": self._first[order],
-        }
-
     def carry_over(self) -> None:
         """Drop complete transitions, and move steps in flight to the first places."""
         in_flight = (self._place >= 0).nonzero()[0]
         places = self._place[in_flight]
         now = slice(0, len(in_flight))
-        for name in self._given:
+        for name in (*self._given, *_OF_PLACES):
             column = self.columns[name]
             scattered(column, now, gather(column, places))
-        self._env[now] = in_flight
-        self._first[now] = self._first[places]
-        self._version[now] = self._version[places]
         self._place[in_flight] = np.arange(len(in_flight))
-        self._is_complete[:] = False
         self._last[:] = _NO_PLACE
         self.made[:] = 0
         self._used = len(in_flight)

@@ -3,7 +3,7 @@
 A policy is called with a batch of results. It returns actions, ``[n, *action]`` (a dict or tuple of
 such arrays for Dict and Tuple spaces, or a list with one action for each result), or a dict of
 columns with ``action``, or what `BatchedData.respond` returns. It may be a coroutine function;
-whoever calls it awaits it.
+its caller awaits it.
 """
 
 from __future__ import annotations

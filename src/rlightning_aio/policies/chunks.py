@@ -57,7 +57,7 @@ class ActionChunks:
     Raises:
         ValueError: `n_action_steps` is below 1, or not None beside `temporal_ensemble`, or an env
             has sub-environments.
-        BadAction: the policy did not return a chunk of so many actions for each result, or those
+        BadAction: the policy did not return a chunk of enough actions for each result, or those
             that are averaged are not floats.
     """
 
