@@ -103,8 +103,10 @@ def test_death_while_starting_fails_the_start_with_its_cause(
 
 @on_one_driver
 def test_error_has_the_output_of_the_worker_and_its_stack(start: Start) -> None:
-    """The Python stack at a segmentation fault, and what was printed before."""
-    group = start(entry(on_worker_death="raise"))
+    """The Python stack at a segmentation fault, and what was printed before; of a sudden SIGKILL,
+    which nothing else would explain, a hint at the out-of-memory killer.
+    """
+    group = start(entry(on_worker_death="raise", envs_per_process=1))
     group.call("faulty-0", "do", "print")
     with pytest.raises(WorkerDied) as caught:
         group.call("faulty-0", "do", "segfault")
@@ -114,14 +116,8 @@ def test_error_has_the_output_of_the_worker_and_its_stack(start: Start) -> None:
     assert "in string_at" in caught.value.stderr_tail
     assert "in do" in str(caught.value)
     assert "a call of do()" in str(caught.value)
-
-
-@on_one_driver
-def test_sigkill_hints_at_the_out_of_memory_killer(start: Start) -> None:
-    """Nothing else would explain a sudden SIGKILL."""
-    group = start(entry(on_worker_death="raise"))
     with pytest.raises(WorkerDied, match="run out of memory"):
-        group.call("faulty-0", "do", "sigkill")
+        group.call("faulty-1", "do", "sigkill")
 
 
 @on_one_driver

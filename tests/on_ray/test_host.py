@@ -103,13 +103,6 @@ async def test_what_the_user_wrote_reaches_the_actor(
         assert batch.values()[0].info == {"is": True}
 
 
-async def test_an_env_that_cannot_be_built_is_named(sync_facade: Place) -> None:
-    """Nothing is left running, whatever the others were about."""
-    fails = entry("bad", num_workers=3, envs_per_process=3, env_kwargs={"fails": 1})
-    with pytest.raises(StartFailed, match=r"env 'bad-1'.* could not be built: RuntimeError: no"):
-        await sync_facade.build([entry("good"), fails]).init()
-
-
 async def test_an_actor_without_a_place_says_what_it_asked_for(sync_facade: Place) -> None:
     asked = entry(
         "big", start_timeout=1, num_cpus=3, num_gpus=2, ray_options={"resources": {"robot": 1}}

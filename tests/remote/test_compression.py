@@ -11,7 +11,6 @@ from kit.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.remote import RemoteEnvClient
 
 
 class Camera(CountingEnv):
@@ -37,9 +36,3 @@ def test_a_trainer_sees_the_same_images() -> None:
             batch, _ = group.step(batch.respond(action=np.zeros((2, 2), np.float32)))
     for client in clients:
         client.join()
-
-
-def test_another_compression_is_refused() -> None:
-    other: Any = "jpeg"
-    with pytest.raises(rl.ConfigError, match="compression should be 'zstd' or None, not 'jpeg'"):
-        RemoteEnvClient(Camera(), "127.0.0.1", 9, compression=other)

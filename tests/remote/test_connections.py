@@ -14,7 +14,6 @@ from kit.counting import ClientThread, CountingEnv, look, served
 from patience import HANG
 
 from rlightning_aio import sync
-from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.wire import Bye, Reset, Welcome, Writer
 from rlightning_aio.remote import RemoteEnvClient
 
@@ -136,11 +135,3 @@ def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: byt
                     pass
         look(group)
         assert not listener._open
-
-
-@pytest.mark.parametrize(
-    "given", [("127.0.0.1",), ("tcp://127.0.0.1",), ("tcp://127.0.0.1:5555", 5555), ("ipc://x", 1)]
-)
-def test_an_address_that_is_not_whole_or_given_twice_is_refused(given: Any) -> None:
-    with pytest.raises(ConfigError, match=r"give a host and a port, or tcp://127.0.0.1:5555"):
-        RemoteEnvClient(CountingEnv(), *given)

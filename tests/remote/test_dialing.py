@@ -134,52 +134,61 @@ def test_a_client_takes_a_gymnasium_env_or_a_callable(made: str) -> None:
         assert stops == ["stop", "stop", "stop"], "it is stopped before it is closed"
 
 
-def test_an_awaitable_env_is_no_client() -> None:
-    """A client is a plain loop; the reason is given before it dials."""
+class Awaitable:
+    observation_space = action_space = gym.spaces.Discrete(2)
 
-    class Awaitable:
-        observation_space = action_space = gym.spaces.Discrete(2)
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any: ...
 
-        async def reset(self, *, seed: Any = None, options: Any = None) -> Any: ...
-
-        async def step(self, action: Any) -> Any: ...
-
-    with pytest.raises(
-        ConfigError, match=r"is awaitable .* a client steps its env in a plain loop"
-    ):
-        RemoteEnvClient(Awaitable, "127.0.0.1", 9)
+    async def step(self, action: Any) -> Any: ...
 
 
-def test_an_env_of_gyms_old_kind_is_named_as_such() -> None:
-    class Old:
-        observation_space = action_space = gym.spaces.Discrete(2)
+class Old:
+    """An env of Gym's old kind."""
 
-        def reset(self) -> int: ...
+    observation_space = action_space = gym.spaces.Discrete(2)
 
-        def step(self, action: Any) -> Any: ...
+    def reset(self) -> int: ...
 
-    with pytest.raises(TypeError, match=r"shimmy\.GymV21CompatibilityV0"):
-        RemoteEnvClient(Old, "127.0.0.1", 9)
+    def step(self, action: Any) -> Any: ...
 
 
-def test_an_env_that_can_not_be_a_client_is_closed() -> None:
-    """Nobody else has what a callable has made."""
-    closed: list[bool] = []
+class Unsupported(gym.Env[Any, Any]):
+    observation_space = gym.spaces.Graph(gym.spaces.Discrete(2), None)
+    action_space = gym.spaces.Discrete(2)
+    num_closed = 0
 
-    class Unsupported(gym.Env[Any, Any]):
-        observation_space = gym.spaces.Graph(gym.spaces.Discrete(2), None)
-        action_space = gym.spaces.Discrete(2)
-
-        def close(self) -> None:
-            closed.append(True)
-
-    with pytest.raises(ConfigError, match="can't be a remote client"):
-        RemoteEnvClient(Unsupported, "127.0.0.1", 9)
-    assert closed
+    def close(self) -> None:
+        Unsupported.num_closed += 1
 
 
-@pytest.mark.parametrize("heartbeat", [0, 0.05, -1, 86401, math.inf, math.nan])
-def test_a_heartbeat_is_a_number_of_seconds(heartbeat: float) -> None:
-    """Too short a one would end every session."""
-    with pytest.raises(ConfigError, match=r"heartbeat: should be 0\.1 to 86400 seconds"):
-        RemoteEnvClient(CountingEnv(), "127.0.0.1", 9, heartbeat=heartbeat)
+ADDRESS = "127.0.0.1", 9
+REFUSED: list[tuple[Any, Any, dict[str, Any], str]] = [
+    (Awaitable, ADDRESS, {}, "is awaitable .* a client steps its env in a plain loop"),
+    (Old, ADDRESS, {}, r"shimmy\.GymV21CompatibilityV0"),
+    (Unsupported, ADDRESS, {}, "can't be a remote client"),
+    *(
+        (CountingEnv(), given, {}, r"give a host and a port, or tcp://127.0.0.1:5555")
+        for given in (
+            ("127.0.0.1",), ("tcp://127.0.0.1",), ("tcp://127.0.0.1:5555", 5555), ("ipc://x", 1),
+        )
+    ),
+    *(
+        (CountingEnv(), ADDRESS, {"heartbeat": h}, r"heartbeat: should be 0\.1 to 86400 seconds")
+        for h in (0, 0.05, -1, 86401, math.inf, math.nan)
+    ),
+    (
+        CountingEnv(), ADDRESS, {"compression": "jpeg"},
+        "compression should be 'zstd' or None, not 'jpeg'",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("env", "address", "fields", "says"), REFUSED)
+def test_what_can_not_be_a_client_is_refused(
+    env: Any, address: Any, fields: dict[str, Any], says: str
+) -> None:
+    """Before it dials; an env that a callable has made is closed, as nobody else has it."""
+    before = Unsupported.num_closed
+    with pytest.raises(TypeError if env is Old else ConfigError, match=says):
+        RemoteEnvClient(env, *address, **fields)
+    assert Unsupported.num_closed - before == (env is Unsupported)
