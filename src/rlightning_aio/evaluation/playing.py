@@ -21,8 +21,8 @@ import numpy as np
 from rlightning_aio._core.group.api.facade import request_number
 from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import Attempt, success_of
-from rlightning_aio.batch.contents import lost_rows, readable
-from rlightning_aio.batch.parts import all_agents, summed_rewards
+from rlightning_aio.batch.contents import ended_episodes, lost_rows, readable
+from rlightning_aio.batch.parts import all_agents
 from rlightning_aio.errors import EnvAway, EnvFault, RLightningError, WorkerDied
 from rlightning_aio.evaluation.evaluation import Evaluation
 from rlightning_aio.outcomes import Outcome, bystanders, own_end
@@ -79,8 +79,6 @@ class PolicyPlay:
         self._jobs: dict[int, Job] = {}  # By place.
         self._counts = np.zeros(ends[-1], np.bool_)
         """An episode of the queue is going on; False before the result of its reset."""
-        self._reward = np.zeros(ends[-1])
-        self._length = np.zeros(ends[-1], np.int64)
         self._has_clients = len(group) > group.size()
         self._pending: set[str] = set()
         """Envs with a request in flight."""
@@ -255,19 +253,14 @@ class PolicyPlay:
     # -- results ----------------------------------------------------------------------
 
     def _record(self, batch: BatchedData) -> None:
-        """Add results to their episodes."""
+        """Note what results end and begin."""
         env_ids = batch.env_ids()
         lost = [row for row in lost_rows(batch) if not self._is_begun_as_asked(env_ids[row])]
         if lost:
             self._note_losses(batch, lost)
         places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
-        stepped = self._counts[places] & ~begins
-        rewards = np.where(stepped, summed_rewards(batch.reward).reshape(-1), 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):  # It has failed.
-            self._reward[places] += rewards
-        self._length[places] += stepped
         done = all_agents(batch.done)
-        ended = stepped & done.reshape(-1)
+        ended = self._counts[places] & ~begins & done.reshape(-1)
         if ended.any():
             self._note_ends(batch, ended.reshape(len(batch), -1))
         begins |= self._begun_again(env_ids, done).reshape(-1)
@@ -296,7 +289,6 @@ class PolicyPlay:
                 if place not in self._jobs and env_id not in self._begun:
                     self._take_next(env_id, sub_env)
                 self._counts[place] = place in self._jobs
-                self._reward[place] = self._length[place] = 0
 
     def _take_next(self, env_id: str, sub_env: int) -> None:
         """Give a sub-environment that resets itself its next episode."""
@@ -309,30 +301,34 @@ class PolicyPlay:
         rows = np.flatnonzero(ended.any(axis=1)).tolist()
         env_ids = batch.env_ids()
         terminated = all_agents(batch.terminated).reshape(len(batch), -1)
-        for row, info in zip(rows, batch.take(rows).info(), strict=True):
-            env_id = env_ids[row]
+        for row, (sums, info) in zip(rows, ended_episodes(batch, rows), strict=True):
+            env_id, returns, lengths = env_ids[row], *(np.atleast_1d(sums[name]) for name in "rl")
             for sub_env in np.flatnonzero(ended[row]).tolist():
                 outcome = own_end(env_id, info, terminated=bool(terminated[row, sub_env]))
-                self._end(env_id, sub_env, outcome, success_of(info, sub_env))
+                self._end(
+                    env_id,
+                    sub_env,
+                    outcome,
+                    reward=float(returns[sub_env]),
+                    length=int(lengths[sub_env]),
+                    success_value=success_of(info, sub_env),
+                )
                 self._take_next(env_id, sub_env)
             self._release(env_id)
 
     def _end(
-        self, env_id: str, sub_env: int, outcome: Outcome, success: float | None = None
+        self, env_id: str, sub_env: int, outcome: Outcome, reward: float = 0.0, **known: Any
     ) -> None:
         """Note that the episode of a sub-environment has ended, if it was one of the queue."""
         place = self._places[env_id][sub_env]
         job = self._jobs.pop(place, None)
         if job is None:
             return
-        reward = float(self._reward[place])
         if not (outcome.is_failure or math.isfinite(reward)):
             cause = "returned no reward" if math.isnan(reward) else f"rewards add up to {reward}"
             outcome = Outcome("env_raised", "env", cause, env_id)
-        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
-        if not outcome.is_failure:
-            attempt.reward, attempt.success_value = reward, success
-            attempt.length = int(self._length[place])
+        known = {} if outcome.is_failure else {"reward": reward, **known}
+        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env, **known)
         self._counts[place] = False
         self._ended.append((job, attempt))
 
