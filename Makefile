@@ -86,7 +86,7 @@ test-simulators: export OPENENV_PYTHON := $(CURDIR)/$(OPENENV)/bin/python
 test-simulators: environments ## the tests of every backend, on the real simulators (8 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py tests/test_wheel.py
+	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
 	$(TRAINERS)/bin/python -m pytest -m simulators -rs tests/trainers
 	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_simulators_page.py tests/envs/test_rendering.py tests/policies/test_real_servers.py

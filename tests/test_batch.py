@@ -155,16 +155,6 @@ def test_columns_need_no_values() -> None:
     assert batch["pendulum-0"] is value
 
 
-def test_dict_and_tuple_observations_are_trees_of_columns() -> None:
-    """As a whole and by value."""
-    tree = {"a": np.array([1, 2]), "b": (np.zeros((2, 3)), np.ones((2, 1)))}
-    batch = results(columns([0, 1], tree))
-    assert batch.observation is tree
-    one = batch["pendulum-1"].observation
-    assert one["a"] == 2
-    assert [part.tolist() for part in one["b"]] == [[0.0, 0.0, 0.0], [1.0]]
-
-
 def test_different_observation_spaces_do_not_stack() -> None:
     """Other columns do, in the order of the batch; the error says what to do."""
     batch = mixed()

@@ -27,7 +27,7 @@ from rlightning_aio.config import (
     parse_configs,
 )
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, Backend, placement_of
+from rlightning_aio.registry import BACKENDS, PLACEMENTS, Backend, placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -67,11 +67,6 @@ def test_a_file_gives_its_entries_in_order(write: Write) -> None:
         EnvConfig(name="hopper", backend="mujoco", task="Hopper-v5", num_workers=3),
         EnvConfig(name="cartpole", backend="gymnasium", task="CartPole-v1", max_episode_steps=50),
     ]
-
-
-def test_env_is_another_name_for_envs(write: Write) -> None:
-    """RLightning's files use either."""
-    assert load_config(write({"env": [HOPPER]})) == load_config(write({"envs": [HOPPER]}))
 
 
 @pytest.mark.parametrize(
@@ -178,14 +173,6 @@ def test_an_interpreter_is_found_as_by_a_shell() -> None:
     assert EnvConfig(**HOPPER, interpreter="~/bin/python").interpreter == str(
         Path.home() / "bin/python"
     )
-
-
-def test_an_env_server_needs_no_task() -> None:
-    """Its clients choose the task; every other backend requires one."""
-    if "env_server" not in ENVS.names():
-        pytest.skip("no env_server yet")
-    (config,) = parse_configs({"name": "robots", "backend": "env_server"})
-    assert config.task == ""
 
 
 def test_names_for_another_interpreter_are_not_checked() -> None:
@@ -380,14 +367,6 @@ def test_a_wrong_field_is_named_with_file_and_entry(
     assert said in message
     assert "\n" not in message
     assert caught.value.__cause__ is None
-
-
-def test_a_wrong_field_causes_no_further_messages() -> None:
-    """Defaults that depend on it are not checked."""
-    with pytest.raises(ConfigError) as caught:
-        EnvConfig(name="pole", backend="gymnasium", task="CartPole-v1", num_workers=0)
-    assert str(caught.value).startswith("EnvConfig: num_workers: should be ")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -635,11 +614,6 @@ def test_a_missing_simulator_is_named_with_its_install_command(absent: Backend) 
         check_installed(configs)
     assert "envs.1 ('cartpole'), backend" in str(caught.value)
     assert "make absent" in str(caught.value)
-
-
-def test_installed_simulators_pass() -> None:
-    """Core dependencies are installed."""
-    check_installed(parse_configs([HOPPER, CARTPOLE]))
 
 
 # ---- configurations of the project

@@ -6,7 +6,6 @@ import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from rlightning_aio.attempts import Attempt
 
 SHORT, LONG = 2, 8
 
@@ -109,42 +107,6 @@ def by_number(found: Evaluation) -> list[tuple[Any, ...]]:
         (one.env_id, one.sub_env, one.index, one.reward, one.length, one.success)
         for one in found.attempts
     )
-
-
-def test_episodes_are_listed() -> None:
-    """Each with its env, number, return and length, and values of its last info."""
-    listed: list[Attempt] = []
-    group = group_of(scripted(lambda seed: seed % 2 == 0, key="is_success"))
-    found = evaluated(group, 2, seed=4, on_episode=listed.append)
-    assert found.attempts == found.played == listed
-    assert by_number(found) == [
-        ("env-0", 0, 0, float(SHORT), SHORT, True),
-        ("env-0", 0, 1, float(LONG), LONG, False),
-    ]
-    assert [one.spec.seed for one in listed] == [4, 5]
-    assert {one.outcome.kind for one in listed} == {"terminated"}
-
-
-def test_published_figures_stay() -> None:
-    """Returns of a policy for CartPole that were published before there was one queue."""
-
-    def lean(batch: rl.BatchedData) -> Any:
-        return (batch.observation[..., 2] > 0).astype(int)
-
-    with sync.build_env_group("CartPole-v1", num_workers=3) as group:
-        found = evaluate(group, lean, 4, seed=0)
-        queued = evaluate(group, lean, [EpisodeSpec("", seed) for seed in range(6)])
-    returns = [one[3] for one in by_number(found)]
-    assert returns == [41, 36, 32, 48, 51, 25, 34, 51, 35, 39, 45, 43]
-    by_seed = sorted((one.spec.seed, one.reward) for one in queued.attempts)
-    assert by_seed == [*enumerate([41, 51, 35, 36, 25, 39])]
-    for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
-        pair = lambda mode=mode: SyncVectorEnv(  # noqa: E731
-            [lambda: gym.make("CartPole-v1")] * 2, autoreset_mode=mode
-        )
-        with group_of(pair, pair) as group:
-            found = evaluate(group, lean, 2, seed=7)
-        assert [one[3] for one in by_number(found)] == [34, 55, 45, 47, 48, 40, 51, 53]
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)

@@ -17,7 +17,6 @@ from rlightning_aio.config import parse_configs
 from rlightning_aio.config.checks import check_installed
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, MujocoEnv
-from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import BACKENDS, Backend, Registry
 
 if TYPE_CHECKING:
@@ -114,16 +113,6 @@ def test_naming_a_backend_imports_nothing(announce: Announce) -> None:
         "sys.exit(bool(heavy & sys.modules.keys()))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_an_unknown_backend_raises_with_the_nearest_name() -> None:
-    """The message lists all known names."""
-    envs = Registry()
-    envs.register("own")(OwnEnv)
-    with pytest.raises(ConfigError, match=r"unknown backend 'mujco'; did you mean 'mujoco'\?"):
-        envs.resolve("mujco")
-    with pytest.raises(ConfigError, match=r"known: .*gymnasium.*mujoco.*own"):
-        envs.resolve("zzzzz")
 
 
 @pytest.mark.parametrize("backend", BACKENDS.values(), ids=lambda backend: backend.name)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import pickle
 from typing import Any
 from unittest import mock
@@ -13,7 +11,6 @@ import pytest
 from gymnasium import spaces
 
 import rlightning_aio as rl
-from rlightning_aio.collecting import Collector
 from rlightning_aio.spaces import Anything
 
 
@@ -81,28 +78,6 @@ async def test_a_single_response_makes_a_list_of_one_action() -> None:
         group.step_async(rl.BatchedData(["t-1"], [rl.PolicyResponse("t-1", {"content": "x"})]))
         batch, _ = await group.collect_async()
         assert batch.sent.action == [{"content": "x"}]
-
-
-async def test_rollouts_hold_lists_next_to_arrays() -> None:
-    def policy(batch: Any) -> dict[str, Any]:
-        tokens = [list(range(len(m))) for m in batch.observation["messages"]]
-        return {"action": say(batch), "tokens": tokens, "log_prob": np.zeros(len(batch))}
-
-    async with rl.build_env_group(entry()) as group:
-        with group.auto_reset(math.inf):
-            collector = Collector(group, policy, num_transitions=24, min_results=2, seed=0)
-            for _ in range(3):
-                rollout = await collector.collect()
-    seen, counts = rollout.observation["messages"], rollout.observation["count"]
-    assert isinstance(rollout.tokens, list)
-    assert list(map(len, rollout.tokens)) == list(map(len, seen)) == (counts[:, 0] + 1).tolist()
-    assert isinstance(rollout.action, list)
-    after = rollout.next_observation["messages"]
-    assert [messages[-1]["content"] for messages in after] == [a["content"] for a in rollout.action]
-    assert len(rollout.end_observation["messages"]) == len(rollout.ends)
-    assert json.loads(json.dumps(seen)) == seen
-    assert rollout.log_prob.shape == (24,)
-    assert rollout.advantages(np.zeros(24), np.zeros(len(rollout.ends)), 0.9, 0.9).shape == (24,)
 
 
 async def test_nothing_is_pickled_on_the_loop() -> None:

@@ -61,25 +61,27 @@ class Task:
         }
 
 
-INLINE = {"placement": "inline", "num_workers": 2}
-ONE = {"envs_per_process": 2, "num_workers": 2}
-TWO = {"envs_per_process": 2, "num_workers": 4}
-FOUR = {"envs_per_process": 1, "num_workers": 4}
-EIGHT = {"envs_per_process": 1, "num_workers": 8}
-PLACEMENTS = {"inline": INLINE, "one": ONE, "two": TWO, "eight": EIGHT}
-# All in one group.
-TOGETHER = {"inline": INLINE, "one": ONE, "two": TWO, "four": FOUR}
+PLACEMENTS: dict[str, dict[str, Any]] = {
+    "inline": {"placement": "inline", "num_workers": 2},
+    "one": {"envs_per_process": 2, "num_workers": 2},
+    "two": {"envs_per_process": 2, "num_workers": 4},
+    "four": {"envs_per_process": 1, "num_workers": 4},
+    "eight": {"envs_per_process": 1, "num_workers": 8},
+}
 
 CARTPOLE = Task("gymnasium", "CartPole-v1", 25, num_envs=8)
 TREE = Task("gymnasium", "Tree-v0", 40, ("group.sample_envs",))
 HOPPER = Task("mujoco", "Hopper-v5", 20)
-# Each in two placements, with as few envs as possible, because bare envs take time, too.
 MUJOCO = {
     Task("mujoco", "HalfCheetah-v5", 70): ("inline", "two"),
     HOPPER: ("one", "four"),
     Task("mujoco", "Ant-v5", 70, num_envs=2): ("inline", "one"),
     Task("mujoco", "Humanoid-v5", 70, num_envs=2): ("inline", "one"),
 }
+"""In two placements, with as few envs as possible, because bare envs take time, too."""
+TOGETHER = ("inline", "one", "two", "four")
+EACH = [(CARTPOLE, (name,)) for name in ("inline", "one", "two", "eight")]
+"""The entries of a group: one for each placement, or a group for each."""
 
 
 @cache
@@ -170,7 +172,8 @@ def seeds(env_ids: list[str]) -> dict[str, int]:
     return {env_id: SEED + int(env_id.rpartition("-")[2]) for env_id in env_ids}
 
 
-def run_sync(task: Task, entries: list[dict[str, Any]]) -> None:
+def run_sync(task: Task, placements: Iterable[str]) -> None:
+    entries = [task.entry(name, PLACEMENTS[name]) for name in placements]
     with sync.build_env_group(entries) as group:
         recorder = Recorder(task, group.env_ids)
         batch, flags = group.reset(seed=seeds(group.env_ids))
@@ -183,7 +186,8 @@ def run_sync(task: Task, entries: list[dict[str, Any]]) -> None:
         recorder.assert_complete()
 
 
-async def run_async(task: Task, entries: list[dict[str, Any]]) -> None:
+async def run_async(task: Task, placements: Iterable[str]) -> None:
+    entries = [task.entry(name, PLACEMENTS[name]) for name in placements]
     draw = Random(0)
     async with build_env_group(entries) as group:
         recorder = Recorder(task, group.env_ids)
@@ -202,47 +206,31 @@ async def run_async(task: Task, entries: list[dict[str, Any]]) -> None:
         recorder.assert_complete()
 
 
-def all_at_once(task: Task, placements: Iterable[str] = TOGETHER) -> list[dict[str, Any]]:
-    """Build one group with an entry for each placement, because starts take most of the time."""
-    return [task.entry(name, TOGETHER[name]) for name in placements]
+def shown(value: Any) -> str:
+    return value.name if isinstance(value, Task) else " ".join(value)
 
 
-def test_mujoco_trajectories_stepped_together() -> None:
-    """Inline, in one worker, in two and in four, all in one synchronous group.
+@pytest.mark.parametrize(
+    ("task", "placements"), [(HOPPER, TOGETHER), (TREE, TOGETHER), *EACH], ids=shown
+)
+def test_trajectories_stepped_together(task: Task, placements: tuple[str, ...]) -> None:
+    """In a synchronous group."""
+    run_sync(task, placements)
 
-    For one task; the next test has all of them, with results in any order.
-    """
-    run_sync(HOPPER, all_at_once(HOPPER))  # Its episodes end in both ways.
+
+@pytest.mark.parametrize(("task", "placements"), EACH, ids=shown)
+async def test_trajectories_collected_as_they_come(task: Task, placements: tuple[str, ...]) -> None:
+    """With results in any order, on either event loop."""
+    await run_async(task, placements)
 
 
-@pytest.mark.parametrize("task", MUJOCO, ids=lambda task: task.name)
+@pytest.mark.parametrize(("task", "placements"), [(TREE, TOGETHER), *MUJOCO.items()], ids=shown)
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_mujoco_trajectories_collected_as_they_come(task: Task) -> None:
-    """The same in the order of arrival; each task runs in some of the placements."""
-    await run_async(task, all_at_once(task, MUJOCO[task]))
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_trajectories_stepped_together(placement: str) -> None:
-    """A separate group for each placement, stepped synchronously."""
-    run_sync(CARTPOLE, [CARTPOLE.entry(placement, PLACEMENTS[placement])])
-
-
-def test_trajectories_of_every_kind_of_space_stepped_together() -> None:
-    """All placements in one synchronous group."""
-    run_sync(TREE, all_at_once(TREE))
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-async def test_trajectories_collected_as_they_come(placement: str) -> None:
-    """A separate group for each placement, on either event loop."""
-    await run_async(CARTPOLE, [CARTPOLE.entry(placement, PLACEMENTS[placement])])
-
-
-@pytest.mark.asyncio(loop_factories=["asyncio"])
-async def test_trajectories_of_every_kind_of_space_collected_as_they_come() -> None:
-    """All placements in one group; the other event loop runs the MuJoCo tasks."""
-    await run_async(TREE, all_at_once(TREE))
+async def test_more_trajectories_collected_as_they_come(
+    task: Task, placements: tuple[str, ...]
+) -> None:
+    """Every kind of space, and every task of MuJoCo that has a model of its own."""
+    await run_async(task, placements)
 
 
 def test_the_bare_trajectories_have_resets_and_ends_of_both_kinds() -> None:

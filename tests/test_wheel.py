@@ -6,8 +6,6 @@ import os
 import shutil
 import subprocess
 import sys
-import sysconfig
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +15,6 @@ ROOT = Path(__file__).parent.parent
 
 PROGRAM = """
 import sys
-from importlib.util import find_spec
 
 import gymnasium as gym
 import numpy as np
@@ -33,15 +30,6 @@ for envs in (VectorEnv(pendulums), make_vec("Pendulum-v1", 2, "async")):
     assert envs.step(np.zeros((2, 1), np.float32))[0].shape == observations.shape == (2, 3)
     envs.close()
 print("gymnasium")
-if find_spec("stable_baselines3"):
-    from rlightning_aio.sb3 import VecEnv
-
-    envs = VecEnv(pendulums)
-    envs.seed(1)
-    assert (envs.reset() == observations).all()
-    assert envs.step(np.zeros((2, 1), np.float32))[0].shape == (2, 3)
-    envs.close()
-    print("stable_baselines3")
 with build_env_group(pendulums) as group:
     batch, _ = group.reset(seed=1)
     assert (batch.observation == observations).all()
@@ -105,21 +93,3 @@ def test_both_work_under_each_python(version: str, built: dict[str, Path], tmp_p
         ]
     steps = ("rollout", ROOT / "configs" / "cartpole.yaml", "--steps", "500", "--json")
     assert '"steps"' in run(folder / "rlightning-aio", *steps, folder=tmp_path)
-
-
-@pytest.mark.simulators
-def test_it_works_in_an_empty_environment(tmp_path: Path) -> None:
-    """Installed with its dependencies; Stable-Baselines3 is shared, because it is large."""
-    run(sys.executable, *PIP, "wheel", "--no-deps", "--wheel-dir", ".", ROOT, folder=tmp_path)
-    run(sys.executable, "-m", "venv", "empty", folder=tmp_path)
-    python = tmp_path / "empty" / "bin" / "python"
-    (wheel,) = tmp_path.glob("*.whl")
-    run(python, *PIP, "install", "--constraint", ROOT / "constraints.txt", wheel, folder=tmp_path)
-    program = tmp_path / "program.py"
-    program.write_text(PROGRAM)
-    assert run(python, program, folder=tmp_path).split() == ["gymnasium", "factories"]
-    if find_spec("stable_baselines3") is None:
-        pytest.skip("stable_baselines3 is not installed")
-    lent = next((tmp_path / "empty" / "lib").glob("python*/site-packages")) / "lent.pth"
-    lent.write_text(sysconfig.get_path("purelib"))
-    assert "stable_baselines3" in run(python, program, folder=tmp_path)

@@ -74,48 +74,6 @@ async def test_each_task_is_attempted_as_often_as_asked(place: dict[str, Any]) -
             assert attempt.env_id in group.env_ids
 
 
-@pytest.mark.parametrize(
-    ("deed", "kind", "blame", "on_env_error"),
-    [
-        ("raise", "env_raised", "either", "raise"),
-        ("raise", "env_raised", "either", "restart"),
-        ("hang", "env_hung", "either", "raise"),
-        ("die", "env_died", "env", "raise"),
-    ],
-)
-async def test_a_failed_attempt_is_tried_again(
-    place: dict[str, Any], deed: str, kind: str, blame: str, on_env_error: str
-) -> None:
-    """In the end the group is complete, and the record says what failed before."""
-    here = place.get("placement") in ("loop", "inline")
-    if (deed == "die" and here) or (deed == "hang" and place.get("placement") == "inline"):
-        pytest.skip("it would be the end of the test")
-    tries = Counter[tuple[int, int]]()
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await episode.step(1)
-        which = episode.spec.seed, episode.index
-        tries[which] += 1
-        if tries[which] == 1 and episode.index == 0:
-            await episode.step(deed)
-        await earner(episode)
-
-    limit: dict[str, Any] = {"on_env_error": on_env_error}
-    if deed == "hang":
-        limit = {"step_timeout": 1.0}
-    async with rooms(place, **limit) as group:
-        found = await played(group, tasks(3), agent, size=2)
-    assert len(found) == 3
-    for attempts in found:
-        assert attempts.is_complete
-        assert attempts.rewards == [1 + 4.0 * attempts.spec.seed] * 2
-        failed = [outcome for outcome in attempts[0].failures if outcome.kind == kind]
-        assert (failed[0].blame, failed[0].env_id[:4]) == (blame, "room")
-        bystanders = {*attempts[0].failures, *attempts[1].failures} - {*failed}
-        assert all(one.blame == "infrastructure" for one in bystanders)
-        assert attempts[0].outcome.attempt == len(attempts[0].failures)
-
-
 async def test_what_the_policy_is_to_blame_for_is_not_tried_again(place: dict[str, Any]) -> None:
     async def agent(episode: AttemptEpisode) -> None:
         await episode.step("blame")
@@ -626,6 +584,22 @@ async def test_what_moves_something_real_is_not_reset_ahead() -> None:
     assert counts == [1, 2, 3, 4, 5, 6]
 
 
+async def test_an_attempt_whose_turn_never_came_is_cancelled() -> None:
+    async def agent(episode: AttemptEpisode) -> None:
+        while Slow.began < 2 or not episode.spec.seed:  # noqa: ASYNC110  # The others wait.
+            await asyncio.sleep(0)
+        await once(episode)
+
+    Slow.began = 0
+    async with rl.build_env_group(Slow, name="box", num_workers=4, placement="loop") as group:
+        specs = [EpisodeSpec("", 1)]
+        rules = Rules(max_concurrency=1, first=1)
+        (found,) = await played(group, specs, agent, 2, rules)
+        assert [one.outcome.kind for one in found] == ["terminated", "cancelled"]
+        assert group.pending == []
+        assert len(await played(group, specs, once, 4)) == 1
+
+
 class Poisoned(AwaitedRoom):
     """An action may end its worker, while all envs in that wait."""
 
@@ -802,23 +776,6 @@ async def test_a_model_that_is_away_at_first_is_no_bug_in_the_agent() -> None:
 
 async def mistaken(episode: AttemptEpisode) -> None:
     raise NameError("a typo")
-
-
-async def test_groups_that_were_not_handed_out_come_after_a_resume(tmp_path: Path) -> None:
-    """They were complete when the caller left; each group comes once."""
-    path, found = tmp_path / "attempts.jsonl", list[int | None]()
-    for most in (3, 2, 30):
-        async with sandboxes(8) as group:
-            with ResultsFile(path) as results:
-                groups = play(group, tasks(10), once, 2, results=results)
-                async with contextlib.aclosing(groups):
-                    async for attempts in groups:
-                        found.append(attempts.spec.seed)
-                        assert attempts.rewards == [1.0, 1.0]
-                        await asyncio.sleep(0.05)  # Others end meanwhile.
-                        if len(found) % 5 == most % 5:
-                            break
-    assert sorted(found) == [*range(10)]
 
 
 async def test_what_was_not_handed_out_comes_first_after_a_resume(tmp_path: Path) -> None:

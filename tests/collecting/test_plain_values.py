@@ -14,7 +14,6 @@ from gymnasium import spaces
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.batch import joined
 from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import BadAction
 from rlightning_aio.spaces import Anything
@@ -66,28 +65,6 @@ async def test_blocks_hold_values_of_envs_that_are_reset_apart() -> None:
                 counts = [[word[1] for word in row] for row in rollout.observation["word"]]
                 assert [row[1] for row in counts] == [0] * 5
                 assert counts[0][0] in (0, 5)
-
-
-async def test_joined_batches_keep_them() -> None:
-    """Of several entries, too, though the arrays between them have other bounds."""
-
-    class Other(Counting):
-        observation_space = spaces.Dict(
-            word=Anything(), pair=spaces.Tuple([Anything(), spaces.Box(-9, 99, (), np.float32)])
-        )
-
-    entries = [
-        rl.EnvConfig(name=kind.__name__, task=kind, num_workers=2, placement="loop")
-        for kind in (Counting, Other)
-    ]
-    async with rl.build_env_group(entries) as group:
-        batch, _ = await group.reset()
-        group.step_async(batch.respond(action=["on"] * 4))
-        later, _ = await group.collect_async(wait_all=True)
-        both = joined([batch, later])
-        check(both.observation)
-        assert both.observation["pair"][1].dtype == np.float32
-        check(both.take([5, 0]).observation)
 
 
 class Cloud(gym.Env[Any, Any]):

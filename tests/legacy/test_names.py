@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from typing import TYPE_CHECKING
 
 import pytest
-from patience import HANG
+from run_python import output_of
 
 from rlightning_aio.legacy import install
 from rlightning_aio.plugins.legacy.names import ALIASED, is_rlightning_installed
@@ -27,10 +25,7 @@ def _installed() -> None:
 def test_importing_rlightning_aio_does_not_import_legacy() -> None:
     """Its names are made on first use."""
     program = "import rlightning_aio, sys; print([m for m in sys.modules if 'legacy' in m])"
-    found = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=HANG, check=True
-    )
-    assert found.stdout.strip() == "[]"
+    assert output_of("-c", program).strip() == "[]"
 
 
 def test_every_name_of_the_table_can_be_imported() -> None:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from patience import HANG
 
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
@@ -135,44 +134,6 @@ def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:
         robot.steps = STEPS  # It is finished.
         group.close()
         thread.join()
-
-
-def test_an_error_in_a_reset_has_the_results_of_other_robots() -> None:
-    """Also of those that answered before the one that fails."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        group = build_env_group(
-            EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
-        )
-    address = group.env_servers[0].get_address_port()
-    served = [serving(address, times=1) for _ in range(2)]
-    try:
-        came: set[str] = set()
-        while len(came) < 2:
-            batch, _ = group.reset()
-            came.update(batch.ids(), (ret.env_id for ret in batch.values()))
-            came.discard(group.env_ids[0])
-        bad = served[1][1]
-        collected, make_rows = threading.Event(), group._rows
-
-        def rows_of(batch: Any) -> Any:
-            collected.set()
-            return make_rows(batch)
-
-        def fail() -> EnvRet:
-            assert collected.wait(HANG)
-            raise RuntimeError("stuck")
-
-        group._rows, bad.reset = rows_of, fail
-        with pytest.raises(EnvRaised, match="stuck") as caught:
-            group.reset()
-        assert len(caught.value.results.values()) == 1
-    finally:
-        for _, robot in served:
-            robot.steps = STEPS
-        group.close()
-        for thread, _ in served:
-            thread.join()
 
 
 def test_a_loop_over_robots_that_come_and_go(tmp_path: Path) -> None:

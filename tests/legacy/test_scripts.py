@@ -6,14 +6,11 @@ The examples of RLightning's documentation run unchanged where its texts are nex
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
 import pytest
-from patience import HANG
+from run_python import output_of
 
 from rlightning_aio.plugins.legacy.names import is_rlightning_installed
 
@@ -22,25 +19,9 @@ pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning it
 TEXTS = Path(__file__).parents[2].parent / "shared" / "reference"
 
 
-def run(
-    script: Path, *arguments: str, folder: Path | None = None
-) -> subprocess.CompletedProcess[str]:
-    environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
-    return subprocess.run(
-        [sys.executable, "-m", "rlightning_aio.legacy", str(script), *arguments],
-        cwd=folder or script.parent,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-
-
 def check(script: Path, *arguments: str, folder: Path | None = None) -> str:
-    done = run(script, *arguments, folder=folder)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    command = ("-m", "rlightning_aio.legacy", script, *arguments)
+    return output_of(*command, folder=folder or script.parent, asyncio_debug=False)
 
 
 MODULE = """
@@ -141,18 +122,13 @@ def test_a_script_runs_with_its_own_env_and_arguments(tmp_path: Path) -> None:
     assert told == "ran as __main__ True ['entries.yaml', '0.5']\n"
 
 
-def test_a_missing_script_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "said"), [(["missing.py"], "missing.py: no such file"), ([], "usage")]
+)
+def test_a_missing_script_is_named(arguments: list[str], said: str) -> None:
     """Without an argument, the usage is printed."""
-    missing = run(tmp_path / "missing.py")
-    assert (missing.returncode, "missing.py: no such file" in missing.stderr) == (1, True)
-    usage = subprocess.run(
-        [sys.executable, "-m", "rlightning_aio.legacy"],
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert "usage" in usage.stderr
+    with pytest.raises(AssertionError, match=said):
+        output_of("-m", "rlightning_aio.legacy", *arguments)
 
 
 # -- the examples of RLightning's documentation

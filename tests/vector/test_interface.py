@@ -20,7 +20,7 @@ from gymnasium.error import (
     NoAsyncCallError,
     ResetNeeded,
 )
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 from kit.scripted import Awaited
 from patience import HANG
 from vector.toys import Toy, assert_alike, toy
@@ -249,33 +249,6 @@ class Sized(Plain):
     def __init__(self, high: float, actions: int) -> None:
         self.observation_space = spaces.Box(-high, high, (2,), np.float64)
         self.action_space = spaces.Discrete(actions)
-
-
-def test_spaces_must_match() -> None:
-    """According to the observation mode; action spaces must always be equal."""
-    both = [lambda: Sized(1, 3), lambda: Sized(2, 3)]
-    with pytest.raises(RuntimeError, match=r"env 1 is Box.*observation_mode='different'"):
-        VectorEnv(both, placement="inline")
-    env = VectorEnv(both, placement="inline", observation_mode="different")
-    theirs = SyncVectorEnv(both, observation_mode="different")
-    assert env.observation_space == theirs.observation_space
-    for one in (env, theirs):
-        one.close()
-    with pytest.raises(RuntimeError, match="action space of env 1"):
-        VectorEnv([lambda: Sized(1, 3), lambda: Sized(1, 4)], placement="inline")
-
-
-def test_attributes_of_the_vector_env() -> None:
-    """Spaces, metadata with the mode, render mode, seeds; without building an env here."""
-    env = VectorEnv([toy] * 2, autoreset_mode="Disabled", placement="inline")
-    assert (env.num_envs, env.render_mode) == (2, "rgb_array")
-    assert env.metadata["autoreset_mode"] is env.autoreset_mode is AutoresetMode.DISABLED
-    assert "autoreset_mode" not in Toy.metadata
-    assert env.single_observation_space == Toy.observation_space
-    env.reset(seed=[5, 9])
-    assert env.np_random_seed == (5, 9)
-    assert [frame.shape for frame in env.render()] == [(2, 2, 3)] * 2
-    env.close()
 
 
 def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:

@@ -20,14 +20,7 @@ if TYPE_CHECKING:
 INFOS = [{"x": 1.0}, {"x": 2.0, "done": True}]
 
 READERS: dict[str, Callable[[Any], Any]] = {
-    "iter": lambda infos: [*infos],
     "list": list,
-    "slice": lambda infos: infos[:],
-    "index": lambda infos: [infos[0], infos[-1]],
-    "len": lambda infos: INFOS[: len(infos)],
-    "equal": lambda infos: INFOS if infos == INFOS else None,
-    "bool": lambda infos: INFOS if infos else None,
-    "copy": lambda infos: infos.copy(),
     "copy.copy": copy.copy,
     "deepcopy": copy.deepcopy,
     "pickle": lambda infos: pickle.loads(pickle.dumps(infos)),
@@ -61,23 +54,14 @@ READERS_OF_COLUMNS: dict[str, Callable[[Any], Any]] = {
     "or": lambda infos: infos | {},
     "or of a dict": lambda infos: {} | infos,
     "in place": lambda infos: (made := {}, made.__ior__(infos))[0],
-    "items": lambda infos: dict(infos.items()),
     "keys": lambda infos: {key: infos[key] for key in infos.keys()},  # noqa: SIM118
-    "iter": lambda infos: {key: infos.get(key) for key in infos},
-    "in": lambda infos: COLUMNS if "x" in infos else None,
-    "values": lambda infos: dict(zip(COLUMNS, infos.values(), strict=True)),
-    "len": lambda infos: COLUMNS if len(infos) == 2 else None,
-    "bool": lambda infos: COLUMNS if infos else None,
-    "equal": lambda infos: COLUMNS if infos == COLUMNS else None,
     "equal to": lambda infos: COLUMNS if COLUMNS == infos else None,  # noqa: SIM300
     "keywords": lambda infos: dict(**infos),
-    "copy": lambda infos: infos.copy(),
     "copy.copy": copy.copy,
     "deepcopy": copy.deepcopy,
     "pickle": lambda infos: pickle.loads(pickle.dumps(infos)),
     "repr": lambda infos: eval(repr(infos)),
     "pop": lambda infos: {key: infos.pop(key) for key in ("x", "_x")},
-    "setdefault": lambda infos: {key: infos.setdefault(key, 7) for key in ("x", "_x")},
     "match": lambda infos: COLUMNS if _matched(infos) else None,
 }
 
