@@ -10,6 +10,7 @@ import json
 import logging
 import math
 import threading
+from contextlib import asynccontextmanager
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from rlightning_aio.errors import StartFailed
 from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerGone
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
     from pathlib import Path
 
 ENVS = 4
@@ -52,6 +54,17 @@ def entry(url: str, **fields: Any) -> dict[str, Any]:
     return {"name": "o", "backend": "openenv", "task": url, **fields}
 
 
+@asynccontextmanager
+async def one_env(capacity: int = 1, **fields: Any) -> AsyncGenerator[tuple[Misbehaving, Any]]:
+    """Yield a server and a group of one env, which was reset."""
+    async with (
+        Misbehaving(capacity) as server,
+        rl.build_env_group(entry(server.url, num_workers=1, **fields)) as group,
+    ):
+        await group.reset()
+        yield server, group
+
+
 FATES = ("idle loss", "lost before", "lost after", "restart", "half a frame", "no JSON")
 
 
@@ -59,11 +72,7 @@ FATES = ("idle loss", "lost before", "lost after", "restart", "half a frame", "n
 @on_asyncio
 async def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
     """The step is answered by the first result of a new episode; its action is not sent again."""
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
+    async with one_env() as (server, group):
         await group.step(steps_of("o-0"))
         server.fates.append(fate)
         batch, _ = await group.step(steps_of("o-0"))
@@ -87,11 +96,7 @@ async def test_a_lost_socket_is_a_lost_env(fate: str) -> None:
 @on_asyncio
 async def test_a_reply_that_nobody_waits_for_answers_no_other_request() -> None:
     """Replies have no numbers, so an aborted step ends its session."""
-    async with (
-        Misbehaving(capacity=2) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
+    async with one_env(capacity=2) as (server, group):
         server.fates.append("never")
         group.step_async(steps_of("o-0"))
         await server.asked.wait()
@@ -125,11 +130,7 @@ async def test_a_session_is_over_once_nobody_waits_for_a_reply(fate: str) -> Non
 @pytest.mark.parametrize("code", ERRORS)
 @on_asyncio
 async def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
+    async with one_env() as (server, group):
         server.fates.append(code)
         with pytest.raises(rl.EnvRaised, match=f"{code}: as it should not"):
             await group.step(steps_of("o-0"))
@@ -141,11 +142,7 @@ async def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
 @on_asyncio
 async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_again() -> None:
     """As workers that die do."""
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1, max_restarts=1)) as group,
-    ):
-        await group.reset()
+    async with one_env(max_restarts=1) as (server, group):
         server.fates.extend(["lost after", "ok", "lost after"])
         batch, _ = await group.step(steps_of("o-0"))
         assert batch.restarted.all()
@@ -159,11 +156,7 @@ async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_ag
 
 @on_asyncio
 async def test_other_messages_of_openenv_are_methods() -> None:
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
+    async with one_env() as (_, group):
         await group.step(steps_of("o-0"))
         assert (await group["o-0"].call("state"))["step_count"] == 1
         assert await group["o-0"].call("mcp", "tools/list", {"a": 1}) == {"result": {"a": 1}}
@@ -332,11 +325,7 @@ async def test_an_episode_without_any_reward_has_none(
 
     monkeypatch.setattr(Misbehaving, "_executed", with_rewards)
 
-    async with (
-        Misbehaving(capacity=1) as server,
-        rl.build_env_group(entry(server.url, num_workers=1)) as group,
-    ):
-        await group.reset()
+    async with one_env() as (_, group):
         found = [(await group.step(steps_of("o-0")))[0].reward.item() for _ in rewards]
     assert np.array_equal(found, expected, equal_nan=True)
 

@@ -63,11 +63,12 @@ def serving(handler: Callable[[ServerConnection], None], port: int = 0) -> Itera
 
 
 class OpenPiServer:
-    """Answers an observation with its chunk; keeps the observations."""
+    """Answers an observation with its chunk, or as `answer` does; keeps the observations."""
 
-    def __init__(self) -> None:
+    def __init__(self, answer: Callable[[ServerConnection, Any], None] | None = None) -> None:
         self.seen: list[dict[str, Any]] = []
         self.connections = 0
+        self._answer = answer or send_chunk
 
     def __call__(self, connection: ServerConnection) -> None:
         self.connections += 1
@@ -75,9 +76,11 @@ class OpenPiServer:
         for frame in connection:
             observation = unpacked(frame)
             self.seen.append(observation)
-            self.answer(connection, observation)
+            self._answer(connection, observation)
 
-    def answer(self, connection: ServerConnection, observation: dict[str, Any]) -> None:
-        actions = chunk_of(observation["observation/state"])
-        timing = {"infer_ms": 0.5}
-        connection.send(packed({"actions": actions, "server_timing": timing}))
+
+def send_chunk(connection: ServerConnection, observation: dict[str, Any]) -> None:
+    """Answer as a server of openpi does."""
+    actions = chunk_of(observation["observation/state"])
+    timing = {"infer_ms": 0.5}
+    connection.send(packed({"actions": actions, "server_timing": timing}))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import socket
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from patience import HANG
 from policies.counting import QUEUE, check, group_of
-from policies.servers import OpenPiServer, packed, serving
+from policies.servers import OpenPiServer, packed, send_chunk, serving
 from websockets.sync.client import connect
 
 import rlightning_aio as rl
@@ -20,6 +20,11 @@ from rlightning_aio.evaluation import evaluate
 from rlightning_aio.plugins import openpi
 from rlightning_aio.plugins.openpi import OpenPiPolicy
 from rlightning_aio.policies import ActionChunks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from websockets.sync.server import ServerConnection
 
 
 def evaluated(policy: Any, workers: int = 2, **fields: Any) -> Any:
@@ -42,14 +47,13 @@ def test_chunks_of_an_openpi_server_are_played() -> None:
 
 
 def test_a_lost_connection_is_an_error_and_the_next_call_connects_again() -> None:
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            if len(self.seen) == 1:
-                connection.close()
-            else:
-                super().answer(connection, observation)
+    def answer(connection: Any, observation: dict[str, Any]) -> None:
+        if len(server.seen) == 1:
+            connection.close()
+        else:
+            send_chunk(connection, observation)
 
-    server = Server()
+    server = OpenPiServer(answer)
     with serving(server) as url, OpenPiPolicy(url) as policy:
         with pytest.raises(PolicyServerError, match="has closed the connection in place of an"):
             evaluated(ActionChunks(policy, 3))
@@ -62,20 +66,16 @@ def test_what_is_sent_can_be_chosen(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     keys: list[Any] = []
 
-    class Server(OpenPiServer):
-        def __call__(self, connection: Any) -> None:
-            keys.append(connection.request.headers["Authorization"])
-            super().__call__(connection)
-
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            super().answer(connection, {"observation/state": observation["nested"]["state"]})
+    def answer(connection: Any, observation: dict[str, Any]) -> None:
+        keys.append(connection.request.headers["Authorization"])
+        send_chunk(connection, {"observation/state": observation["nested"]["state"]})
 
     def observe(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
         image = np.full((4, 6, 3), 7, np.uint8)[:, ::2]
         more = {"image": image, "gripper": np.float32(0.5), "n": np.int64(3), "ok": np.bool_(True)}
         return {"nested": {"state": observation}, "prompt": info["task_description"], **more}
 
-    server = Server()
+    server = OpenPiServer(answer)
     with serving(server) as url, OpenPiPolicy(url, observe, api_key="abc") as policy:
         check(evaluated(ActionChunks(policy, 3)))
     assert set(keys) == {"Api-Key abc"}
@@ -153,20 +153,23 @@ def test_a_silent_server_is_an_error(greets: bool, monkeypatch: pytest.MonkeyPat
         evaluated(policy)
 
 
+def refused(answer: Callable[[ServerConnection, Any], None], match: str) -> None:
+    """Check the error of an evaluation with a server that answers like this."""
+    server = OpenPiServer(answer)
+    refusal = pytest.raises(PolicyServerError, match=match)
+    with serving(server) as url, OpenPiPolicy(url) as policy, refusal:
+        evaluated(policy)
+    assert server.connections == 1
+
+
 def test_the_error_of_an_openpi_server_is_shown() -> None:
     """It is a text frame, a traceback."""
 
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            connection.send("Traceback …\nKeyError: 'observation/image'")
-            connection.close(1011)
+    def answer(connection: ServerConnection, _: Any) -> None:
+        connection.send("Traceback …\nKeyError: 'observation/image'")
+        connection.close(1011)
 
-    with (
-        serving(Server()) as url,
-        OpenPiPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match=r"reports an error:\nTrace.*\n.*/image'"),
-    ):
-        evaluated(policy)
+    refused(answer, r"reports an error:\nTrace.*\n.*/image'")
 
 
 def array_of(**fields: Any) -> bytes:
@@ -198,35 +201,13 @@ def array_of(**fields: Any) -> bytes:
 )  # fmt: skip
 def test_a_frame_that_is_no_answer_is_refused(frame: bytes, message: str) -> None:
     """Nothing in it is executed, and no memory is taken for what it only claims to hold."""
-
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            connection.send(frame)
-
-    with (
-        serving(Server()) as url,
-        OpenPiPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match=message),
-    ):
-        evaluated(policy)
+    refused(lambda connection, _: connection.send(frame), message)
 
 
 def test_a_frame_above_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """The connection is closed before it is read."""
     monkeypatch.setattr("rlightning_aio.plugins.openpi._MAX_BYTES", 1000)
-
-    class Server(OpenPiServer):
-        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
-            connection.send(bytes(1001))
-
-    server = Server()
-    with (
-        serving(server) as url,
-        OpenPiPolicy(url) as policy,
-        pytest.raises(PolicyServerError, match=r"1009 \(message too big\)"),
-    ):
-        evaluated(policy, 1)
-    assert server.connections == 1
+    refused(lambda connection, _: connection.send(bytes(1001)), r"1009 \(message too big\)")
 
 
 @pytest.mark.parametrize("url", ["localhost:8000", "http://localhost", "ws://", "ws://a:b", ""])
