@@ -9,7 +9,7 @@ import numpy as np
 from kit.scripted import Counts
 
 from rlightning_aio import sync
-from rlightning_aio.evaluation import EpisodeSpec
+from rlightning_aio.evaluation import EpisodeSpec, evaluate
 
 if TYPE_CHECKING:
     from rlightning_aio.evaluation import Evaluation
@@ -56,6 +56,12 @@ def chunk_of(observation: Any, horizon: int = 5) -> Any:
 def group_of(num_workers: int = 2, **fields: Any) -> sync.EnvGroup:
     entry = {"name": "env", "task": Counting, "placement": "inline", "num_workers": num_workers}
     return sync.build_env_group({**entry, **fields})
+
+
+def evaluated(policy: Any, workers: int = 2, retries: int = 2, **fields: Any) -> Evaluation:
+    """Play the queue with a policy, in a group of its own."""
+    with group_of(workers, **fields) as group, group.auto_reset(100):
+        return evaluate(group, policy, QUEUE, min_results=1, retries=retries)
 
 
 def check(found: Evaluation) -> None:

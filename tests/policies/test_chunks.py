@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from policies.counting import QUEUE, Counting, check, chunk_of, group_of
+from policies.counting import QUEUE, Counting, check, chunk_of, evaluated
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -33,22 +33,19 @@ class Asked:
 def test_a_policy_is_asked_when_actions_are_used_up_and_at_a_reset(place: str) -> None:
     """An episode of 4 steps leaves two actions of its last chunk, which no other episode plays."""
     asked = Asked()
-    with group_of(placement=place) as group, group.auto_reset(100):
-        check(evaluate(group, ActionChunks(asked, 3), QUEUE))
+    check(evaluated(ActionChunks(asked, 3), placement=place))
     steps = [(one.seed, step) for one in QUEUE for step in range(0, one.seed + 4, 3)]
     assert sorted(asked.seen) == steps
 
 
 def test_whole_chunks_are_played_without_a_number() -> None:
     """Their length may change."""
-    with group_of(env_kwargs={"period": 5}) as group, group.auto_reset(100):
-        check(evaluate(group, ActionChunks(chunks), QUEUE))
+    check(evaluated(ActionChunks(chunks), env_kwargs={"period": 5}))
 
 
 def test_no_action_is_left_over_after_a_lost_episode() -> None:
     """Every second episode of an env is lost in its third step, and played again."""
-    with group_of(env_kwargs={"breaks": True}) as group, group.auto_reset(100):
-        found = evaluate(group, ActionChunks(chunks, 3), QUEUE)
+    found = evaluated(ActionChunks(chunks, 3), env_kwargs={"breaks": True})
     check(found)
     assert found.failures["env_raised"] > 0
 
@@ -67,21 +64,16 @@ class Averaged(Counting):
 @pytest.mark.parametrize("breaks", [False, True])
 def test_predictions_for_a_step_are_averaged(breaks: bool) -> None:
     """Of one episode alone, the oldest with the largest weight."""
-    fields = {"task": Averaged, "env_kwargs": {"breaks": breaks}}
-    with group_of(**fields) as group, group.auto_reset(100):
-        check(evaluate(group, ActionChunks(chunks, temporal_ensemble=0.5), QUEUE))
+    policy = ActionChunks(chunks, temporal_ensemble=0.5)
+    check(evaluated(policy, task=Averaged, env_kwargs={"breaks": breaks}))
 
 
 def test_only_floats_are_averaged_and_every_step_asks() -> None:
     with pytest.raises(ValueError, match="no n_action_steps"):
         ActionChunks(chunks, 3, temporal_ensemble=0.0)
     whole = ActionChunks(lambda batch: chunks(batch).astype(int), temporal_ensemble=0.0)
-    with (
-        group_of(1) as group,
-        group.auto_reset(100),
-        pytest.raises(rl.BadAction, match="must be floats"),
-    ):
-        evaluate(group, whole, QUEUE)
+    with pytest.raises(rl.BadAction, match="must be floats"):
+        evaluated(whole)
 
 
 async def test_the_policy_may_be_a_coroutine_function() -> None:
@@ -104,8 +96,7 @@ def test_a_policy_may_reuse_its_memory() -> None:
         memory[: len(batch)] = chunks(batch)
         return memory[: len(batch)]
 
-    with group_of(4) as group, group.auto_reset(100):
-        check(evaluate(group, ActionChunks(policy, 3), QUEUE, min_results=1))
+    check(evaluated(ActionChunks(policy, 3), 4))
 
 
 def test_it_serves_an_evaluation_of_a_number_of_episodes() -> None:
@@ -136,12 +127,8 @@ def test_it_serves_an_evaluation_of_a_number_of_episodes() -> None:
 )
 def test_an_answer_that_is_no_chunk_is_refused(answer: Any, message: str) -> None:
     """The message says what it is, and what it should be."""
-    with (
-        group_of(1) as group,
-        group.auto_reset(100),
-        pytest.raises(rl.BadAction, match=message),
-    ):
-        evaluate(group, ActionChunks(lambda batch: answer, 3), QUEUE)
+    with pytest.raises(rl.BadAction, match=message):
+        evaluated(ActionChunks(lambda batch: answer, 3), 1)
 
 
 def test_sub_environments_and_a_number_below_one_are_refused() -> None:

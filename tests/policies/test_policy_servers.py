@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from patience import HANG
-from policies.counting import QUEUE, check, group_of
+from policies.counting import QUEUE, check, evaluated
 from policies.servers import OpenPiServer, packed, send_chunk, serving
 from websockets.sync.client import connect
 
 import rlightning_aio as rl
 from rlightning_aio.errors import PolicyServerError
-from rlightning_aio.evaluation import evaluate
 from rlightning_aio.plugins import openpi
 from rlightning_aio.plugins.openpi import OpenPiPolicy
 from rlightning_aio.policies import ActionChunks
@@ -25,11 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from websockets.sync.server import ServerConnection
-
-
-def evaluated(policy: Any, workers: int = 2, **fields: Any) -> Any:
-    with group_of(workers, **fields) as group, group.auto_reset(100):
-        return evaluate(group, policy, QUEUE)
 
 
 # -- right answers ------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from policies.counting import QUEUE, check, group_of
+from policies.counting import QUEUE, check, evaluated
 from run_python import output_of
 
 from rlightning_aio import sync
@@ -40,9 +40,7 @@ class Recurrent:
 
 def test_recurrent_state_belongs_to_one_episode() -> None:
     """It follows its env through batches of other envs, and is lost with its episode."""
-    fields = {"env_kwargs": {"breaks": True}}
-    with group_of(3, **fields) as group, group.auto_reset(100):
-        check(evaluate(group, Recurrent(), QUEUE, min_results=1, retries=5))
+    check(evaluated(Recurrent(), 3, retries=5, env_kwargs={"breaks": True}))
 
 
 def test_sub_environments_have_a_state_each() -> None:

@@ -6,19 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from policies.counting import QUEUE, check, chunk_of, group_of
+from policies.counting import QUEUE, check, chunk_of, evaluated
 from policies.servers import serving
 
-from rlightning_aio.evaluation import evaluate
 from rlightning_aio.plugins.openpi import OpenPiPolicy
 from rlightning_aio.policies import ActionChunks
 
 pytestmark = pytest.mark.simulators
-
-
-def evaluated(policy: Any, **kwargs: Any) -> Any:
-    with group_of(3) as group, group.auto_reset(100):
-        return evaluate(group, policy, QUEUE, **kwargs)
 
 
 def test_openpi_s_codec_reads_and_writes_the_frames() -> None:
@@ -36,5 +30,5 @@ def test_openpi_s_codec_reads_and_writes_the_frames() -> None:
             connection.send(codec.packb({"actions": actions, "server_timing": timing}))
 
     with serving(handler) as url, OpenPiPolicy(url) as policy:
-        check(evaluated(ActionChunks(policy, 3)))
+        check(evaluated(ActionChunks(policy, 3), 3))
     assert prompts == {f"lift {one.seed}" for one in QUEUE}
