@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,15 +14,27 @@ from vector.toys import assert_alike
 from rlightning_aio.envs.mujoco import outputs, resets
 from rlightning_aio.envs.mujoco.batch import MujocoBatch
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 pytestmark = pytest.mark.usefixtures("implementation")
 
 
-def pair(task: str, mode: AutoresetMode, **options: Any) -> tuple[MujocoBatch, SyncVectorEnv]:
+@contextmanager
+def pair(
+    task: str, mode: AutoresetMode = AutoresetMode.NEXT_STEP, **options: Any
+) -> Iterator[tuple[MujocoBatch, SyncVectorEnv]]:
+    """Yield a batch and Gymnasium's vector env, which were reset."""
+
     def make() -> Any:
         return gym.make(task, disable_env_checker=True, max_episode_steps=7, **options)
 
     ours = MujocoBatch(make(), 3, mode, num_threads=2)
-    return ours, SyncVectorEnv([make] * 3, autoreset_mode=mode)
+    theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    yield ours, theirs
+    ours.close()
+    theirs.close()
 
 
 def compare(ours: MujocoBatch, theirs: SyncVectorEnv, num_steps: int = 30) -> None:
@@ -35,55 +48,44 @@ def compare(ours: MujocoBatch, theirs: SyncVectorEnv, num_steps: int = 30) -> No
 @pytest.mark.parametrize("task", ["Hopper-v5", "Ant-v5"])
 def test_generators_go_on_as_gymnasiums(task: str, mode: AutoresetMode) -> None:
     """After resets that drew uniform, and normal, noise from them; also after a draw by a call."""
-    ours, theirs = pair(task, mode)
-    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
-    for _ in range(2):
-        compare(ours, theirs)
-        drawn = [
-            [each.bit_generator.state for each in envs.call("np_random")] for envs in (ours, theirs)
-        ]
-        assert drawn[0] == drawn[1]
-        for generators in (ours.call("np_random"), theirs.call("np_random")):
-            for generator in generators:
-                generator.random(3)
-    ours.close()
-    theirs.close()
+    with pair(task, mode) as (ours, theirs):
+        for _ in range(2):
+            compare(ours, theirs)
+            drawn = [
+                [each.bit_generator.state for each in envs.call("np_random")]
+                for envs in (ours, theirs)
+            ]
+            assert drawn[0] == drawn[1]
+            for generators in (ours.call("np_random"), theirs.call("np_random")):
+                for generator in generators:
+                    generator.random(3)
 
 
 def test_noise_is_the_same_where_numpy_hides_its_normal_numbers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(resets, "_normal", lambda: None)
-    ours, theirs = pair("Ant-v5", AutoresetMode.NEXT_STEP)
-    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
-    compare(ours, theirs)
-    ours.close()
-    theirs.close()
+    with pair("Ant-v5") as both:
+        compare(*both)
 
 
 @pytest.mark.parametrize("task", ["Swimmer-v5", "Walker2d-v5", "Humanoid-v5"])
 def test_weights_may_be_numbers_of_numpy(task: str) -> None:
     """Then Gymnasium computes with other types than with Python's numbers."""
     weights = {"forward_reward_weight": np.float64(1.5), "ctrl_cost_weight": np.float32(0.3)}
-    ours, theirs = pair(task, AutoresetMode.NEXT_STEP, **weights)
-    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
-    compare(ours, theirs)
-    ours.close()
-    theirs.close()
+    with pair(task, **weights) as both:
+        compare(*both)
 
 
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Ant-v5"])
 def test_actions_may_have_any_type(task: str) -> None:
     """Costs are computed in their type, by NumPy for some; they may be a part of something else."""
-    ours, theirs = pair(task, AutoresetMode.NEXT_STEP)
-    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
-    count, width = ours.action_space.shape or ()
-    for kind in (np.float32, np.float16, np.float64, np.int64, np.float16, np.float32):
-        wide = np.random.default_rng(5).uniform(-2, 2, (count, 2 * width)).astype(kind)
-        for _ in range(9):
-            assert_alike(ours.step(wide[:, ::2]), theirs.step(wide[:, ::2]), str(kind))
-    ours.close()
-    theirs.close()
+    with pair(task) as (ours, theirs):
+        count, width = ours.action_space.shape or ()
+        for kind in (np.float32, np.float16, np.float64, np.int64, np.float16, np.float32):
+            wide = np.random.default_rng(5).uniform(-2, 2, (count, 2 * width)).astype(kind)
+            for _ in range(9):
+                assert_alike(ours.step(wide[:, ::2]), theirs.step(wide[:, ::2]), str(kind))
 
 
 def test_a_build_of_another_version_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:

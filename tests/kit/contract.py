@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from typing import TYPE_CHECKING, Any, ClassVar, cast
-from unittest import SkipTest
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import pytest
 
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
@@ -22,7 +22,7 @@ from rlightning_aio.trees import as_numpy, mapped
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Sequence
+    from collections.abc import Generator, Iterator, Sequence
 
     import gymnasium as gym
 
@@ -60,7 +60,7 @@ class EnvContract:
         episode, a reset without a seed takes the place of the next action.
         """
         del actions
-        raise SkipTest("no bare simulator to compare with")
+        pytest.skip("no bare simulator to compare with")
 
     def actions(self, env: BaseEnv) -> list[Any]:
         """Return seeded random actions; override it if the action space is unbounded."""
@@ -163,14 +163,14 @@ class EnvContract:
 
     def test_torch_actions_are_taken(self) -> None:
         """An action may be a torch tensor, with the same effect as the array."""
-        tensor = _tensor_maker()
+        torch = pytest.importorskip("torch")
         with self.opened() as env, self.opened() as other:
             env.reset(seed=self.seed)
             other.reset(seed=self.seed)
             for action in self.actions(env)[:3]:
                 assert same(
                     values_of(_step(env, action)),
-                    values_of(_step(other, mapped(tensor, action))),
+                    values_of(_step(other, mapped(torch.as_tensor, action))),
                 )
 
     def test_it_is_the_bare_simulator(self) -> None:
@@ -202,34 +202,23 @@ def outcomes_of(env: BaseEnv, actions: Sequence[Any], seed: int) -> Iterator[Exp
 def values_of(result: Any) -> Expected:
     """Return observation, reward and ends of a result, without torch tensors."""
     assert isinstance(result, EnvRet | MultiAgentEnvRet), f"not a result: {result}"
-    return cast(
-        "Expected",
-        tuple(
-            map(
-                as_numpy,
-                (
-                    result.observation,
-                    result.last_reward,
-                    result.last_terminated,
-                    result.last_truncated,
-                ),
-            )
-        ),
+    ends = result.last_terminated, result.last_truncated
+    observation, reward, terminated, truncated = map(
+        as_numpy, (result.observation, result.last_reward, *ends)
     )
+    return observation, reward, terminated, truncated
 
 
 def same(one: Any, other: Any) -> bool:
     """Return True if two values agree in structure, shapes and every bit; NaN equals NaN."""
     if isinstance(one, dict):
-        entries = cast("dict[Any, Any]", one)
         return (
             isinstance(other, dict)
-            and entries.keys() == cast("dict[Any, Any]", other).keys()
-            and all(same(value, other[key]) for key, value in entries.items())
+            and one.keys() == other.keys()
+            and all(same(value, other[key]) for key, value in one.items())
         )
     if isinstance(one, tuple | list):
-        members = cast("Sequence[Any]", one)
-        return len(members) == len(other) and all(map(same, members, other))
+        return len(one) == len(other) and all(map(same, one, other))
     array = np.asarray(one)
     return np.array_equal(array, np.asarray(other), equal_nan=array.dtype.kind == "f")
 
@@ -259,9 +248,8 @@ def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
     if not isinstance(value, dict):
         assert not agents, f"not by agent: {value}"
         return [value]
-    by_agent = cast("dict[str, Any]", value)
-    assert not agents or tuple(by_agent) == tuple(agents), f"not of {agents}: {by_agent}"
-    return list(by_agent.values())
+    assert not agents or tuple(value) == tuple(agents), f"not of {agents}: {value}"
+    return list(value.values())
 
 
 def _awaits_reset(env: BaseEnv, outcome: Expected) -> bool:
@@ -275,11 +263,3 @@ def _awaits_reset(env: BaseEnv, outcome: Expected) -> bool:
 
 def _copied(value: Any) -> Any:
     return mapped(lambda one: np.array(one, copy=True), value)
-
-
-def _tensor_maker() -> Callable[[Any], Any]:
-    try:
-        from torch import as_tensor  # pyright: ignore[reportMissingImports, reportUnknownVariableType]
-    except ImportError:
-        raise SkipTest("no torch here") from None
-    return cast("Callable[[Any], Any]", as_tensor)
