@@ -70,8 +70,3 @@ def test_a_seed_of_metaworld_decides_an_episode(monkeypatch: pytest.MonkeyPatch)
     assert (one.reset(seed=5)[0] != first[0]).any()
     one.close()
     other.close()
-
-
-def test_the_env_of_libero_is_a_program() -> None:
-    """It is not run: LIBERO's packages go with no others."""
-    compile((EXAMPLES / "libero_env.py").read_text(), "libero_env.py", "exec")

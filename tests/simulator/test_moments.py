@@ -142,21 +142,6 @@ def test_a_hang_is_ended_though_an_earlier_worker_ended_before_its_kill(world: W
         assert cause(batch) == ["hung in a step and was killed"]
 
 
-def test_workers_are_looked_at_a_few_times_within_the_shortest_limit(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """However often a call waits meanwhile: so limits cost a step nothing."""
-    looks: list[int] = []
-    look = ProcessHost.current_request
-    monkeypatch.setattr(ProcessHost, "current_request", lambda h: looks.append(1) or look(h))
-    with built(entry(8, step_timeout=8.0, reset_timeout=100.0)) as group:
-        batch, _ = group.reset()
-        began = world.now_ns
-        while world.now_ns - began < 8e9:
-            batch, _ = group.step(batch.respond(action=np.full(8, 0.01)))
-    assert 0 < len(looks) <= 8 * 6
-
-
 def test_without_a_limit_a_request_may_take_any_time(world: World) -> None:
     """So may a call, and a reset if only steps have a limit."""
     with built(entry()) as group:
