@@ -7,10 +7,8 @@ import math
 import os
 import random
 import signal
-import threading
 import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -22,10 +20,9 @@ from hosts.awaited import GATE, OWN, STEP, Scripted
 from kit.scripted import CUT, DIE, GO, RAISE, Counts
 from kit.scripted import END as FAIL_END
 from kit.scripted import HANG as HANG_UP
-from patience import HANG
 
 import rlightning_aio
-from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, RLightningError, sync
+from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 from rlightning_aio._core.group.state import sums
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio._core.group.state.sums import Sums
@@ -303,27 +300,3 @@ async def test_an_episode_that_is_aborted_counts_once(num_aborts: int, tmp_path:
         batch, _ = await group.step(responses(["gated-0"], 1.0, what=DO_NOTHING))
         assert [one.kind for one in batch.outcome] == ["cancelled"]
         assert numbers(group).outcomes_cancelled == 1
-
-
-class Held(Counts):
-    """Its steps last until they are let go."""
-
-    began, ends = threading.Event(), threading.Event()
-
-    def does(self, action: Any) -> None:
-        self.began.set()
-        self.ends.wait(HANG)
-
-
-def test_another_thread_may_not_read_during_a_call() -> None:
-    """The group is used by one thread at a time; the error says so."""
-    entry = {"name": "held", "task": Held, "num_workers": 1, "placement": "inline"}
-    with sync.build_env_group(entry) as group, ThreadPoolExecutor(1) as pool:
-        batch, _ = group.reset()
-        stepping = pool.submit(group.step, batch.respond(action=[0]))
-        Held.began.wait(HANG)
-        with pytest.raises(RLightningError, match="only one thread may at a time"):
-            group.metrics()
-        Held.ends.set()
-        stepping.result()
-        assert numbers(group).steps == 1

@@ -147,7 +147,7 @@ def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
         try:
             while not group._driver._thread:
                 os.sched_yield()
-            for ask in (group.reset, group.close, lambda: group.step_async(batch)):
+            for ask in (group.reset, group.close, group.metrics, lambda: group.step_async(batch)):
                 with pytest.raises(RLightningError, match=f"{waiter.ident} is using this group"):
                     ask()
         finally:

@@ -246,26 +246,6 @@ def test_another_version_of_the_simulator_is_refused(monkeypatch: pytest.MonkeyP
             group.restore(snapshot)
 
 
-def test_a_wrong_number_of_envs_is_refused() -> None:
-    """As many envs as the snapshot has, each once, idle, and known."""
-    with sync.build_env_group(entry_of("gymnasium", placement="inline")) as group:
-        with pytest.raises(SnapshotError, match="env 'e-0' has no state yet: reset it"):
-            group.snapshot()
-        batch, _ = group.reset(seed=0)
-        snapshot = group.snapshot()
-        with pytest.raises(SnapshotError, match="is of 2 envs, but should go into 1"):
-            group.restore(snapshot, env_ids=["e-0"])
-        with pytest.raises(EnvBusy, match="twice"):
-            group.restore(snapshot, env_ids=["e-0", "e-0"])
-        with pytest.raises(rl.UnknownEnv):
-            group.restore(snapshot, env_ids=["e-0", "f-0"])
-        group.step_async(batch.respond(action=[0, 0]))
-        for call in (group.snapshot, lambda: group.restore(snapshot)):
-            with pytest.raises(EnvBusy):
-                call()
-        group.collect_async(wait_all=True)
-
-
 class Fragile(Saved):
     """Restoring the second env fails once."""
 
@@ -362,21 +342,34 @@ def test_an_env_that_cannot_be_saved_names_the_attribute() -> None:
             group.snapshot()
 
 
-def test_a_snapshot_of_fewer_envs_or_of_others_is_refused() -> None:
-    """Unless each target env is named."""
+def test_envs_that_a_snapshot_does_not_fit_are_refused() -> None:
+    """As many envs as the snapshot has, each once, idle, known, and named if they are others."""
     fields = entry_of("gymnasium", placement="inline")
     with (
-        sync.build_env_group({**fields, "num_workers": 2}) as two,
+        sync.build_env_group(fields) as two,
         sync.build_env_group({**fields, "num_workers": 3}) as three,
-        sync.build_env_group({**fields, "num_workers": 2, "name": "f"}) as others,
+        sync.build_env_group({**fields, "name": "f"}) as others,
     ):
-        for group in (two, three, others):
+        with pytest.raises(SnapshotError, match="env 'e-0' has no state yet: reset it"):
+            two.snapshot()
+        for group in (three, others):
             group.reset(seed=0)
+        batch, _ = two.reset(seed=0)
         snapshot = two.snapshot()
-        with pytest.raises(SnapshotError, match="of 2 envs, but should go into 3; name"):
-            three.restore(snapshot)
-        with pytest.raises(SnapshotError, match=r"of 'e-0', and this group has no such env; name"):
-            others.restore(snapshot)
+        for group, env_ids, error, said in (
+            (two, ["e-0"], SnapshotError, "is of 2 envs, but should go into 1"),
+            (two, ["e-0", "e-0"], EnvBusy, "twice"),
+            (two, ["e-0", "f-0"], rl.UnknownEnv, "'f-0'"),
+            (three, None, SnapshotError, "of 2 envs, but should go into 3; name"),
+            (others, None, SnapshotError, "of 'e-0', and this group has no such env; name"),
+        ):
+            with pytest.raises(error, match=said):
+                group.restore(snapshot, env_ids=env_ids)
         for group, env_ids in ((three, ["e-2", "e-0"]), (others, ["f-0", "f-1"])):
             shown, _ = group.restore(snapshot, env_ids=env_ids)
             assert shown.ids() == env_ids
+        two.step_async(batch.respond(action=[0, 0]))
+        for call in (two.snapshot, lambda: two.restore(snapshot)):
+            with pytest.raises(EnvBusy):
+                call()
+        two.collect_async(wait_all=True)
