@@ -229,12 +229,6 @@ class Counter(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=self.total, last_reward=1.0)
 """
 
-ROW = """
-from rlightning_aio.registry import Backend
-
-BACKEND = Backend("announced", "counters:Counter", "gymnasium")
-"""
-
 SCRIPT = (
     MODULE
     + """
@@ -311,24 +305,6 @@ async def test_a_module_that_only_workers_import_may_define_them(
         batch, _ = await group.step(batch.respond(action=np.array([4])))
         assert batch.observation.tolist() == [7]
     assert (module in sys.modules) == (place.inline or on_loop)
-
-
-def test_an_installed_package_may_announce_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """By an entry point; nothing has to be imported by name."""
-    info = tmp_path / "counters-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: counters\nVersion: 1.0\n")
-    points = "[rlightning_aio.backends]\nannounced = announced:BACKEND\n"
-    (info / "entry_points.txt").write_text(points)
-    (tmp_path / "announced.py").write_text(ROW)
-    (tmp_path / "counters.py").write_text(MODULE)
-    monkeypatch.syspath_prepend(tmp_path)
-    with sync.build_env_group({"name": "c", "backend": "announced", "task": "x"}) as group:
-        assert group.reset(seed=2)[0].observation.tolist() == [2]
-        assert group["c-0"].step(3).observation == 5
-    assert "counters" not in sys.modules
 
 
 def test_workers_collect_garbage() -> None:

@@ -16,7 +16,6 @@ from patience import HANG
 import rlightning_aio
 from rlightning_aio._core.hosts.messages import WorkerPlace
 from rlightning_aio._core.hosts.process.fork_messages import (
-    Exited,
     Fork,
     MessageSocket,
     NotForked,
@@ -79,21 +78,6 @@ def test_messages_of_any_length_arrive_whole_with_their_descriptors(pair: Pair) 
     kept.close()
     for descriptor in (channel, arena, reader, writer):
         os.close(descriptor)
-
-
-def test_an_end_that_reads_nothing_does_not_block_the_other(pair: Pair) -> None:
-    """Both send more than the buffer holds before they read."""
-    said = [Exited(k, 1, "x" * 9000) for k in range(1000)]
-    for message in said:
-        for end in pair:
-            end.send(message)
-    assert all(end.waiting for end in pair)
-    rest = {end: list(reversed(said)) for end in pair}
-    while any(rest.values()):
-        for end, other in (pair, pair[::-1]):
-            end.flush()
-            while (received := other.receive()) is not None:
-                assert received.message == rest[end].pop()
 
 
 def test_last_messages_arrive_even_if_the_sender_left_some_unread(pair: Pair) -> None:
