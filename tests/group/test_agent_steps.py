@@ -18,7 +18,6 @@ from rlightning_aio._core.group.engine import agent_steps
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio.errors import (
     BadAction,
-    EnvBusy,
     EnvRaised,
     EpisodeLost,
     GroupClosed,
@@ -69,16 +68,6 @@ async def test_only_the_agent_with_a_bad_action_gets_an_error(place: dict[str, A
             ]
         found = await stepped(playing, [GO] * 4)
         assert [ret.info["count"] for ret in found] == [3, 1, 3, 3]
-
-
-async def test_two_steps_of_one_env_are_one_too_many() -> None:
-    """The second one is refused, and nobody else notices."""
-    async with rl.build_env_group(Counter, num_workers=2, placement="inline") as group:
-        first, other = await episodes(group)
-        found = await stepped([first, first, other], [GO] * 3)
-        assert [type(ret) is EnvBusy for ret in found] == [False, True, False]
-        found = await stepped([first, other], [GO] * 2)
-        assert [ret.info["count"] for ret in found] == [2, 2]
 
 
 class Picky(Counter):

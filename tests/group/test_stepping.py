@@ -378,28 +378,6 @@ async def test_statistics_of_a_group(start: Any, capsys: pytest.CaptureFixture[s
 
 
 @one_driver
-async def test_steps_after_an_end_belong_to_no_episode(start: Any) -> None:
-    """They have results, but only one episode is counted."""
-    entry = {
-        "name": "tree",
-        "backend": "gymnasium",
-        "task": "group.sample_envs:Tree-v0",
-        "num_workers": 2,
-    }
-    group = await start(entry)
-    batch, _ = await group.reset(seed=1)
-    space = group.get_action_spaces()[0]
-    ends = np.zeros(2, int)
-    for _ in range(100):
-        values = [PolicyResponse(env_id, space.sample()) for env_id in batch.ids()]
-        batch, _ = await group.step(BatchedData(batch.ids(), values))
-        ends += batch.terminated
-    assert (ends > 1).all()
-    stats = group.get_env_stats()
-    assert [stats[env_id]["episodes"] for env_id in batch.ids()] == [1, 1]
-
-
-@one_driver
 async def test_a_seed_of_an_env_that_is_not_reset_is_refused(start: Any) -> None:
     """A misprint would leave a run without seeds."""
     group = await start(ENTRY)
