@@ -14,13 +14,12 @@ from gymnasium.wrappers import RecordVideo
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
 RECORD_VIDEO: Final = "record_video"
 
 
-def record(env: BaseEnv, config: EnvConfig) -> None:
+def record(env: BaseEnv, name: str, options: Any) -> None:
     """Put `RecordVideo` around the Gymnasium env of `env`.
 
     Films are called ``<env_id>-episode-<n>.mp4``, and n continues after those that the folder
@@ -28,15 +27,16 @@ def record(env: BaseEnv, config: EnvConfig) -> None:
 
     Args:
         env: as it was built.
-        config: its entry. ``env_kwargs["record_video"]`` has the ``folder``, and may have
-            ``every``: episodes 0, every, 2 * every, … are filmed.
+        name: of its entry.
+        options: of ``record_video``: the ``folder``, and perhaps ``every``: episodes 0, every,
+            2 * every, … are filmed.
 
     Raises:
         ConfigError: these are something else, or the env is no single Gymnasium env that renders
             arrays.
     """
-    where = f"entry {config.name!r}, env_kwargs.record_video"
-    folder, every = _checked(config.env_kwargs[RECORD_VIDEO], where)
+    where = f"entry {name!r}, env_kwargs.record_video"
+    folder, every = _checked(options, where)
     inner: Any = getattr(env, "env", None)
     if not isinstance(inner, gym.Env):
         raise ConfigError(f"{where}: only an entry of single Gymnasium envs can be filmed")
@@ -59,8 +59,8 @@ def record(env: BaseEnv, config: EnvConfig) -> None:
             name_prefix=prefix,
             disable_logger=True,
         )
-    name = re.compile(re.escape(prefix) + r"-episode-(\d+)\.mp4")
-    found = [int(match[1]) for path in folder.iterdir() if (match := name.fullmatch(path.name))]
+    own = re.compile(re.escape(prefix) + r"-episode-(\d+)\.mp4")
+    found = [int(match[1]) for path in folder.iterdir() if (match := own.fullmatch(path.name))]
     recorder.episode_id = max(found, default=-1)
     env.env = recorder  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -42,19 +42,16 @@ def build_env(
     for module in config.imports:
         importlib.import_module(module)
     env_class = env_class or ENVS.resolve(config.backend)
-    if is_hardware and ACTION_TIMEOUT in config.env_kwargs:
-        kwargs = dict(config.env_kwargs)
-        seconds = kwargs.pop(ACTION_TIMEOUT)
-        config = config.model_copy(update={"env_kwargs": kwargs})
-        env = build_env(config, env_class, worker_index, preprocess_fn)
-        limit_actions(env, seconds)
-        return env
-    if RECORD_VIDEO not in config.env_kwargs:
-        return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
-    own = {name: value for name, value in config.env_kwargs.items() if name != RECORD_VIDEO}
-    unfilmed = config.model_copy(update={"env_kwargs": own})
-    env = env_class(unfilmed, worker_index=worker_index, preprocess_fn=preprocess_fn)
-    record(env, config)
+    ours = {RECORD_VIDEO, ACTION_TIMEOUT} if is_hardware else {RECORD_VIDEO}
+    given = config.env_kwargs
+    if ours := ours & given.keys():
+        own = {name: value for name, value in given.items() if name not in ours}
+        config = config.model_copy(update={"env_kwargs": own})
+    env = env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
+    if RECORD_VIDEO in ours:
+        record(env, config.name, given[RECORD_VIDEO])
+    if ACTION_TIMEOUT in ours:
+        limit_actions(env, given[ACTION_TIMEOUT])
     return env
 
 
