@@ -224,7 +224,11 @@ def _codec_of(space: gym.Space[Any], what: str, zstd: _Zstd | None) -> _Array | 
 
 
 class ResultFields(NamedTuple):
-    """One env's result as values: dicts by agent for multi-agent envs."""
+    """One env's result as values.
+
+    Of a multi-agent env, reward and flags are dicts by agent before they are packed, and arrays in
+    the order of the agents when they have arrived.
+    """
 
     observation: Any
     reward: Any
@@ -299,7 +303,4 @@ class ResultLayout:
         if len(rest) < 3:
             raise WireError("a result lacks the frames of its rewards and flags")
         columns = (form.read(part) for form, part in zip(self._columns, rest, strict=False))
-        return ResultFields(observation, *map(self._by_agent, columns))
-
-    def _by_agent(self, column: NDArray[Any]) -> Any:
-        return dict(zip(self._agents, column, strict=True)) if self._agents else column
+        return ResultFields(observation, *columns)
