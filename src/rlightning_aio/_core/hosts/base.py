@@ -132,8 +132,8 @@ class Host(Protocol):
                 that is in the row; (seed, options) of a reset, (name, args, kwargs) of a call.
                 None: they are in the rows.
 
-        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Lost` or
-        `Withdrawn`, with the same entry; or the host's `Died` for all.
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised` or `Lost`,
+        with the same entry; or the host's `Died` for all.
         """
         ...
 

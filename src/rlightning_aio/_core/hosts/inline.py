@@ -19,14 +19,15 @@ from rlightning_aio._core.hosts.base import Host
 from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
+    Raised,
     Reported,
-    Withdrawn,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, stop_one
 from rlightning_aio.envs.hardware import stopped_by_signals
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.trees import copied
 
 if TYPE_CHECKING:
@@ -97,7 +98,8 @@ class InlineHost(Host):
         for waiting in list(self._queue):
             if waiting[0] in aborted:
                 self._queue.remove(waiting)
-                self._post(Withdrawn(self.host_id, waiting[0]))
+                error = ErrorText("CancelledError", "aborted", "")
+                self._post(Raised(self.host_id, waiting[0], error))
 
     def stop(self, index: int, number: int) -> None:
         del number  # None is being executed now.

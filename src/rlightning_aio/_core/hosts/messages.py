@@ -222,7 +222,7 @@ class Value(NamedTuple):
 
 
 class Raised(NamedTuple):
-    """A request has raised."""
+    """A request has raised, or was aborted before it has begun."""
 
     host_id: int
     entry: int
@@ -263,13 +263,6 @@ class Moved(NamedTuple):
     resident_mb: float
 
 
-class Withdrawn(NamedTuple):
-    """A request that was aborted will not be answered: it had not begun."""
-
-    host_id: int
-    entry: int
-
-
 class Taken(NamedTuple):
     """A client has dialled in, so the host accepts requests.
 
@@ -287,7 +280,7 @@ class Taken(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Lost | Moved | Withdrawn | Taken
+    | Reported | Result | Value | Raised | Lost | Moved | Taken
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """The queue of a group: hosts append, the core removes."""

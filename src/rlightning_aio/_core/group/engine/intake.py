@@ -27,7 +27,6 @@ from rlightning_aio._core.hosts.messages import (
     Result,
     Taken,
     Value,
-    Withdrawn,
 )
 from rlightning_aio.errors import EnvAway, env_raised
 from rlightning_aio.outcomes import Loss
@@ -77,7 +76,6 @@ class Intake:
             Raised: self._on_raised,
             Lost: self._on_lost,
             Moved: self._on_moved,
-            Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Taken: self._on_taken,
             Died: self._on_died,
@@ -207,9 +205,6 @@ class Intake:
         """Note that an episode is lost; only its user resets what moves something real."""
         if not self._record_of(slot).is_hardware:
             self._episodes.lose([slot], why)
-
-    def _on_withdrawn(self, completion: Withdrawn) -> None:
-        self._requests.end(completion.host_id, completion.entry)
 
     def _on_taken(self, completion: Taken) -> None:
         """Give a client the request that was held for it.
