@@ -134,7 +134,7 @@ class Responder:
             raise  # Random actions can't be drawn, a policy's server is missing, and the like.
         except Exception as error:
             raise PolicyRaised(_raised(error)) from error
-        return answers_of(batch, answer, lambda: self._space_of(batch.env_ids()[0]))
+        return answers_of(batch, answer, self._space_of(batch.env_ids()[0]))
 
 
 def _raised(error: Exception) -> str:

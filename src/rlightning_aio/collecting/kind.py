@@ -102,7 +102,6 @@ class EnvKind:
         self.quota = quota
         self.num_steps = 0
         self.held: Part | None = None
-        self._acts_in_arrays = self._acts_in_values = False
         self._action_space: gym.Space[Any] | None = None
         self.staging = Staging(quota, infos)
         self._taken = OWN_NAMES.union(infos)
@@ -124,12 +123,7 @@ class EnvKind:
         for row in newcomers:
             self._env_ids[int(results.index[row])] = env_ids[row // results.num_sub_envs]
             meta = self._meta_of(env_ids[row // results.num_sub_envs])
-            space = meta.action_space
-            self._action_space = space
-            self._acts_in_arrays = space is not None and is_array(space)
-            self._acts_in_values = space is not None and not (
-                self._acts_in_arrays or is_dict(space) or is_tuple(space)
-            )
+            self._action_space = meta.action_space
             if meta.autoreset == "same_step":
                 self.staging.note_same_step(results.index[row])
 
@@ -148,7 +142,7 @@ class EnvKind:
         Raises:
             ValueError, TypeError: the answer doesn't fit (`BadAction` is a ValueError).
         """
-        answers = answers_of(part.batch, answer, self._space)
+        answers = answers_of(part.batch, answer, self._action_space)
         given = columns_of_responses(answers[0])
         if given is None or (
             isinstance(answer, BatchedData | list) and _answered(answers) != part.batch.env_ids()
@@ -161,17 +155,17 @@ class EnvKind:
             raise ValueError(
                 f"a rollout already has {name!r}; give the policy's column another name"
             )
-        head = part.results.head
+        space, plain = self._action_space, tuple[str, ...]()
         stored: dict[str, Any] = {**given}
-        if self._acts_in_arrays and isinstance(given["action"], list):
-            stored["action"] = np.asarray(cast("list[Any]", given["action"]))
-        columns = rows_of(stored, head, ("action",) if self._acts_in_values else ())
+        if space is not None and not (is_dict(space) or is_tuple(space)):
+            if not is_array(space):
+                plain = ("action",)
+            elif isinstance(given["action"], list):
+                stored["action"] = np.asarray(cast("list[Any]", given["action"]))
+        columns = rows_of(stored, part.results.head, plain)
         columns["observation"] = part.results.observation
         self.staging.check(columns)
         return answers[0], columns
-
-    def _space(self) -> gym.Space[Any] | None:
-        return self._action_space
 
     def rollout(self, held: ResultRows | None, version: int) -> Rollout:
         """Return the completed transitions as columns.

@@ -223,7 +223,7 @@ class PolicyPlay:
             for name, part in parts_by_policy(stepped, self._policies):
                 answer = yield partial(self._policies[name], part)
                 space = self._metas[part.env_ids()[0]].action_space
-                for responses in answers_of(part, answer, lambda space=space: space):
+                for responses in answers_of(part, answer, space):
                     self._step(responses)
 
     def _film(self, env_ids: list[str]) -> Procedure[None]:

@@ -16,7 +16,7 @@ from rlightning_aio.errors import BadAction
 from rlightning_aio.trees import is_dict
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     import gymnasium as gym
 
@@ -55,16 +55,14 @@ def parts_by_policy(
     return [*parts.items()]
 
 
-def answers_of(
-    batch: BatchedData, answer: Any, space_of: Callable[[], gym.Space[Any] | None]
-) -> list[BatchedData]:
+def answers_of(batch: BatchedData, answer: Any, space: gym.Space[Any] | None) -> list[BatchedData]:
     """Convert what a policy has returned for `batch` to batches of responses, usually one.
 
     Args:
         batch: of results.
         answer: see the module; or a list of batches of responses, which together answer all
             results.
-        space_of: returns the action space of the batch's envs, None if that is unknown.
+        space: of the actions of the batch's envs; None if it is unknown.
 
     Raises:
         BadAction: it doesn't answer all results, or it is a dict, but not of columns.
@@ -75,7 +73,7 @@ def answers_of(
         parts = cast("list[BatchedData]", answer)
     elif isinstance(answer, dict | Mapping):  # Most are dicts, for which this is cheap.
         named = cast("Mapping[Any, Any]", answer)
-        return [batch.respond(**(named if _are_columns(named, space_of()) else {"action": named}))]
+        return [batch.respond(**(named if _are_columns(named, space) else {"action": named}))]
     else:
         return [batch.respond(action=answer)]
     answered = sum(map(len, parts))
