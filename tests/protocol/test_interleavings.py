@@ -297,9 +297,9 @@ def test_the_trainer_and_a_worker_agree_on_the_request_in_execution(
     monkeypatch.setattr(rings, "IN_ORDER", False)
     _, trainer, worker = both_sides(1)
     names = {exchange.CURRENT: "current", exchange.CURRENT_SINCE_NS: "since"}
-    for side in (trainer, worker):
+    for side, its_fence in ((trainer, "_fence"), (worker, "fence")):
         vars(side)["_words"] = Recorded(trace, names, 40)
-        vars(side)["_fence"] = lambda: trace.append(fence())
+        vars(side)[its_fence] = lambda: trace.append(fence())
     worker.begin(STEP, 1)
     assert trace == bare(publish(1))
     trace.clear()
