@@ -267,35 +267,6 @@ async def test_a_group_without_envs_that_are_left_raises(retries: int) -> None:
     assert any("it played attempt" in note and "seed=" in note for note in caught.value.__notes__)
 
 
-async def test_clients_of_an_env_server_play() -> None:
-    """Also one that comes while others play."""
-
-    async def agent(episode: AttemptEpisode) -> str:
-        for _ in range(3):
-            await episode.step([0.0, 0.0])
-        episode.finish()
-        playing.add(episode.env_id)
-        return episode.env_id
-
-    playing = set[str]()
-    async with rl.build_env_group(served(clients=["c0", "c1", "c2"])) as group:
-        handle: Any = group["robots-0"]
-        address: str = handle.address
-        clients = [ClientThread(address, "c0", CountingEnv(0))]
-        endless = (("", seed) for seed in itertools.count())
-        async with contextlib.aclosing(play(group, endless, agent)) as groups:
-            async for (attempt,) in groups:
-                assert attempt.rewards == [1.0, 2.0, 3.0]
-                if len(clients) < 3 and len(playing) == len(clients):
-                    name = f"c{len(clients)}"
-                    clients.append(ClientThread(address, name, CountingEnv(len(clients))))
-                if len(playing) == 3:
-                    break
-        assert playing == {"robots-0/c0", "robots-0/c1", "robots-0/c2"}
-    for client in clients:
-        await asyncio.to_thread(client.join)
-
-
 async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() -> None:
     """However many wait; all are played when it comes."""
 

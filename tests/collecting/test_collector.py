@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from collecting.scripted import Script, scripted_group
+from collecting.scripted import scripted_group
 from group import sample_envs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from kit.counting import ClientThread, CountingEnv
@@ -92,29 +92,6 @@ def test_each_kind_of_env_has_its_own_policy_and_rollout() -> None:
                 for name, shape in expected.items():
                     assert rollouts[name].shape == shape
                     assert rollouts[name].action.shape[:2] == shape
-
-
-def test_a_kind_whose_first_step_has_not_ended_has_an_empty_rollout() -> None:
-    """Its step is in a later rollout; those of the other kind are complete."""
-    after: dict[str, Any] = {}
-    group = sync.build_env_group([{**POLE, "name": name} for name in ("one", "other")])
-    with group, group.auto_reset():
-        collector = Collector(
-            group, {"one": zeros, "other": zeros}, num_transitions=1, min_results=1, seed=0
-        )
-        for _ in range(4):
-            rollouts = collector.collect()
-            assert sorted(map(len, rollouts.values())) == [0, 1]
-            for name, rollout in rollouts.items():
-                values, nothing = np.zeros(len(rollout)), np.zeros(len(rollout.ends))
-                assert rollout.advantages(values, nothing, 0.99, 0.95).shape == rollout.shape
-                assert rollout.next_observation.shape == (len(rollout), 4)
-                for before, following in zip(
-                    rollout.observation, rollout.next_observation, strict=True
-                ):
-                    np.testing.assert_array_equal(before, after.get(name, before))
-                    after[name] = following.copy()
-    assert set(after) == {"one", "other"}
 
 
 def test_an_entry_without_a_policy_raises_each_time() -> None:
@@ -229,21 +206,6 @@ def test_each_agent_has_its_own_rewards_and_ends() -> None:
         assert found["tall"][:2].tolist() == [2, 1]
 
 
-def test_a_sub_environment_that_waits_for_others_makes_no_transitions() -> None:
-    """With a simulator without autoreset, which is reset when all have ended."""
-    batched = {"name": "batched", "backend": "batched", "task": "-", "num_envs": 3}
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        return {"action": np.array([[3, 5, 9]])}  # They end after 3 steps, 2 and 1.
-
-    group = sync.build_env_group({**batched, "placement": "inline"})
-    with group, group.auto_reset(99):
-        rollout = Collector(group, policy, num_transitions=12).collect()
-        assert rollout.index.tolist() == [0] * 6 + [1] * 4 + [2] * 2
-        assert rollout.reward.tolist() == [3, 6, 9, 3, 6, 9, 5, 10, 5, 10, 9, 9]
-        assert rollout.first.tolist() == [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1]
-
-
 def test_blocks_that_would_have_holes_raise() -> None:
     group = scripted_group("vector", 2, 0.1)
     with group, group.auto_reset(99):
@@ -284,23 +246,6 @@ def test_a_block_equals_the_steps_of_gymnasiums_vector_env() -> None:
         np.testing.assert_array_equal(block.reward[t], reward)
         np.testing.assert_array_equal(block.done[t], terminated | truncated)
     envs.close()
-
-
-def test_the_step_limit_cuts_envs_with_same_step_autoreset() -> None:
-    """They have not reset themselves, so their observation is the final one."""
-
-    def make() -> Any:
-        makers = [lambda number=number: Script(number, 0.0) for number in range(2)]
-        return gym.vector.SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        return {"action": np.zeros((*batch.is_reset.shape, 1))}
-
-    group = sync.build_env_group({"name": "v", "task": make, "placement": "inline"})
-    with group, group.auto_reset(3):
-        rollout = Collector(group, policy, num_transitions=12, seed=0).collect()
-    assert np.count_nonzero(rollout.truncated) == 4
-    assert (rollout.next_observation[:, 2] == rollout.observation[:, 2] + 1).all()
 
 
 def test_the_step_limit_truncates() -> None:

@@ -21,10 +21,8 @@ from kit.scripted import Counts
 from patience import HANG
 
 import rlightning_aio as rl
-import rlightning_aio.sync
 from rlightning_aio.collecting import Collector, Rollout
 from rlightning_aio.errors import EnvRaised, RLightningError
-from rlightning_aio.evaluation import evaluate
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -242,43 +240,6 @@ async def test_a_restart_needs_all_envs_and_no_call_in_progress() -> None:
         with pytest.raises(RuntimeError, match="in progress"):
             collector.restart()
         await collecting
-
-
-def test_a_collect_after_ctrl_c_asks_for_a_restart() -> None:
-    """Also if the policy is interrupted; nothing of the interrupted call comes back."""
-    presses = [False, False, True]
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        if presses and presses.pop(0):
-            raise KeyboardInterrupt
-        return failing()(batch)
-
-    tasks = [lambda k=k: Numbered(k) for k in range(4)]
-    with rlightning_aio.sync.build_env_group(tasks, placement="inline") as group:
-        collector = Collector(group, policy, num_transitions=24, min_results=4)
-        with pytest.raises(KeyboardInterrupt):
-            collector.collect()
-        for kind in (rl.ResetNeeded, RLightningError):
-            with pytest.raises(kind, match=r"restart\(seed=…\)"):
-                collector.collect()
-        collector.restart()
-        rollout = collector.collect()
-    assert all(own[0] == (2, 0) for own in steps_of([rollout]).values())
-
-
-@pytest.mark.parametrize("style", STYLES[2:])
-async def test_an_evaluation_between_two_blocks_ends_their_chains(style: str) -> None:
-    """The envs are reset after it."""
-    found: list[Rollout] = []
-    async with numbered(INLINE) as group:
-        with group.auto_reset(4):
-            collector = collector_of(group, style, failing())
-            found += parts_of(await collector.collect())
-            await evaluate(group, lambda batch: failing()(batch)["action"], 1)
-            collector.restart()
-            found += parts_of(await collector.collect())
-    for steps in steps_of(found).values():
-        assert steps == [(1, 0), (1, 1), (1, 2), (3, 0), (3, 1), (3, 2)]
 
 
 async def until_it_raises(collector: Any) -> None:

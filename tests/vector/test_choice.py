@@ -120,3 +120,10 @@ def test_stable_baselines3s_function_decides_likewise() -> None:
             env.reset()
     with pytest.raises(ConfigError, match=r"^step_timeout: leave out vec_env_cls to have workers"):
         make_vec_env(OWN, 2, vec_env_cls=vec_env.DummyVecEnv, vec_env_kwargs={"step_timeout": 9})
+    for task in ("CartPole-v1", "Hopper-v5"):  # Separate, and stepped together.
+        with pytest.raises(
+            ValueError, match="object, and these envs are in a VecEnv: leave it out"
+        ):
+            make_vec_env(task, 1, vec_env_cls=object)
+        with pytest.raises(TypeError, match="unexpected keyword argument 'monitor'"):
+            make_vec_env(task, 1, monitor=True)

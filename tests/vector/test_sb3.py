@@ -338,24 +338,6 @@ def test_has_attr_does_not_transfer_the_value() -> None:
     env.close()
 
 
-@pytest.mark.parametrize("task", ["CartPole-v1", "Hopper-v5"])  # Separate, and stepped together.
-def test_make_vec_env_takes_the_arguments_of_stable_baselines3s(task: str) -> None:
-    """Other classes than its own and unknown arguments raise."""
-    from stable_baselines3.common.vec_env import SubprocVecEnv
-
-    from rlightning_aio.sb3 import make_vec_env
-
-    entry = {"placement": "inline", "start_method": "fork"}
-    for kind in (SubprocVecEnv, None):
-        make_vec_env(task, 1, 0, vec_env_cls=kind, vec_env_kwargs=entry).close()
-    with pytest.raises(
-        ValueError, match="object, and these envs are in a VecEnv: leave it out, or"
-    ):
-        make_vec_env(task, 1, vec_env_cls=object)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'monitor'"):
-        make_vec_env(task, 1, monitor=True)
-
-
 class Asked(Counts):
     """Counts the calls of its method."""
 
