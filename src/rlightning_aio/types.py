@@ -7,7 +7,7 @@ Absent on purpose: anything that knows where an env runs.
 from __future__ import annotations
 
 import time
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import gymnasium as gym
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
@@ -150,17 +150,3 @@ class EnvMeta(BaseModel):
     autoreset: Autoreset = "disabled"
     task: str = ""
     switches_task: bool = False
-
-
-class ClientTraits(NamedTuple):
-    """Properties of a client of an env_server that affect its requests.
-
-    Attributes:
-        free_actions: its actions may be outside its action space.
-        reads_extras: the client reads fields of responses other than the action.
-        hardware: its env moves something real.
-    """
-
-    free_actions: bool
-    reads_extras: bool
-    hardware: bool = True

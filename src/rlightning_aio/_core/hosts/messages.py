@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.error_text import ErrorText
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import RowLayout, Slab
-    from rlightning_aio.types import ClientTraits, EnvMeta
+    from rlightning_aio.types import EnvMeta
 
 STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (None, {})
 """The action and the extras of a step that has no arguments out of band."""
@@ -267,13 +267,15 @@ class Taken(NamedTuple):
     """A client has dialled in, so the host accepts requests.
 
     Attributes:
+        started: the client's env.
+        is_hardware: it moves something real.
         slab: of all places of the entry, if this is its first client.
         first_slot: of the entry's places.
     """
 
     host_id: int
-    meta: EnvMeta
-    traits: ClientTraits
+    started: EnvStarted
+    is_hardware: bool
     slab: Slab | None
     first_slot: int
 

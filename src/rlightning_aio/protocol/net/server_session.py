@@ -44,7 +44,7 @@ from rlightning_aio.protocol.net.wire import (
     Writer,
     portable,
 )
-from rlightning_aio.types import ClientTraits, EnvMeta
+from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -217,13 +217,13 @@ class ServerSessions:
     ) -> list[bytes]:
         step = Step(number=session.last_number + 1)
         packed = Packed([], step.texts)
-        traits = session.announced.traits
+        client = session.announced
         try:
-            if traits.free_actions:
+            if client.free_actions:
                 step.action = action
             else:
-                session.announced.actions.pack(action, packed)
-            if extras and traits.reads_extras:
+                client.actions.pack(action, packed)
+            if extras and client.reads_extras:
                 step.extras = self._portable_extras(extras)
             return self._writer.write(step, packed.frames)
         except (Misfit, Untransferable) as error:
@@ -434,7 +434,9 @@ class Announcement(NamedTuple):
 
     kind: ClientKind
     meta: EnvMeta
-    traits: ClientTraits
+    free_actions: bool
+    reads_extras: bool
+    hardware: bool
     results: ResultLayout
     actions: SpaceLayout
 
@@ -514,7 +516,9 @@ def _announcement(
     return Announcement(
         kind,
         meta,
-        ClientTraits(hello.free_actions, hello.reads_extras, hello.hardware),
+        hello.free_actions,
+        hello.reads_extras,
+        hello.hardware,
         ResultLayout(observation_space, hello.num_envs, hello.agents, hello.compression),
         SpaceLayout(action_space, "action"),
     )

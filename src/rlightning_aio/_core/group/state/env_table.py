@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import EnvStarted
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.types import ClientTraits, EnvMeta
 
 
 class EnvTable:
@@ -93,31 +92,23 @@ class EnvTable:
     def note_started(self, started: Sequence[EnvStarted]) -> None:
         """Record the properties of the local envs, in the order of their slots."""
         for slot, env in enumerate(started):
-            self.actions_beside_rows[slot] = env.actions_beside_row
-            self.reads_extras[slot] = env.reads_extras
-            self._note_meta(slot, env.meta)
+            self._note(slot, env)
             self.num_sub_envs[slot] = env.meta.num_envs
         self.seed_offset[:] = np.cumsum(self.num_sub_envs) - self.num_sub_envs
         self.names.index_offset[:] = self.seed_offset
         self._note_any()
 
-    def note_taken(self, slot: int, meta: EnvMeta, traits: ClientTraits, *, has_row: bool) -> None:
-        """Record the properties of a client that has taken a place.
-
-        Args:
-            slot: of the place.
-            meta: reported by the client.
-            traits: how the client treats requests.
-            has_row: actions fit its row.
-        """
-        self.actions_beside_rows[slot] = traits.free_actions or not has_row
-        self.reads_extras[slot] = traits.reads_extras
-        self._note_meta(slot, meta)
+    def note_taken(self, slot: int, env: EnvStarted) -> None:
+        """Record the properties of the env of a client that has taken a place."""
+        self._note(slot, env)
         self._note_any()
 
-    def _note_meta(self, slot: int, meta: EnvMeta) -> None:
-        self.resets_itself[slot] = meta.autoreset != "disabled"
-        self.step_limits[slot] = self.configs[slot].max_episode_steps or meta.max_episode_steps or 0
+    def _note(self, slot: int, env: EnvStarted) -> None:
+        self.actions_beside_rows[slot] = env.actions_beside_row
+        self.reads_extras[slot] = env.reads_extras
+        self.resets_itself[slot] = env.meta.autoreset != "disabled"
+        most = self.configs[slot].max_episode_steps or env.meta.max_episode_steps
+        self.step_limits[slot] = most or 0
 
     def _note_any(self) -> None:
         self.any_beside_rows = bool(self.actions_beside_rows.any() or self.reads_extras.any())

@@ -73,10 +73,9 @@ class Places:
         record.place.admit()
         if taken.slab is not None:
             self._tables.layout.add(taken.slab, taken.first_slot)
-        has_row = self._tables.layout.of(slot)[0].action is not None
-        self._envs.note_taken(slot, taken.meta, taken.traits, has_row=has_row)
+        self._envs.note_taken(slot, taken.started)
         self._tables.episodes.note_taken(slot)
-        record.is_hardware = taken.traits.hardware
+        record.is_hardware = taken.is_hardware
         record.stage = Stage.UP
         record.idle = ()
         self._note_clients()

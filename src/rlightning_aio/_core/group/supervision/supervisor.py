@@ -447,7 +447,7 @@ class Supervisor:
         record.deaths = {slot: count for slot, count in record.deaths.items() if count}
         self.places.take(record, taken)
         meta = self.metas[slot]
-        self.metas[slot] = taken.meta.model_copy(
+        self.metas[slot] = taken.started.meta.model_copy(
             update={"max_episode_steps": self._envs.step_limits.item(slot) or None}
         )
         if meta.action_space is None:  # The first client decides for all places of its entry.

@@ -22,6 +22,7 @@ from rlightning_aio._core.hosts.messages import (
     Closed,
     Death,
     Died,
+    EnvStarted,
     Raised,
     Result,
     Taken,
@@ -239,13 +240,11 @@ class EnvServerHost(Host):
             announce=infos_out_of_band,
         )
         self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)
-        # Decided for this client: see `EnvTable.note_taken`.
-        in_row = slab.action is not None and not announced.traits.free_actions
+        in_row = slab.action is not None and not announced.free_actions
         self._read_action = row_reader(slab.action, self._row) if in_row else None
-        first_slot = self.first_slot - self._row
-        self._post(
-            Taken(self.host_id, meta, announced.traits, slab if is_new else None, first_slot)
-        )
+        started = EnvStarted(meta, slab.layout, announced.reads_extras, not in_row)
+        new, first_slot = slab if is_new else None, self.first_slot - self._row
+        self._post(Taken(self.host_id, started, announced.hardware, new, first_slot))
 
     def on_answer(self, answer: Answer) -> None:
         self._num_messages += 1
