@@ -8,7 +8,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import SyncVectorEnv
 from kit.scripted import Counts
 
 
@@ -44,30 +43,12 @@ class Waiting(Judged):
 class Rewarded(Judged):
     """Gives the same reward, of any value, for each step of an episode."""
 
-    def __init__(self, reward: float) -> None:
-        super().__init__()
-        self.reward = reward
+    def __init__(self, reward: str) -> None:
+        self.reward = float(reward)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, _, *ends_and_info = super().step(action)
         return observation, self.reward, *ends_and_info
-
-
-def rewarded(reward: str) -> Rewarded:
-    return Rewarded(float(reward))
-
-
-def make() -> Judged:
-    return Judged()
-
-
-def wait() -> Waiting:
-    return Waiting()
-
-
-def poles() -> SyncVectorEnv:
-    """Make a vector env of three independent CartPoles."""
-    return SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 3)
 
 
 class Switching(Judged):
@@ -79,7 +60,3 @@ class Switching(Judged):
         if options and options["task"] == "raises":
             raise ValueError("as its task says")
         return super().reset(seed=seed)
-
-
-def switching() -> Switching:
-    return Switching()

@@ -7,6 +7,7 @@ import os
 import signal
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, line_with, run, start, write_config
 from patience import HANG
 
@@ -14,11 +15,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    import pytest
-
 POLE = {**CARTPOLE, "placement": "inline", "num_workers": 3}
 STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
-JUDGED = {"name": "judged", "task": "cli.judged_env:make", "placement": "inline"}
+JUDGED = {"name": "judged", "task": "cli.judged_env:Judged", "placement": "inline"}
 
 
 def by_number(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -75,7 +74,7 @@ def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
 def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
     """The summary says that it is no fair sample, and a film of them is there."""
     config = write_config(
-        tmp_path, {"name": "slow", "task": "cli.judged_env:wait", "num_workers": 2}
+        tmp_path, {"name": "slow", "task": "cli.judged_env:Waiting", "num_workers": 2}
     )
     file, films = tmp_path / "episodes.jsonl", tmp_path / "films"
     asked = ("--episodes", 2, "--resume", file, "--video", films, "--seed", 0, "--json")
@@ -162,7 +161,7 @@ def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:
 
 # -- a queue of episodes ----------------------------------------------------------------
 
-SWITCHING = {"name": "many", "task": "cli.judged_env:switching", "placement": "inline"}
+SWITCHING = {"name": "many", "task": "cli.judged_env:Switching", "placement": "inline"}
 
 
 def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
@@ -210,3 +209,29 @@ def test_a_film_that_cannot_be_kept_ends_it_with_one_message(tmp_path: Path) -> 
     assert str(films) in line
     assert "Traceback" not in done.stderr
     assert [one["task"] for one in json.loads(done.stdout)["attempts"]] == ["a"]
+
+
+def test_after_an_error_only_episodes_of_the_queue_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The results file has others besides."""
+    config, file = (
+        write_config(tmp_path, {**POLE, "max_episode_steps": 4}),
+        tmp_path / "results.jsonl",
+    )
+    policy = "cli.stub_policies:breaks_soon"
+    words = ("eval", config, "--policy", policy, "--resume", file)
+    assert invoke_json(*words, "--seeds", "0:6")["episodes"] == 6
+    monkeypatch.setattr("cli.stub_policies.calls_left", 0)
+    done = invoke(*words, "--seeds", "4:8")
+    assert done.exit_code == 1
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("CartPole-v1 ")]
+    assert line.split()[1] == "2"
+
+
+@pytest.mark.parametrize("folder", [__file__, "/proc/films"])
+def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path, folder: str) -> None:
+    """Before anything is played."""
+    said = refused(write_config(tmp_path, POLE), "--seeds", "0:2", "--video", folder)
+    assert [folder in line for line in said.splitlines() if line.startswith("error: ")] == [True]
+    assert "playing" not in said

@@ -50,7 +50,7 @@ SWEEPS = {
 ADDRESSES = (
     *("robot", "tcp://robot", "tcp://:5555", "udp://robot:1", "tcp://robot:0", "tcp://robot:65536"),
 )
-SWITCHING = {"name": "many", "task": "cli.judged_env:switching", "placement": "inline"}
+SWITCHING = {"name": "many", "task": "cli.judged_env:Switching", "placement": "inline"}
 SERVER = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
 REFUSED: list[tuple[str, dict[str, Any], str, str]] = [
     ("rollout", CARTPOLE, "--steps 0", "--steps"),

@@ -23,7 +23,7 @@ def config(folder: Path, rewards: dict[str, str] = REWARDS) -> str:
         *(
             {
                 "name": name,
-                "task": "cli.judged_env:rewarded",
+                "task": "cli.judged_env:Rewarded",
                 "env_kwargs": {"reward": reward},
                 "placement": "inline",
             }

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.registration import WrapperSpec
+from kit.scripted import Counts
 
 import rlightning_aio.sync as rl
 from rlightning_aio.vector import VectorEnv
@@ -23,22 +24,16 @@ ID = "Pendulum-v1"
 LIMIT = 3
 
 
-class Told(gym.Env[Any, Any]):
+class Told(Counts):
     """Not Gymnasium's pendulum."""
 
-    observation_space = action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    observation_space = action_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
     def __init__(self, *, told: str = "nothing") -> None:
-        self.told = told
+        self.words = told
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        super().reset(seed=seed)
-        del options
-        return np.zeros(1, np.float32), {"told": self.told}
-
-    def step(self, action: Any) -> Any:
-        del action
-        return np.zeros(1, np.float32), 0.0, False, False, {"told": self.told}
+    def told(self) -> dict[str, Any]:
+        return {"told": self.words}
 
 
 @pytest.fixture(autouse=True)
@@ -153,7 +148,7 @@ def test_workers_import_a_task_of_the_program_when_they_make_it(
         """The env of a task, and whether its simulator was imported before it was made."""
         env = Told(told=str("a_simulator" in sys.modules))
         if name is not None:
-            env.told += f" {gym.make(name).spec.max_episode_steps}"  # type: ignore[union-attr]
+            env.words += f" {gym.make(name).spec.max_episode_steps}"  # type: ignore[union-attr]
         return env
 
     envs = VectorEnv([lambda: told(None), lambda: told("Simulated-v0")])
