@@ -18,7 +18,7 @@ from rlightning_aio.json_text import finite
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
 _KEYS: Final = ("success", "is_success")
 """In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
@@ -154,9 +154,6 @@ class AttemptGroup(Sequence[Attempt]):
     def __len__(self) -> int:
         """The number of attempts."""
         return len(self.attempts)
-
-    def __iter__(self) -> Iterator[Attempt]:
-        return iter(self.attempts)
 
 
 def success_of(info: dict[str, Any], sub_env: int = 0) -> float | None:

@@ -302,22 +302,23 @@ class PolicyPlay:
         env_ids = batch.env_ids()
         terminated = all_agents(batch.terminated).reshape(len(batch), -1)
         for row, (sums, info) in zip(rows, ended_episodes(batch, rows), strict=True):
-            env_id, returns, lengths = env_ids[row], *(np.atleast_1d(sums[name]) for name in "rl")
+            env_id = env_ids[row]
+            returns, lengths = np.atleast_1d(sums["r"]), np.atleast_1d(sums["l"])
             for sub_env in np.flatnonzero(ended[row]).tolist():
                 outcome = own_end(env_id, info, terminated=bool(terminated[row, sub_env]))
-                self._end(
-                    env_id,
-                    sub_env,
-                    outcome,
-                    reward=float(returns[sub_env]),
-                    length=int(lengths[sub_env]),
-                    success_value=success_of(info, sub_env),
-                )
+                reward, length = float(returns[sub_env]), int(lengths[sub_env])
+                self._end(env_id, sub_env, outcome, reward, length, success_of(info, sub_env))
                 self._take_next(env_id, sub_env)
             self._release(env_id)
 
     def _end(
-        self, env_id: str, sub_env: int, outcome: Outcome, reward: float = 0.0, **known: Any
+        self,
+        env_id: str,
+        sub_env: int,
+        outcome: Outcome,
+        reward: float = 0.0,
+        length: int = 0,
+        success: float | None = None,
     ) -> None:
         """Note that the episode of a sub-environment has ended, if it was one of the queue."""
         place = self._places[env_id][sub_env]
@@ -327,8 +328,9 @@ class PolicyPlay:
         if not (outcome.is_failure or math.isfinite(reward)):
             cause = "returned no reward" if math.isnan(reward) else f"rewards add up to {reward}"
             outcome = Outcome("env_raised", "env", cause, env_id)
-        known = {} if outcome.is_failure else {"reward": reward, **known}
-        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env, **known)
+        attempt = Attempt(job.spec, job.index, outcome, sub_env=job.sub_env)
+        if not outcome.is_failure:
+            attempt.reward, attempt.length, attempt.success_value = reward, length, success
         self._counts[place] = False
         self._ended.append((job, attempt))
 
