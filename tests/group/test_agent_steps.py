@@ -178,8 +178,9 @@ async def test_agents_and_batches_and_calls_take_turns() -> None:
             return found.info["count"]
 
         async def called(env_id: str) -> None:
+            await group[env_id].set_attr("mark", env_id)
             for _ in range(20):
-                assert await group[env_id].get_attr("action_space") == Counter.action_space
+                assert await group[env_id].get_attr("mark") == env_id
 
         async def collected() -> int:
             found = batch
