@@ -60,15 +60,6 @@ def problems_of(cfgs: object) -> str:
 # ---- accepted configurations
 
 
-def test_a_file_gives_its_entries_in_order(write: Write) -> None:
-    """Entries keep their order, fields their values, and the rest takes defaults."""
-    path = write({"envs": [HOPPER | {"num_workers": 3}, CARTPOLE | {"max_episode_steps": 50}]})
-    assert load_config(path) == [
-        EnvConfig(name="hopper", backend="mujoco", task="Hopper-v5", num_workers=3),
-        EnvConfig(name="cartpole", backend="gymnasium", task="CartPole-v1", max_episode_steps=50),
-    ]
-
-
 @pytest.mark.parametrize(
     "wrap",
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import resource
-import socket
 import stat
 import subprocess
 import sys
@@ -75,18 +74,6 @@ def _fifo(path: Path) -> None:
     os.mkfifo(path)
 
 
-def _socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as listener:
-        listener.bind(os.path.relpath(path))
-
-
-def _device(path: Path) -> None:
-    try:
-        os.mknod(path, stat.S_IFCHR | 0o666, os.makedev(1, 3))
-    except PermissionError:
-        pytest.skip("only root makes device nodes")
-
-
 def _loop(path: Path) -> None:
     path.symlink_to(path)
 
@@ -99,8 +86,6 @@ def _below_a_file(path: Path) -> None:
 IN_THE_WAY: dict[str, tuple[Callable[[Path], None], str]] = {
     "folder": (Path.mkdir, "it is no regular file"),
     "FIFO": (_fifo, "it is no regular file"),
-    "socket": (_socket, "it is no regular file"),
-    "device": (_device, "it is no regular file"),
     "loop": (_loop, "it is no regular file"),
     "no folder": (lambda path: path.parent.rmdir(), "there is no folder"),
     "below a file": (_below_a_file, "Not a directory"),

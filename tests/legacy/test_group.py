@@ -257,30 +257,6 @@ def test_statistics_are_means_over_all_envs(group: EnvGroup) -> None:
     assert isinstance(group.get_stats(), dict)
 
 
-class Counted:
-    """An object with the methods of an env that statistics call."""
-
-    def __init__(self, **stats: list[float]) -> None:
-        self._stats = stats
-        self.calls: list[str] = []
-
-    def get_env_stats(self, reset: bool) -> dict[str, list[float]]:
-        self.calls.append(f"get_env_stats({reset})")
-        return self._stats
-
-    def finish_rollout(self) -> None:
-        self.calls.append("finish_rollout")
-
-
-def test_statistics_come_from_the_objects_in_the_lists_of_envs_and_servers() -> None:
-    """RLightning's own tests assign both lists of a group that `__init__` did not make."""
-    env, server = Counted(reward=[3.0, 2], success=[1.0, 1]), Counted(reward=[6.0, 1])
-    group = EnvGroup.__new__(EnvGroup)
-    group.env_list, group.env_servers = [env], [server]
-    assert group.get_env_stats(reset=True) == {"reward": 3.0, "success": 1.0}
-    assert env.calls == server.calls == ["get_env_stats(True)", "finish_rollout"]
-
-
 def test_envs_need_no_method_of_their_own_for_an_evaluation() -> None:
     """Engines call it for whatever env is there."""
     config = EnvConfig(name="pole", backend="mujoco", task="InvertedPendulum-v5", num_workers=2)
