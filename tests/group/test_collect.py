@@ -160,18 +160,6 @@ def test_invalid_arguments_are_refused(rules: dict[str, Any], said: str) -> None
 # -- awaited
 
 
-async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gate]) -> None:
-    """In the order of the group. The window closes early when nothing more can come."""
-    group.step_async(responses(0, 1, 2))
-    waiting = asyncio.create_task(group.collect_async(timeout=100))
-    await open_gates(gates[1], gates[0])
-    await asyncio.wait([waiting], timeout=0.05)
-    assert not waiting.done()
-    await open_gates(gates[2])
-    batch, _ = await waiting
-    assert batch.ids() == IDS[:3]
-
-
 async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:
     """A collect and a step raise at once; the envs get time to close."""
     group.step_async(responses(0))
