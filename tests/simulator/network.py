@@ -51,8 +51,16 @@ class Network:
             host as env_server,  # Few programs need it.
         )
 
+        kill = env_server.EnvServerHost.kill
+
+        def checked(host: Any, *, dump: bool) -> None:
+            if dump:
+                host.server.listener.check_unread(host.client)
+            kill(host, dump=dump)
+
         return [
             (env_server, "Listener", partial(_Listener, self)),
+            (env_server.EnvServerHost, "kill", checked),
             (client_module, "zmq", _Zmq(self)),
             (client_module, "recv_monitor_message", lambda monitor, _: monitor.take()),
         ]
@@ -213,6 +221,13 @@ class _Listener:
             self.incoming.append((route, None))
 
     def on_writable(self) -> None: ...
+
+    def check_unread(self, name: str) -> None:
+        """Check that a client that is about to be sent away as hung has not replied."""
+        clients = {c.route: c.dealer.process.name for c in self.connections.values()}
+        unread = [clients.get(route) for route, parts in self.incoming if parts is not None]
+        if f"client {name}" in unread:
+            self._network.world.wrongs.append(f"client {name} is sent away, and has replied")
 
     def on_readable(self) -> None:
         self._has_more = False
