@@ -6,10 +6,7 @@ import multiprocessing
 import sys
 
 import pytest
-import uvloop
 
-# libuv keeps a pipe for signals from its first loop to the end of the process.
-uvloop.new_event_loop().close()
 # Multiprocessing keeps the memory that Gymnasium's AsyncVectorEnv shares with its processes.
 multiprocessing.RawArray("b", 1)
 
