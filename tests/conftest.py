@@ -28,7 +28,7 @@ from hypothesis import HealthCheck, settings
 from kit import checked
 
 from rlightning_aio._core.group.drivers import sync_driver
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.registry import BACKENDS, ENVS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
@@ -254,6 +254,12 @@ def pressed_again(python_raises: None, monkeypatch: pytest.MonkeyPatch) -> list[
     pressed: list[bool] = []
     monkeypatch.setattr(sync_driver, "press_again", lambda: pressed.append(True))
     return pressed
+
+
+@pytest.fixture
+def moving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All envs move something real."""
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
 
 
 @pytest.fixture

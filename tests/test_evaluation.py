@@ -315,19 +315,6 @@ def test_a_step_that_takes_too_long_for_an_evaluation_that_has_ended_is_aborted(
     assert not found.failures
 
 
-def test_it_resets_envs_at_their_ends_by_itself() -> None:
-    """At the limits of the open context, or else at their own, if they have any."""
-    for limit, lengths in ((None, {SHORT, LONG}), (5, {SHORT, 5})):
-        for episodes in (2, [EpisodeSpec("", seed) for seed in range(8)]):
-            with group_of(*HALF_SUCCEED, max_episode_steps=limit) as group:
-                found = evaluate(group, nothing, episodes)
-                assert len(found.played) == 8
-                assert {episode.length for episode in found.played} == lengths
-                with group.auto_reset(limit or 3):  # None is open.
-                    found = evaluate(group, nothing, 1)
-                assert {episode.length for episode in found.played} == {SHORT, limit or 3}
-
-
 # -- statistics -------------------------------------------------------------------------
 
 

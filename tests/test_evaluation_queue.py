@@ -25,7 +25,6 @@ from rlightning_aio.evaluation import (
     ResultsFile,
     evaluate,
 )
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -117,13 +116,6 @@ def test_an_env_plays_first_what_only_it_may_play() -> None:
     assert [one.spec for one in seen] == [replace(one, entry="env") for one in (pinned, *others)]
 
 
-def test_options_reach_the_reset() -> None:
-    """They make episodes of one seed different ones."""
-    options = [None, {"longer": 1}, {"longer": 2}]
-    found = evaluated(group_of(), [EpisodeSpec("1", 0, chosen) for chosen in options])
-    assert sorted(one.length for one in found.attempts) == [1, 2, 3]
-
-
 def test_an_entry_is_found_by_its_task() -> None:
     """An env that doesn't switch plays its own task; the entry that has the task is preferred."""
     one, two = (
@@ -164,12 +156,10 @@ def test_an_episode_whose_env_raises_fails_after_some_attempts() -> None:
     assert (found.success.count, found.failures) == (8, {"env_raised": 8})
 
 
+@pytest.mark.usefixtures("moving")
 @pytest.mark.parametrize("deed", [RAISE, DIE])
-def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(
-    deed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_moves_something_real_is_reset_by_nobody_else_after_a_loss(deed: int) -> None:
     """The others go on; what only it could play has failed, and says what to do."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
     fields = {"env_kwargs": {"breaks": {"2": deed}}, "on_worker_death": "restart"}
     fields |= {"placement": "process", "envs_per_process": 1}
     queue = [EpisodeSpec("2", 0), *(EpisodeSpec("1", seed) for seed in range(8))]

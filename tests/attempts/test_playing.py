@@ -29,7 +29,6 @@ from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.attempts.rules import is_unnamed
 from rlightning_aio.errors import EnvBusy, EpisodeLost
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -470,12 +469,6 @@ async def test_an_env_that_raises_is_rebuilt(place: dict[str, Any]) -> None:
         ((attempt,),) = await played(group, tasks(1), agent)
         assert [one.kind for one in attempt.failures] == ["env_raised"] * 2
         assert (marks, attempt.result) == ([7, 7], 0)
-
-
-@pytest.fixture
-def moving(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All envs move something real."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
 
 
 @pytest.mark.usefixtures("moving")

@@ -23,7 +23,6 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector, Rollout
 from rlightning_aio.errors import EnvRaised, RLightningError
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -245,12 +244,6 @@ async def test_a_restart_needs_all_envs_and_no_call_in_progress() -> None:
 async def until_it_raises(collector: Any) -> None:
     while True:
         await collector.collect()
-
-
-@pytest.fixture
-def moving(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All envs move something real."""
-    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, *entry: True)
 
 
 @pytest.mark.usefixtures("moving")
