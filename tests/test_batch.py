@@ -569,11 +569,16 @@ def test_single_responses_become_columns() -> None:
 
 
 def test_the_error_for_an_unknown_name_lists_the_sent_ones() -> None:
-    """Also if nothing was sent."""
-    sent = sent_for(1, {"action": np.zeros(1), "value": np.zeros(1)}, of_rows=[0], rows=[0])
-    with pytest.raises(AttributeError, match=r"no 'logprob' was sent.*action, value"):
-        sent.logprob  # noqa: B018
+    """Also if nothing was sent for a row, or for none."""
+    requests = {"action": np.ones(1)}, {"action": np.ones(1), "value": np.ones(1)}
+    sent = sent_for(2, *requests, of_rows=[0, 1], rows=[0, UNASKED])
+    assert (sent.action[0], np.isnan(sent.action[1])) == (1, True)
+    with pytest.raises(AttributeError, match=r"no 'valeu' was sent.*action"):
+        sent.valeu  # noqa: B018
+    sent = sent_for(1, requests[1], of_rows=[0], rows=[0])
     assert repr(sent) == "Sent(1 rows: action, value)"
+    with pytest.raises(AttributeError, match=r"no 'valeu' was sent.*action, value"):
+        sent.valeu  # noqa: B018
     with pytest.raises(KeyError, match="nothing"):
         sent_for(1, None, of_rows=[0], rows=[0])["action"]
 
@@ -590,17 +595,6 @@ def test_a_batch_without_requests_has_the_columns_sent_last() -> None:
     assert np.isnan(sent.log_prob).tolist() == [True, True]
     assert sent.thought == [None, None]
     assert np.isnan(sent.value).tolist() == [True, True]
-
-
-def test_a_name_without_values_raises_even_with_rows_without_requests() -> None:
-    """So a typo is found, although the other row would accept any name."""
-    of_each = np.full(2, None, object)
-    of_each[:] = [{"action": np.ones(1)}, {"action": np.ones(1), "value": np.ones(1)}]
-    sent = results(columns([0, 1], None), sources=(of_each, np.array([0, UNASKED]))).sent
-    assert sent.action[0] == 1
-    assert np.isnan(sent.action[1])
-    with pytest.raises(AttributeError, match=r"no 'valeu' was sent"):
-        sent.valeu  # noqa: B018
 
 
 # -- infos

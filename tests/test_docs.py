@@ -10,6 +10,7 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
 from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
@@ -53,3 +54,16 @@ def test_the_programs_for_rlightning_run(tmp_path: Path) -> None:
         *shlex.split(command)[1:], folder=tmp_path, asyncio_debug=False
     )
     run_programs(programs, tmp_path)
+
+
+def test_the_programs_about_the_numbers_of_a_group_run(tmp_path: Path) -> None:
+    """Means and percentiles are made, and a timeline is written, with the real libraries."""
+    pytest.importorskip("prometheus_client")
+    first, means, _, prometheus, traced = blocks("python", "metrics.md")
+    printed = run_programs([first, means, prometheus, traced], tmp_path)
+    assert re.search(r"mean return: [1-9]", printed)
+    assert re.search(r"p99 of a step: \[\d\S* \d\S*\]", printed)
+    for name in ("steps", "idle", "seconds_in_envs", "outcomes_env_died"):
+        assert re.search(rf"^envs/{name} ", printed, re.MULTILINE)
+        assert f'rlightning{{name="envs/{name}"}}' in printed
+    assert (tmp_path / "run.json").stat().st_size > 0

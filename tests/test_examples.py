@@ -25,7 +25,7 @@ RUN = (*LOOPS, "openpi_policy", "remote_arm")
 # Run by other tests: they need other packages, or are not complete programs.
 ELSEWHERE = {
     "command-line": "cli/test_documentation.py",
-    "metrics": "test_metrics.py",
+    "metrics": "test_docs.py",
     "rlightning": "test_docs.py",
     "simulators": "cli/test_simulators_page.py",
     "stable_baselines3": "vector/test_pages.py",

@@ -27,14 +27,6 @@ def test_no_worker_has_much_more_than_its_share(total: int, workers: int) -> Non
 
 
 @pytest.mark.parametrize(
-    ("total", "workers", "count"), [(256, 2, 2), (32, 2, 2), (100, 16, 25), (31, 2, 31), (3, 8, 3)]
-)
-def test_one_batch_for_each_worker_if_possible(total: int, workers: int, count: int) -> None:
-    """Otherwise more; a prime number makes batches of one."""
-    assert num_batches(total, workers) == count
-
-
-@pytest.mark.parametrize(
     ("limits", "cores"),
     [
         ({}, 8),
