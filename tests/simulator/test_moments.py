@@ -303,6 +303,31 @@ def test_a_start_has_its_time_though_the_trainer_was_stopped(
     assert world.wrongs == []
 
 
+def sized(content: bytes) -> Timed:
+    return Timed()
+
+
+def test_what_was_not_sent_is_dropped_with_its_worker(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A replacement dies before it has its whole order, and a look for late ones reads of that."""
+
+    def kill(host: Any) -> None:
+        monkeypatch.undo()  # The next one lives.
+        world.sleep(1.0)
+        world.kill([process.pid for process in world._processes])
+        world.sleep(1.0)
+        assert host.catch_up()
+
+    with built(entry(task=partial(sized, bytes(100_000)), start_timeout=10.0)) as group:
+        batch, _ = group.reset()
+        stopped_in(world, monkeypatch, "start", kill)
+        world.kill([group.get_workers()[0]["pid"]])
+        batch, _ = group.step(batch.respond(action=[0.0]))
+        assert batch.restarted.all()
+        assert world.deaths["worker 0"] == 2
+
+
 def test_the_time_of_a_start_counts_from_the_death(world: World) -> None:
     """Not from the last time that the supervisor ran; and it may be up before it runs again."""
     with built(entry(task=builds_in(8.0), start_timeout=10.0)) as group:

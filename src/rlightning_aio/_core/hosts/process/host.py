@@ -352,7 +352,6 @@ class ProcessHost(Host):
             self._memory = wiring.arena.map(self._place.rings_offset, rings_size(self.num_envs))
         self._rings = TrainerRings(self._memory, self.num_envs, wiring.bell, self.host_id)
         self._socket, self._frames = channel, FrameReader()
-        self._outgoing, self._frames_outgoing = bytearray(), 0
         self._close_errors = None
         wiring.rings[self.host_id] = self._rings.ring(self._wake)
         wiring.driver.watch(self)
@@ -381,9 +380,10 @@ class ProcessHost(Host):
         self._memory = None
 
     def _part(self) -> None:
-        """Take the rings away, and close the channel; unread data is lost."""
+        """Take the rings away, and close the channel; what is unread or unsent is lost."""
         if self._rings is not None:
             self._wiring.rings[self.host_id] = self._rings = None
+        self._outgoing, self._frames_outgoing = bytearray(), 0
         self._close_channel()
 
     def _close_channel(self) -> None:
