@@ -76,6 +76,7 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
         Raises:
             ClosedEnvironmentError: the vector env is closed.
         """
+        check_running(self)
         if options is not None and "reset_mask" in options:
             mask = checked_mask(options["reset_mask"], self.num_envs)
             options = {**options, "reset_mask": mask}
@@ -85,11 +86,13 @@ class MujocoVectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `
 
     def call(self, name: str, /, *args: Any) -> tuple[Any, ...]:
         """Get attribute `name` of each env; see `MujocoBatch.call`."""
+        check_running(self)
         check_name(name)
         return super().call(name, *args)
 
     def env_is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Return True if `wrapper_class` is among the wrappers of the envs."""
+        check_running(self)
         return self.is_wrapped(name_of(wrapper_class))
 
     # -- state and rendering ---------------------------------------------------------------

@@ -162,7 +162,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             seed: simulation k gets ``seed + k``, or element k of a sequence.
             options: passed to the task, without the mask.
         """
-        check_running(self)
         if seed is None or isinstance(seed, int | np.integer):
             seeds = [None if seed is None else int(seed) + k for k in range(self.num_envs)]
         else:
@@ -376,7 +375,6 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         Raises:
             NotImplementedError: it is another method, which exists once for all simulations.
         """
-        check_running(self)
         return tuple(self.call_one(k, name, *args) for k in range(self.num_envs))
 
     def call_one(self, k: int, name: str, /, *args: Any) -> Any:
