@@ -175,7 +175,8 @@ async def test_an_agent_that_takes_too_long(
         ((attempt,),) = await played(group, tasks(1), agent, 1, rules)
     assert (attempt.outcome.kind, attempt.outcome.blame) == (kind, blame)
     assert (attempt.reward, attempt.length) == (reward, steps)
-    assert attempt.outcome.seconds.agent > began + 1.0 - thinking[0]
+    if deed != "hang":
+        assert attempt.outcome.seconds.agent > began + 1.0 - thinking[0]
 
 
 @pytest.mark.parametrize("what", ["a step", "a step that was not sent", "a call"])
