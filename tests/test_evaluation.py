@@ -214,21 +214,6 @@ def test_entries_of_different_spaces_have_a_policy_each() -> None:
         assert group.pending == []
 
 
-def test_an_env_that_was_given_up_before_plays_nothing() -> None:
-    """Others play the queue; what only that env may play is an error."""
-    env = scripted(lambda _: True)
-    group = group_of(env, env, placement="process", envs_per_process=1, on_worker_death="raise")
-    with group, group.auto_reset(100):
-        batch, _ = group.reset(seed=0)
-        with pytest.raises(rl.WorkerDied):
-            group.step(batch.respond(action=[1, 0]))
-        found = evaluate(group, nothing, [EpisodeSpec("", seed) for seed in range(4)], retries=0)
-        assert {one.env_id for one in found.played} == {"env-1"}
-        assert not found.failed
-        with pytest.raises(rl.RLightningError, match="no env of this group is left"):
-            evaluate(group, nothing, [EpisodeSpec("", 0, env_id="env-0")])
-
-
 def test_it_is_printed_as_a_table() -> None:
     """With a line for each task, and one for all."""
     found = evaluated(group_of(*HALF_SUCCEED), [EpisodeSpec("", seed) for seed in range(8)])

@@ -294,7 +294,8 @@ class EpisodeLost(EnvFault):
     """A call has no result, because the episode of its env has ended without one.
 
     Its env was replaced during a step of an `EnvEpisode` (whose `lost` is the outcome), or `abort`
-    or `drain` of the group has ended the request. The env can be reset.
+    or `drain` of the group has ended the request, or it moves something real and was lost before a
+    step. The env can be reset.
 
     Attributes:
         results: where the env was replaced, the first result of the episode that it has begun; None

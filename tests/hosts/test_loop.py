@@ -46,7 +46,6 @@ from rlightning_aio.errors import (
     StartFailed,
     WorkerDied,
 )
-from rlightning_aio.evaluation import EpisodeSpec, evaluate
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -456,7 +455,7 @@ async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
             for _ in range(0 if failed else max_restarts):
                 batch, _ = await group.step(steps(e_1=HANG))
                 assert batch.restarted.all()
-            with pytest.raises(EnvHung, match=f"after {max_restarts + failed} restarts in a row"):
+            with pytest.raises(EnvHung, match=f"{max_restarts + failed} restarts in a row"):
                 await group.step(steps(e_1=HANG))
             if after == "call":  # It is answered by an env that has begun no episode.
                 assert await group.call("get_attr", "episodes", env_ids=["e-1"]) == [0]
@@ -467,7 +466,6 @@ async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
                 batch, _ = await group.reset(seed={"e-1": 4}, env_ids=["e-1"])
             assert batch.restarted.tolist() == [True]
             assert batch.observation[0, 1:].tolist() == [1, 0, 4]
-        assert group.get_workers()[0]["given_up"] == []
         batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
         assert batch.observation[:, 2].tolist() == [1, 1]
         for _ in range(max_restarts):
@@ -475,7 +473,7 @@ async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
             assert batch.restarted.all()
 
 
-async def test_an_env_that_is_not_rebuilt_raises_from_then_on(place: dict[str, Any]) -> None:
+async def test_a_hang_that_is_raised_concerns_its_env_alone(place: dict[str, Any]) -> None:
     config = entry(num_workers=2, step_timeout=SOON, on_worker_death="raise", **place)
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset()
@@ -483,28 +481,9 @@ async def test_an_env_that_is_not_rebuilt_raises_from_then_on(place: dict[str, A
             await group.step(steps(e_0=STEP, e_1=HANG))
         assert raised.value.env_ids == ("e-1",)
         assert raised.value.results.ids() == ["e-0"]
-        with pytest.raises(EnvHung, match="is not replaced"):
-            await group.step(steps(e_1=STEP))
-        batch, _ = await group.step(steps(e_0=STEP))
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
+        assert batch.restarted.tolist() == [False, True]
         assert batch.observation[0, 2] == 2
-
-
-async def test_an_env_that_is_not_rebuilt_gets_no_more_episodes_of_a_queue() -> None:
-    """It would lose each of them at once; meanwhile the other plays its first."""
-
-    def policy(batch: rl.BatchedData) -> Any:
-        is_given_up = bool(group.get_workers()[0]["given_up"])
-        others = END if is_given_up else STEP
-        return [HANG if env_id == "e-1" else others for env_id in batch.ids()]
-
-    config = entry(num_workers=2, step_timeout=SOON, on_worker_death="raise")
-    async with rl.build_env_group(config) as group:
-        with group.auto_reset(math.inf):
-            queue = [EpisodeSpec("-", seed) for seed in range(12)]
-            found = await evaluate(group, policy, queue)
-        assert len(found.played) == 12
-        assert found.failures == {"env_hung": 1}
-        assert group.get_workers()[0]["given_up"] == ["e-1"]
 
 
 async def test_an_env_that_can_not_be_rebuilt_fails_its_requests_until_it_can() -> None:

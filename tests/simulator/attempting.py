@@ -29,7 +29,7 @@ from simulator.world import Faults
 from rlightning_aio.attempts import EpisodeSpec, ResultsFile, Rules, file, play
 from rlightning_aio.attempts.queue import AttemptQueue
 from rlightning_aio.attempts.rules import is_retried
-from rlightning_aio.errors import BadAction, EnvFault, RLightningError, WorkerDied
+from rlightning_aio.errors import BadAction, EnvFault, RLightningError
 from rlightning_aio.outcomes import BLAMES, is_bystanders
 
 if TYPE_CHECKING:
@@ -83,10 +83,6 @@ class _AtOnce(Executor):
 
 class Attempts(InContext):
     """A run of a program that plays groups of attempts."""
-
-    def begin(self) -> None:
-        super().begin()
-        self.has_ended = False
 
     def drawn_limit(self, rng: Random) -> float | None:
         return rng.choice([None, None, math.inf, 3, 5])
@@ -178,8 +174,6 @@ class Attempts(InContext):
     plain = False
 
     async def op_attempts(self, rng: Random) -> None:
-        if self.has_ended:
-            return
         self.op_seed, self.played, self.stubborn = rng.getrandbits(32), {}, set()
         self.is_bug, self.excused = False, dict[Any, int]()
         specs = self.specs(rng, 6)
@@ -195,11 +189,11 @@ class Attempts(InContext):
             tasks = partial(_loaded, specs) if rng.random() < 0.3 else specs.copy
             playing = partial(self._played, tasks, size, rules, path)
             found = await playing(*leave)
-            if path is not None and not self.has_ended:
+            if path is not None:
                 self.may_hang = may_time_out
                 await playing(None, None)
                 self._check_file(path, specs, size, rules)
-        if not (leaves or self.has_ended or self.is_bug):
+        if not (leaves or self.is_bug):
             keys = sorted(one.spec.key for one in found)
             require(keys == sorted(spec.key for spec in specs), "other groups", keys)
         if self.stubborn:
@@ -288,16 +282,7 @@ class Attempts(InContext):
             require("raise" in self.features or "misuse" in self.features, "no agent has raised")
             self.is_bug = True
             return
-        given_up = self.given_up()
-        entries = {env.entry.name for env in self.envs if env.env_id not in given_up}
-        require(
-            given_up and entries < {plan.name for plan in self.program.plans},
-            "no env is left",
-            repr(error),
-        )
-        if isinstance(error, WorkerDied):
-            self.lose(error)
-        self.has_ended = True
+        raise Violation(f"ended, and envs are there: {error!r}") from error
 
     # -- what came of them
 
@@ -421,7 +406,7 @@ class Attempts(InContext):
             places = [(one.spec.key, one.index) for one in results]
             whole = [one.spec.key for one in results if not one.outcome.is_failure]
         require(len({*places}) == len(places), "an attempt is twice in the file", places)
-        if self.has_ended or self.is_bug:
+        if self.is_bug:
             return
         for spec in specs:
             count = sum(key == spec.key for key, _ in places)
@@ -430,7 +415,6 @@ class Attempts(InContext):
 
     async def finish(self) -> None:
         self.plain = True
-        self.has_ended |= bool(self.given_up())
         await self.op_attempts(Random(1))
         await super().finish()
 

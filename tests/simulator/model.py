@@ -89,6 +89,7 @@ class Host:
 
     Attributes:
         struck: it was killed from outside; aborted: perhaps by an abort, for which it is replaced.
+        raised: one of its deaths was, or was dropped by a reset of all envs.
         renewed: some of its envs may be in the next process already, and live on.
     """
 
@@ -105,7 +106,7 @@ class Host:
         self.knows = knows
         self._count = count
         self._asked = 0
-        self.struck = self.aborted = False
+        self.struck = self.aborted = self.raised = False
 
     @property
     def deaths(self) -> int:
@@ -288,7 +289,6 @@ class Env:
         limbo: the call that it executes may have been given up.
         deadly: its code was to end its worker, or to hang until that is ended; or it was aborted.
         kept: aborted requests that may have ended in an error before; a collect still raises that.
-        gone: its worker ended and is not replaced.
         dirty: its last result could not be read, so its episode must end.
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
         exceptions: how often it may have raised, where it is then rebuilt.
@@ -313,7 +313,6 @@ class Env:
     limbo: bool = False
     deadly: bool = False
     kept: list[Request] = field(default_factory=list)
-    gone: bool = False
     dirty: bool = False
     hangs: int = 0
     exceptions: int = 0
@@ -328,7 +327,7 @@ class Env:
 
     @property
     def idle(self) -> bool:
-        return self.request is None and not self.gone
+        return self.request is None
 
     @property
     def may_be_lost(self) -> bool:
@@ -372,7 +371,8 @@ class Env:
 
     def possible(self) -> list[State]:
         """The states that it may have."""
-        return [self.state, *(self.after_loss() if self.may_be_lost else self.loose)]
+        is_lost = self.lost or self.may_be_lost
+        return [self.state, *(self.after_loss() if is_lost else self.loose)]
 
 
 class Row(NamedTuple):
@@ -646,8 +646,8 @@ class Model:
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
         if not (env.torn or env.lost):
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
-            is_replaced = env.entry.on_death != "raise" or env.host.aborted
-            require(is_replaced, "marked, where a death is to be raised")
+            is_known = env.entry.on_death != "raise" or env.host.aborted or env.host.raised
+            require(is_known, "marked, where a death is to be raised")
         cause = "worker_restarted" if env.client is None else "client_lost"
         self.judge_heads(row, cause)
         self._judge_blame(env, row.info.get("env_at_fault"))
@@ -700,7 +700,7 @@ class Model:
                     env.kept.pop(0)
                     self.counts["error of an aborted request"] += 1
                     if isinstance(one, WorkerDied):
-                        self.gone(env, one)
+                        self.died(env, one)
                     continue
                 require(
                     request is not None and request.owner == owner,
@@ -713,7 +713,7 @@ class Model:
 
     def _judge_fault(self, env: Env, request: Request, fault: EnvFault) -> None:
         if isinstance(fault, WorkerDied):
-            self.gone(env, fault)
+            self.died(env, fault)
             if request.kind == "restore":  # Its next result says so.
                 self.counts["died in a restore"] += 1
             else:
@@ -805,20 +805,19 @@ class Model:
         is_retried = env.entry.form == "awaitable" and request.resets
         return env.errors[1] + (env.entry.max_restarts if is_retried else 1)
 
-    def gone(self, env: Env, fault: WorkerDied) -> None:
-        """Check an error that says that an env's worker has ended for good, or during a call."""
+    def died(self, env: Env, fault: WorkerDied) -> None:
+        """Check an error that says that an env's worker has ended: its episode is lost."""
         host, entry = env.host, env.entry
-        require(host.mortal and env.may_be_lost, "dead, and nothing has died", repr(fault))
+        may_have_died = host.mortal and (env.may_be_lost or self.starts_fail)
+        require(may_have_died, "dead, and nothing has died", repr(fault))
         hung = isinstance(fault, EnvHung)
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind in ("call", "restore")
-        if not env.gone and (entry.on_death == "raise" or not in_call):  # Judged once for all.
+        if not in_call:
             errors = [self._most_errors(one) for one in self.envs.values() if one.host is host]
             spent = entry.on_death == "raise" or env.deaths + max(errors) > entry.max_restarts
-            require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
-            for other in self.envs.values():
-                if other is env or (other.host is host and not host.renewed):
-                    other.gone = True
+            require(spent or self.starts_fail, "raised, with restarts left", repr(fault))
+        env.lost = host.raised = True
 
 
 def _shown(states: Sequence[State], requests: Sequence[Request], row: Row) -> list[State]:

@@ -157,7 +157,7 @@ class Play(Session):
             for k in range(30):
                 if env.client is not None:
                     env.client.revive(self.address)
-                if env.gone or await self.interruptible(self.use(env)):
+                if await self.interruptible(self.use(env)):
                     break
                 # It may still be starting.
                 await self.rest(1 if self.world is None else 10 ** min(k, 5))
@@ -283,7 +283,7 @@ class Play(Session):
             own = [env_id for env_id in own if env_id in named]
         require(named and sorted(named) == sorted(own), "a refusal of others", repr(fault))
         for env_id in named:
-            self.model.gone(envs[env_id], fault)
+            self.model.died(envs[env_id], fault)
         self.withdraw(requests)
 
     def fail(self, fault: EnvFault, requests: dict[str, Request], owner: Any) -> None:
@@ -310,7 +310,7 @@ class Play(Session):
                 require(env_id in requests, "an error of another call", repr(one))
                 if isinstance(one, WorkerDied):
                     self.counts["died in a call"] += 1
-                    self.model.gone(self.model.envs[env_id], one)
+                    self.model.died(self.model.envs[env_id], one)
         for env_id in requests:
             self.model.envs[env_id].request = None
 
@@ -551,9 +551,7 @@ class Play(Session):
 
     def may_drop(self) -> bool:
         """A reset of all envs drops what is in flight, and nothing stops it on the way."""
-        envs = self.model.envs.values()
-        gone = any(env.gone for env in envs)
-        known = not ("interrupts" in self.features or self.clients or gone or self.is_stopped)
+        known = not ("interrupts" in self.features or self.clients or self.is_stopped)
         return known and self.may_abort() and all(map(self.is_abortable, self.model.pending()))
 
     async def drop(self, rng: Random) -> None:
@@ -581,6 +579,9 @@ class Play(Session):
             everyone = drops or (everyone and rng.random() < 0.7)
         if self.clients and "tasks" in self.features:  # It may wait for one, with nothing sent.
             everyone = False
+        if everyone:  # It drops errors that nobody has collected.
+            for env in envs:
+                env.host.raised = True
         ids = None if everyone else [*requests]
 
         def take(found: Any) -> None:
@@ -853,7 +854,7 @@ class Play(Session):
             await self.answer(requests, lambda: self.group.snapshot([*requests]), take)
         except SnapshotError as error:
             self.count(error)
-            require(any(env.may_be_lost for env in envs), "no state", repr(error))
+            require(any(env.may_be_lost or env.lost for env in envs), "no state", repr(error))
             for env in envs:
                 env.request = None
         for env in envs:

@@ -216,7 +216,7 @@ class Session:
 
     def kill_soon(self, rng: Random, envs: Sequence[Env]) -> Env | None:
         """End the worker of one of these envs, in a world also a little later; return the env."""
-        envs = [env for env in envs if self.is_killable(env) and not env.gone]
+        envs = [env for env in envs if self.is_killable(env)]
         if not envs:
             return None
         env, delay = rng.choice(envs), rng.choice([0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1])

@@ -23,7 +23,6 @@ from rlightning_aio.errors import (
     EnvRaised,
     NothingPending,
     ResetNeeded,
-    RLightningError,
     SnapshotError,
     WorkerDied,
 )
@@ -99,18 +98,9 @@ class InContext(Session):
             specs.append(EpisodeSpec(tasks[name], 100 * k + rng.randrange(100), options, name))
         return specs
 
-    def given_up(self) -> set[str]:
-        """Envs whose worker is not replaced, as the group says."""
-        return {env_id for worker in self.group.get_workers() for env_id in worker["given_up"]}
-
-    def any_gone(self) -> bool:
-        return any(env.gone for env in self.envs)
-
-    def lose(self, fault: WorkerDied) -> None:
-        """Note envs whose worker is not replaced."""
+    def check_death(self, fault: WorkerDied) -> None:
         for env_id in fault.env_ids:
             require(self.by_id[env_id].deaths > 0, "dead, and nothing has died", repr(fault))
-            self.by_id[env_id].gone = True
 
 
 class Training(InContext):
@@ -124,7 +114,6 @@ class Training(InContext):
         super().begin()
         self.raised = dict.fromkeys(self.by_id, 0)
         self.kept: list[tuple[Any, Any]] = []
-        self.raised_deaths: set[int] = set()
         self.begins = True
         rng = Random(self.program.seed)
         self.options = self._options(rng)
@@ -189,7 +178,7 @@ class Training(InContext):
             self.restore_order(fault)
         except NothingPending as error:
             self.count(error)
-            require(all(env.gone for env in self.envs), "nothing to collect, and envs are there")
+            raise Violation("nothing to collect, and envs are there") from error
         except EnvBusy as error:
             self.count(error)
             require("a call that was cancelled" in str(error), "busy", repr(error))
@@ -201,12 +190,11 @@ class Training(InContext):
         return False
 
     def restore_order(self, fault: EnvFault) -> None:
-        """Reset the env that raised, as the error says; those of a worker that is gone are lost."""
-        if isinstance(fault, WorkerDied):
-            self.check_first(fault)
-            self.lose(fault)
-            return
+        """Reset the envs that an error names, or leave that to the collector."""
         for one in (fault, *fault.others):
+            if isinstance(one, WorkerDied):
+                self.check_death(one)
+                continue
             env = self.by_id[one.env_id]
             if env.client is not None and isinstance(one, EnvAway):
                 continue  # It comes back by itself.
@@ -220,32 +208,14 @@ class Training(InContext):
                 self.group.reset_async(env_ids=[one.env_id])
                 raise
             except WorkerDied as died:
-                self.lose(died)
-
-    def check_first(self, fault: WorkerDied) -> None:
-        """Check that no death is raised twice while envs of other workers are left.
-
-        A start, and a block, need all envs; an awaitable env that hangs is tried again each time.
-        """
-        gone = {env_id for worker in self.group.get_workers() for env_id in worker["given_up"]}
-        if gone.isdisjoint(fault.env_ids):
-            return
-        dead = {id(env.host) for env in self.envs if env.gone}
-        own = {id(self.by_id[env_id].host) for env_id in fault.env_ids}
-        if fault.exit_code is None:  # An awaitable env that is given up alone.
-            own = {id(self.by_id[env_id]) for env_id in fault.env_ids}
-        left = any(id(env.host) not in dead | own for env in self.envs)
-        needs_all = "wait_all" in self.options or self.begins
-        again = not own.isdisjoint(self.raised_deaths)
-        require(needs_all or not (again and left), "a death is raised again", repr(fault))
-        self.raised_deaths |= own
+                self.check_death(died)
 
     async def op_restart(self, rng: Random) -> None:
         """Begin all episodes anew, or where the program has reset or restored the envs."""
         for env_id in self.by_id:
             self.raised[env_id] += 1
         self.begins, batch = True, None
-        if rng.random() < 0.6 and not (self.clients or self.any_gone()):
+        if rng.random() < 0.6 and not self.clients:
             batch = await self.interruptible(self.prepared(rng))
         if batch is None:
             self.collector.restart(rng.choice([None, 5]))
@@ -264,8 +234,6 @@ class Training(InContext):
                 batch, _ = await self.done(
                     self.group.restore(await self.done(self.group.snapshot()))
                 )
-        except WorkerDied as fault:
-            self.lose(fault)
         except EnvFault as fault:
             self.count(fault)
         except SnapshotError as error:
@@ -282,7 +250,7 @@ class Training(InContext):
     async def finish(self) -> None:
         self.plain = True
         for _ in range(20):
-            if await self.interruptible(self.op_rollout(Random(1))) or self.any_gone():
+            if await self.interruptible(self.op_rollout(Random(1))):
                 break
         else:
             raise Violation("no rollout is collected any more")
@@ -396,8 +364,6 @@ class Evaluations(InContext):
     async def op_evaluate(self, rng: Random) -> None:
         singles = all(plan.form != "stacked" for plan in self.program.plans)
         await self.settle()
-        if self.any_gone():
-            return
         self.calls_left = rng.randint(0, 20) if rng.random() < 0.3 else math.inf
         self.pressed, self.cut_off = self.num_interrupts, False
         try:
@@ -407,15 +373,6 @@ class Evaluations(InContext):
                 await self._number(rng)
         except PolicyFailed:
             self.counts["evaluations whose policy failed"] += 1
-        except WorkerDied as fault:
-            self.count(fault)
-            self.lose(fault)
-        except RLightningError as error:  # An evaluation before has heard of it.
-            self.count(error)
-            given_up = self.given_up()
-            require(given_up, "no env is left", repr(error))
-            for env_id in given_up:
-                self.by_id[env_id].gone = True
         except KeyboardInterrupt as interrupt:
             self.cut_off = isinstance(interrupt.__context__, Exception)
             raise
@@ -427,8 +384,6 @@ class Evaluations(InContext):
             require(again or self.cut_off, "left in flight", self.group.pending)
             with contextlib.suppress(EnvFault):
                 await self.done(self.group.drain(1.0))
-        for env_id in self.given_up():
-            self.by_id[env_id].gone = True
 
     async def _found(self, rng: Random, answer: Any) -> Any:
         """Wait for an evaluation, or cancel it: then None."""
@@ -514,9 +469,7 @@ class Evaluations(InContext):
                 return total, length, info["success"] > 0.5 if "success" in info else None
 
     async def finish(self) -> None:
-        await self.settle()
-        if not self.any_gone():
-            await self.op_evaluate(Random(1))
+        await self.op_evaluate(Random(1))
         await super().finish()
 
 

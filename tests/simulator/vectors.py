@@ -257,8 +257,6 @@ class Vectors(Session):
                 require(
                     any(env.deaths for env in self.envs), "dead, and nothing has died", repr(one)
                 )
-                for env_id in one.env_ids:
-                    next(env for env in self.envs if env.env_id == env_id).gone = True
 
     def has_cause(self, infos: Any, k: int) -> bool:
         return bool(infos.get("_worker_restarted", np.zeros(k + 1, bool))[k])
@@ -326,8 +324,6 @@ class Vectors(Session):
     async def finish(self) -> None:
         self.plain = True
         for _ in range(6):
-            if any(env.gone for env in self.envs):
-                return
             # A step that Ctrl-C has cut off may still press it again in other envs.
             await self.interruptible(self.op_reset(Random(1)))
             if self.is_whole:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from rlightning_aio._core.group.api.facade import is_lost, is_resettable
+from rlightning_aio._core.group.api.facade import is_resettable, lost_hardware
 from rlightning_aio.attempts.rules import is_from_env
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import RLightningError
@@ -28,9 +28,8 @@ class Players:
     Attributes:
         entry_of: the name of the config entry of each env.
         worker_of: the ids of all envs in the worker of each env.
-        gone: envs whose worker is not replaced.
         left_alone: what moves something real and was lost or has raised: only its user resets it.
-        present: envs that are there, and neither gone nor left alone.
+        present: envs that are there, and not left alone.
     """
 
     def __init__(self, group: Any) -> None:
@@ -47,15 +46,9 @@ class Players:
             self._players[meta.env_id] = player
             self._kinds.pop(player, None)
             self._kinds[player] = None
-        self.gone: set[str] = set()
         self.left_alone: set[str] = set()
         self.present: set[str] = set()
         self.refresh()
-
-    @property
-    def out(self) -> set[str]:
-        """Envs that are gone, or left alone."""
-        return self.gone | self.left_alone
 
     def refresh(self) -> set[str]:
         """Look which envs are there now; return those that are."""
@@ -63,12 +56,8 @@ class Players:
         for worker in self._group.get_workers():
             if worker["state"] != "empty":
                 present.update(worker["env_ids"])
-            self.gone.update(worker["given_up"])
-            if worker.get("client"):  # One that was lost while its env was idle, too.
-                self.left_alone.update(
-                    id_ for id_ in worker["env_ids"] if is_lost(self._group, id_)
-                )
-        self.present = present - self.out
+        self.left_alone |= lost_hardware(self._group)  # Also what was lost while it was idle.
+        self.present = present - self.left_alone
         return self.present
 
     def note(self, outcome: Outcome) -> None:
@@ -117,14 +106,15 @@ class Players:
             return {"task": spec.task, **(spec.options or {})}
         return None if spec.options is None else {**spec.options}
 
-    def can_play(self, entries: Iterable[str], out: set[str]) -> bool:
-        """Return True unless all envs of one of these entries are among those that are `out`."""
-        left = {entry for env_id, entry in self.entry_of.items() if env_id not in out}
-        return not out or left.issuperset(entries)
+    def can_play(self, entries: Iterable[str]) -> bool:
+        """Return True unless all envs of one of these entries are left alone."""
+        alone = self.left_alone
+        left = {entry for env_id, entry in self.entry_of.items() if env_id not in alone}
+        return not alone or left.issuperset(entries)
 
     def is_nobody_left(self) -> bool:
-        """Return True if all envs are gone, or left alone."""
-        return self.entry_of.keys() <= self.out
+        """Return True if all envs are left alone."""
+        return self.entry_of.keys() <= self.left_alone
 
     def refusal(self, env_id: str) -> RLightningError:
         """The error for attempts that only an env which is left alone could play."""

@@ -29,7 +29,7 @@ from rlightning_aio.attempts.records import Attempt, AttemptGroup
 from rlightning_aio.attempts.rules import Rules, needed
 from rlightning_aio.attempts.tasks import TaskSource, spec_of_task
 from rlightning_aio.attempts.tries import Try, surely
-from rlightning_aio.errors import EnvBusy, RLightningError, WorkerDied
+from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.outcomes import Outcome
 
 if TYPE_CHECKING:
@@ -87,7 +87,6 @@ async def play(
         EnvBusy: an env has a request in flight or a result to be collected, or plays already.
         ValueError: `size` is below 1, or no entry can play a task, or more than one can, or there
             is a file, and a task is twice there.
-        WorkerDied, EnvHung: all envs that could play a task are gone for good.
         RLightningError: too many attempts have failed: all at the first task, or by `rules`; or
             only envs are left that move something real and have failed: only you reset them.
     """
@@ -321,14 +320,11 @@ class _Engine:
         queue = self._queue
         job, one = self._playing.pop(ended)
         attempt = ended.result()
-        if isinstance(one.error, WorkerDied):
-            queue.fault = one.error
-            one.error.add_note(f"it played attempt {job.index} at {job.spec}")
         queue.players.note(attempt.outcome)
         if attempt.outcome.is_failure:
             queue.players.refresh()
         queue.release(one.env_id)
-        for env_id in queue.players.out:
+        for env_id in queue.players.left_alone:
             queue.free.pop(env_id, None)
         if self._health.note(attempt.outcome, self._most, time.monotonic()):
             queue.excuse([job, *(other for other, _ in self._playing.values())])
@@ -388,15 +384,12 @@ class _Engine:
     # -- envs that are not there ------------------------------------------------------
 
     def _check_envs(self) -> None:
-        """Raise the last fault if attempts wait for an env that won't come."""
+        """Raise an error if attempts wait for envs that only their user resets."""
         queue = self._queue
-        queue.check_players()
         if self._playing:
             return
-        queue.check_players(alone=True)
+        queue.check_players()
         if queue.free or self._source.is_at_end:
             return
         if queue.players.left_alone and queue.players.is_nobody_left():
             raise queue.players.refusal(min(queue.players.left_alone))
-        if not self._has_clients:
-            raise queue.fault or RLightningError("no env of this group is left that could play")

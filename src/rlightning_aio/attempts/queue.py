@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.rules import is_of_env, is_unnamed, tries_again
-from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from rlightning_aio.attempts.records import Attempt
     from rlightning_aio.attempts.rules import Rules
     from rlightning_aio.attempts.spec import EpisodeKey, EpisodeSpec
-    from rlightning_aio.errors import WorkerDied
     from rlightning_aio.outcomes import Outcome
 
 LOOK_SECONDS: Final = 0.2
@@ -98,7 +96,6 @@ class AttemptQueue:
         players: the envs.
         free: idle envs, the one that has been idle for longest first.
         busy: envs that play.
-        fault: the last error of a worker that ended.
     """
 
     def __init__(self, group: Any, rules: Rules, results: ResultsFile | None = None) -> None:
@@ -107,7 +104,6 @@ class AttemptQueue:
         self.players = Players(group)
         self.free = {id_: None for id_ in self.players.entry_of if id_ in self.players.present}
         self.busy: set[str] = set()
-        self.fault: WorkerDied | None = None
         self._waiting: dict[str, deque[Job]] = {}
         # Jobs that only one env may play: of each of its sub-environments, in order.
         self._pinned: dict[str, dict[int, deque[Job]]] = {}
@@ -314,7 +310,7 @@ class AttemptQueue:
         first = self._rules.first
         return len(task.attempts) == task.size or (first is not None and task.num_whole >= first)
 
-    # -- envs that are gone -----------------------------------------------------------
+    # -- envs that are not there -----------------------------------------------------------
 
     def lacking(self) -> int:
         """The number of attempts that wait for envs while none of these is free or busy."""
@@ -351,20 +347,9 @@ class AttemptQueue:
             if env_id in present:
                 self.free.setdefault(env_id)
 
-    def check_players(self, *, alone: bool = False) -> None:
-        """Raise an error if attempts wait that no env is left for.
-
-        Args:
-            alone: those count as well that only their user resets.
-
-        Raises:
-            WorkerDied: its worker is not replaced.
-            RLightningError: that was known before; or such an env is left alone.
-        """
+    def check_players(self) -> None:
+        """Raise an error if attempts wait for envs that only their user resets."""
         players = self.players
-        out = players.out if alone else players.gone
-        if players.can_play(self._entries(), out) and out.isdisjoint(self._pinned_to()):
+        if players.can_play(self._entries()) and players.left_alone.isdisjoint(self._pinned_to()):
             return
-        if alone and players.left_alone:
-            raise players.refusal(min(players.left_alone))
-        raise self.fault or RLightningError("no env of this group is left that could play")
+        raise players.refusal(min(players.left_alone))

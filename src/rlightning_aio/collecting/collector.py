@@ -179,8 +179,6 @@ class Collector(Generic[G, R]):
         self._expecting = False
         # Envs whose error was raised, and that have sent no result since.
         self._failed: set[str] = set()
-        # Envs of workers that are not replaced, whose error was raised.
-        self._was_raised: set[str] = set()
 
     def restart(self, seed: Any = None, *, batch: BatchedData | None = None) -> None:
         """Begin the episodes of all envs again in the next `collect`.
@@ -233,8 +231,7 @@ class Collector(Generic[G, R]):
             RuntimeError: a call is in progress.
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
                 for each entry; or these envs can't fill a block.
-            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env whose worker is
-                not replaced takes part no more.
+            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`.
             RLightningError: only envs that move something real are left that have raised.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """
@@ -300,10 +297,7 @@ class Collector(Generic[G, R]):
         except EnvFault as fault:
             self._note(fault)
             self._expecting = bool(self._group.pending)
-            if not (isinstance(fault, WorkerDied) and self._was_raised_before(fault)):
-                raise
-            if self._block or not self._has_others():
-                raise
+            raise
         else:
             self._expecting = False
 
@@ -361,32 +355,30 @@ class Collector(Generic[G, R]):
 
     # -- after errors -----------------------------------------------------------------
 
-    def _note(self, fault: EnvFault) -> None:
-        """Note envs whose error was raised."""
+    def _note(self, fault: EnvFault) -> set[str]:
+        """Note envs whose error was raised, and return them."""
+        noted: set[str] = set()
         for one in (fault, *fault.others):
             env_ids = one.env_ids if isinstance(one, WorkerDied | EnvAway) else ()
-            self._failed.update(env_ids or [one.env_id])
+            noted.update(env_ids or [one.env_id])
+        self._failed |= noted
+        return noted
 
     def _rejoin(self) -> None:
-        """Begin episodes of envs whose error was raised, except of those that are given up.
+        """Begin episodes of envs whose error was raised.
 
         Raises:
-            WorkerDied, EnvHung: all envs are given up.
+            WorkerDied, EnvHung: one has been lost once more meanwhile.
             RLightningError: only envs that may move something real are left, or a block needs one.
         """
         pending = self._group.pending
         self._expecting |= bool(pending)
-        idle = self._failed.difference(pending)
-        gone = {env_id for worker in self._group.get_workers() for env_id in worker["given_up"]}
-        left = sorted(idle if self._block else idle - gone)
+        left = sorted(self._failed.difference(pending))
         to_reset = [env_id for env_id in left if is_resettable(self._group, env_id)]
-        if len(to_reset) < len(left):  # The others are reset by the program alone.
-            if self._block or not (to_reset or self._expecting or self._unanswered):
-                env_id = next(env_id for env_id in left if env_id not in to_reset)
-                reset = f"group.reset_async(env_ids=[{env_id!r}])"
-                raise self._refusal(env_id, f"{reset}, whose result the next collect takes")
-        elif idle and not (to_reset or self._has_others()):
-            to_reset = sorted(idle)
+        alone = [env_id for env_id in left if env_id not in to_reset]  # Until the program asks.
+        if alone and (self._block or not (to_reset or self._has_others())):
+            reset = f"group.reset_async(env_ids=[{alone[0]!r}])"
+            raise self._refusal(alone[0], f"{reset}, whose result the next collect takes")
         if to_reset:
             self._group.reset_async(env_ids=to_reset)
             self._expecting = True
@@ -462,29 +454,16 @@ class Collector(Generic[G, R]):
         part.kind.staging.begin(part.results.index, columns, version)
         try:
             self._group.step_async(responses)
-        except WorkerDied as error:
-            if self._block:  # It needs all envs.
-                raise
-            self._note(error)
-            was_raised = self._was_raised_before(error)
-            self._leave_out(part, error.env_ids)
-            if not (was_raised and self._has_others()):
-                raise
-            return
+        except EnvFault as error:
+            if not self._block:  # Which needs all envs.
+                self._leave_out(part, self._note(error))
+            raise
         part.kind.staging.note_sent()
         del self._unanswered[0]
 
-    def _was_raised_before(self, error: WorkerDied) -> bool:
-        """Note a death, for all envs of the worker: some may reply, or fail, at other times."""
-        before = self._was_raised.issuperset(error.env_ids)
-        for worker in self._group.get_workers():
-            if not set(error.env_ids).isdisjoint(worker["given_up"]):
-                self._was_raised.update(worker["given_up"])
-        return before
-
-    def _leave_out(self, part: Part, given_up: Sequence[str]) -> None:
-        """Go on without envs that were given up."""
-        is_left_out = np.isin(part.batch.env_ids(), given_up)
+    def _leave_out(self, part: Part, env_ids: set[str]) -> None:
+        """Go on without some envs."""
+        is_left_out = np.isin(part.batch.env_ids(), [*env_ids])
         left = part.only(~is_left_out)
         self._unanswered[:1] = [] if left is None else [left]
         self._expecting = bool(self._group.pending)

@@ -96,7 +96,6 @@ class PolicyPlay:
         yield from self._films.check()
         while True:
             self._begin_episodes()
-            self._queue.check_players()
             if not self._pending:
                 if not len(self._queue):
                     return self._found
@@ -136,7 +135,7 @@ class PolicyPlay:
             self._jobs.update((first + job.sub_env, job) for job in jobs)
             try:
                 self._begin(env_id, jobs[0])
-            except WorkerDied as fault:
+            except EnvFault as fault:
                 self._note_fault(fault)
 
     def _rests(self, env_id: str) -> bool:
@@ -237,15 +236,13 @@ class PolicyPlay:
         return any(place in self._jobs for place in self._places[env_id])
 
     def _step(self, batch: BatchedData) -> None:
-        """Send a step to each env whose worker was not given up."""
-        gone = self._queue.players.gone
+        """Send a step to each env but those that were lost meanwhile, which it raises."""
         while len(batch):
             try:
                 self._group.step_async(batch)
-            except WorkerDied as fault:
-                self._note_fault(fault)
-                env_ids = batch.env_ids()
-                batch = batch.take([k for k, id_ in enumerate(env_ids) if id_ not in gone])
+            except EnvFault as fault:
+                struck, env_ids = self._note_fault(fault), batch.env_ids()
+                batch = batch.take([k for k, id_ in enumerate(env_ids) if id_ not in struck])
             else:
                 self._pending.update(batch.env_ids())
                 return
@@ -355,23 +352,19 @@ class PolicyPlay:
         self._queue.players.note(replace(outcome, env_id=env_id))
         self._release(env_id)
 
-    def _note_fault(self, fault: EnvFault) -> None:
-        """Note the episodes that an error ended; envs that are not replaced leave."""
+    def _note_fault(self, fault: EnvFault) -> set[str]:
+        """Note the episodes that an error ended; return the envs."""
         struck, is_named = {fault.env_id}, fault.outcome.blame != "infrastructure"
         if isinstance(fault, WorkerDied | EnvAway):
             # The env at fault may be another one, whose own request a replacement answers.
             struck = {*fault.env_ids} or struck
         if isinstance(fault, WorkerDied):
-            self._queue.fault = fault
             self._queue.players.refresh()
         self._pending -= struck
-        gone = self._queue.players.gone
-        # A ready result of an env that is gone can still be collected.
-        for env_id in (struck | gone) - self._pending:
+        for env_id in struck:
             outcome = replace(fault.outcome, env_id=env_id)
             if is_named and env_id != fault.env_id:
                 outcome = bystanders(outcome.cause, fault.env_id, env_id)
             self._begun.pop(env_id, None)
             self._lose(env_id, outcome)
-        for env_id in gone:
-            self._queue.free.pop(env_id, None)
+        return struck

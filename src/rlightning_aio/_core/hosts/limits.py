@@ -78,11 +78,11 @@ class RestartPolicy:
             losses: in a row, this one included.
             pauses: a restart waits for `restart_pause`.
         """
+        again = "the next request tries again"
         if self.raises:
-            return False, f"{self._field} is 'raise', so it is not {self._done}"
+            return False, f"{self._field} is 'raise'; {again}"
         if losses > self._most:
-            text = f"it is not {self._done} after {losses - 1} restarts in a row (max_restarts)"
-            return False, text
+            return False, f"{losses - 1} restarts in a row (max_restarts) came before it; {again}"
         pause = restart_pause(losses) if pauses else 0.0
         after = f", in {pause:g} s" if pause else ""
         return True, f"restart {losses} of {self._most} in a row{after}"

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import GroupDriver, Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
+    from rlightning_aio._core.group.tables import Tables
 
 
 _log = logging.getLogger("rlightning_aio")
@@ -115,10 +116,16 @@ def stop_hardware(group: Any) -> None:
         core.tables.stop_hardware(core.envs.all.tolist())
 
 
-def is_lost(group: Any, env_id: str) -> bool:
-    """Return True if an env moves something real whose client was lost since its last result."""
-    core = group._core  # noqa: SLF001
-    return core.tables.record_of(core.envs.find_one(env_id)).lost_client
+def lost_hardware(group: Any) -> set[str]:
+    """Return the envs that move something real and are lost, other than by an abort."""
+    tables: Tables = group._core.tables  # noqa: SLF001
+    found: set[str] = set()
+    for record in tables.records:
+        for slot in record.slots if record.is_hardware else ():
+            why = tables.episodes.why_lost(slot)
+            if why is not None and why.kind != "cancelled":
+                found.add(tables.envs.env_ids[slot])
+    return found
 
 
 def request_number(group: Any, env_id: str) -> int:
@@ -235,7 +242,9 @@ class Facade:
                 batch.
             EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
-            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            WorkerDied, EnvHung: an env was lost meanwhile, and its entry has that raised; the next
+                request goes to its replacement.
+            EpisodeLost, EnvAway: an env that moves something real was lost; reset it to go on.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
@@ -261,7 +270,8 @@ class Facade:
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
             TypeError: the options are no dict, or can't be sent to a worker or a client.
-            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            WorkerDied, EnvHung: an env was lost meanwhile, and its entry has that raised; the next
+                request goes to its replacement.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
@@ -370,13 +380,12 @@ class Facade:
 
         Never waits; other tasks may be waiting for results or for `init`.
 
-        Keys: ``entry``; ``env_ids``; ``client`` (its name, of a place that has one); ``given_up``
-        (ids of envs that no request reaches: all of a failed worker, or an awaitable one
-        that is not rebuilt); ``pid`` (of a process on this machine, else None); ``state``
-        (``"new"`` before `init`, ``"starting"``, ``"up"``, ``"down"`` before a replacement,
-        ``"empty"`` of a place without a client, ``"failed"``, ``"closed"``); ``owed`` (ids of envs
-        with a request in flight, the oldest first, which is the order of execution);
-        ``owed_seconds`` (the age of the oldest); ``restarts`` (the number of replacements).
+        Keys: ``entry``; ``env_ids``; ``client`` (its name, of a place that has one); ``pid`` (of a
+        process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
+        ``"up"``, ``"down"`` before a replacement, ``"empty"`` of a place without a client,
+        ``"closed"``); ``owed`` (ids of envs with a request in flight, the oldest first, which is
+        the order of execution); ``owed_seconds`` (the age of the oldest); ``restarts`` (the number
+        of replacements).
 
         Raises:
             RLightningError: another thread is using the group, or it belongs to another loop.

@@ -96,14 +96,11 @@ class Aborts:
         return fault
 
     def _lose(self, slots: NDArray[np.intp]) -> None:
-        """Note that episodes are over; only its user resets what moves something real."""
+        """Note that episodes are over."""
         chosen: list[int] = slots.tolist()
         for slot in chosen:
             record = self._record_of(slot)
             if record.place is not None and not record.was_shown:
                 continue  # It has no episode yet.
-            if record.is_hardware:
-                record.needs_reset = record.place is not None
-            else:
-                self._episodes.lose([slot], _WHY)
+            self._episodes.lose([slot], _WHY)
         self._episodes.note_counted(chosen)

@@ -118,6 +118,7 @@ class Core:
                 self.supervisor.places.drop_of(COLLECTOR)
                 with suppress(EnvFault):
                     yield from self._drain(now, None)
+                self.supervisor.losses.drop_unraised()
                 now = self.tables.clock()
             return self.steps.settled(*(yield from self._resets.reset(now, seed, options, env_ids)))
 

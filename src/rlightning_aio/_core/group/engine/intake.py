@@ -103,8 +103,7 @@ class Intake:
         self._requests.deliver(self._requests.alone(slot))
         if completion.out_of_band:
             self._results.keep(slot, completion.out_of_band)
-        record = self._record_of(slot)
-        record.was_shown, record.needs_reset, record.lost_client = True, False, False
+        self._record_of(slot).was_shown = True
         if self._conditions.unusual:
             self._note_answered(self._requests.alone(slot))
 
@@ -185,13 +184,16 @@ class Intake:
         wanted = completion.entry and self._requests.end(host_id, completion.entry) is not None
         if not wanted:
             if self._episodes.why_lost(slot) is None:  # Else that is known, as after an abort.
-                self._lose(slot, why)
+                self._episodes.lose([slot], why)
                 entry = self._requests.numbering.entry.item(slot)
                 is_stepped = op_of(entry) == Operation.STEP and self._requests.is_current(entry)
                 if not is_stepped:  # Else its step is lost, too.
-                    self._supervisor.losses.count_env(slot, why, completion.message)
+                    losses = self._supervisor.losses
+                    replaced, fault = losses.count_env(slot, why, completion.message)
+                    if not replaced:
+                        losses.raise_later([slot], fault)
             return
-        self._lose(slot, why)
+        self._episodes.lose([slot], why)
         replaced, fault = self._supervisor.losses.count_env(slot, why, completion.message)
         alone = self._requests.alone(slot)
         resets = not self._record_of(slot).is_hardware
@@ -200,11 +202,6 @@ class Intake:
             self._send_again(host_id, alone)
         else:
             self._fail(alone, lambda _: fault)
-
-    def _lose(self, slot: int, why: Loss) -> None:
-        """Note that an episode is lost; only its user resets what moves something real."""
-        if not self._record_of(slot).is_hardware:
-            self._episodes.lose([slot], why)
 
     def _on_taken(self, completion: Taken) -> None:
         """Give a client the request that was held for it.
@@ -278,20 +275,18 @@ class Intake:
         requests.in_flight[loss.host_id] = 0  # It answers none of them.
         unwanted = requests.unwanted & {*loss.owed.tolist()}
         owed = requests.drop_unwanted(loss.owed)
-        if not loss.replaced:
-            episodes.give_up(loss.slots)
-            self._fail(owed, loss.error)
-            return
         self._keep_ready(loss.host_id, loss.slots)
         record = self._supervisor.records[loss.host_id]
-        is_lost = loss.resets if record.place is None else record.was_shown
-        if is_lost:
+        if record.place is None or record.was_shown:  # Else it has no episode yet.
             # The episodes of aborted requests were lost before.
             over = {slot for slot in unwanted if episodes.why_lost(slot) is not None}
             episodes.lose([slot for slot in loss.slots if slot not in over], loss.why)
         # A replacement answers steps and resets only.
-        again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN) & loss.resets
+        again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN)
+        again &= loss.resets and loss.replaced
         self._fail(owed[~again], loss.error)
+        if not (loss.replaced or len(owed)):
+            self._supervisor.losses.raise_later(loss.slots, loss.refusal())
         host_id = self._supervisor.replace(loss.host_id)
         self._send_again(host_id, owed[again])
 

@@ -37,7 +37,7 @@ from rlightning_aio.errors import (
 )
 from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import AS_BEFORE, TRUNCATED
+from rlightning_aio.protocol.slab import AS_BEFORE, NO_SEED, TRUNCATED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -274,6 +274,7 @@ class Steps:
         slots = self._slots_of(batch)
         self._waiting.check_sendable(now, slots, "step")
         self._supervisor.places.check_step(slots)
+        self._supervisor.losses.check_step(slots)
         if not len(slots):
             return slots, None
         out_of_band = write_actions(batch, slots, self._envs, self._layout)
@@ -321,9 +322,10 @@ class Steps:
         if self._episodes.exceptional:
             reports = self._episodes.report_losses(slots)
             # A place remembers its last reset itself, and may have no row yet. An episode that had
-            # ended is not begun again.
-            lost = slots[reports & ~resets & (slots < self._envs.num_local)]
-            self._layout.write_seeds(lost, np.full(len(lost), AS_BEFORE))
+            # ended is not begun again, nor with the seed of a reset that has failed since.
+            local = reports & (slots < self._envs.num_local)
+            seeds = np.where(resets[local], NO_SEED, AS_BEFORE)
+            self._layout.write_seeds(slots[local], seeds)
             resets = resets | reports
         entries = requests.issue(slots, _STEP, owner, now)
         if b"\1" in resets.tobytes():

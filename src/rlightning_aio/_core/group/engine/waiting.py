@@ -134,7 +134,7 @@ class Waiting:
                 "sent"
             )
         # Last: the error of a worker that is gone may still have to be collected.
-        self._supervisor.check_usable(slots)
+        self._supervisor.losses.check(slots)
 
     def _why_busy(self, slot: int) -> str:
         state, owner = self._requests.state.item(slot), self._requests.owner.item(slot)

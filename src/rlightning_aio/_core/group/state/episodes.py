@@ -52,7 +52,6 @@ class LossEvent(Enum):
     ANSWERED = auto()
     """A result has come: of an env that is LOST, that of a reset which the caller asked for."""
     RAISED = auto()
-    GIVEN_UP = auto()
 
 
 _INTACT, _LOST, _REPORTING = LossPhase
@@ -62,7 +61,6 @@ LEGAL: Final[dict[tuple[LossPhase, LossEvent], LossPhase]] = {
     **{(phase, LossEvent.EPISODE_LOST): _LOST for phase in LossPhase},
     **{(phase, LossEvent.ANSWERED): _INTACT for phase in (_LOST, _REPORTING)},
     **{(phase, LossEvent.RAISED): _LOST for phase in (_LOST, _REPORTING)},
-    **{(phase, LossEvent.GIVEN_UP): _INTACT for phase in LossPhase},
 }
 """The phase after each event. A pair that is missing is a bug, and raises."""
 
@@ -269,13 +267,6 @@ class Episodes:
         reports = loss.phase is LossPhase.REPORTING
         self._move(slot, LossEvent.RAISED)
         return loss.why if reports else None
-
-    def give_up(self, slots: Iterable[int]) -> None:
-        """Forget losses of `slots`, whose host will not be replaced."""
-        for slot in slots:
-            if slot in self._losses:
-                self._move(slot, LossEvent.GIVEN_UP)
-            self._restored.pop(slot, None)
 
     def _move(self, slot: int, event: LossEvent, why: Loss | None = None) -> None:
         """Apply an event of one slot by the table; `why` is given where the episode is lost."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from rlightning_aio._core.hosts.base import Killable, SelfStarting
 from rlightning_aio._core.hosts.limits import RestartPolicy, close_seconds, limits_of
-from rlightning_aio.errors import WorkerDied
+from rlightning_aio.errors import EnvAway, WorkerDied
 from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.base import Host
     from rlightning_aio._core.hosts.messages import AttachOrder, Death, EnvStarted
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.errors import EnvFault
     from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.error_text import ErrorText
 
@@ -39,10 +38,9 @@ class Stage(Enum):
     ATTACHING = auto()
     UP = auto()
     DOWN = auto()
-    """Dead, and to be restarted."""
+    """Dead, and to be restarted: at a given time, or for the next request."""
     REBUILDING = auto()
     """A replacement is starting."""
-    GIVEN_UP = auto()
     CLOSING = auto()
     """All its envs are in the next worker."""
     CLOSED = auto()
@@ -57,7 +55,8 @@ class HostLoss:
         host_id, slots: of the host, and of the envs that it had.
         owed: its slots with a request in flight.
         death: of its worker, with the cause as the group knows it.
-        replaced: a replacement is started, or a client awaited; else the host is given up.
+        replaced: a replacement is started, or a client awaited; else the error is raised, and the
+            next request starts one.
         resets: the replacement may reset envs on its own; False of hardware, which only the user
             sets in motion.
         kind: of its errors.
@@ -74,7 +73,7 @@ class HostLoss:
     death: Death
     replaced: bool
     resets: bool
-    kind: type[EnvFault]
+    kind: type[WorkerDied | EnvAway]
     what: str
     last: str
     then: str
@@ -87,20 +86,19 @@ class HostLoss:
         """All that is known of it, in one line."""
         return self._message(self.owed)
 
-    def error(self, owed: NDArray[np.intp]) -> EnvFault:
+    def error(self, owed: NDArray[np.intp]) -> WorkerDied | EnvAway:
         """The error of requests that were in flight, with the last lines of the worker's stderr."""
         return self._error(self._message(owed), owed)
 
-    def refusal(self, asked: NDArray[np.intp]) -> EnvFault:
-        """The error for new requests to `asked`, slots of a worker that is not replaced."""
-        names = ", ".join(self._ids(asked))
-        return self._error(f"{self.message}; nothing was sent to {names}", asked)
+    def refusal(self) -> WorkerDied | EnvAway:
+        """The error for the next request, as no request was in flight that could end in it."""
+        return self._error(f"{self.message}; nothing was sent", np.array(self.slots, np.intp))
 
     def _message(self, owed: NDArray[np.intp]) -> str:
         names = ", ".join(self._ids(owed)) or "none"
         return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.then}"
 
-    def _error(self, message: str, slots: NDArray[np.intp]) -> EnvFault:
+    def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied | EnvAway:
         tail = self.death.stderr_tail
         error = self.kind(message + last_lines(tail), env_id=self.env_id)
         if isinstance(error, WorkerDied):
@@ -135,15 +133,15 @@ class HostRecord:
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
-        gone: by slot, the errors of envs that are not replaced though their host goes on.
+        unraised: by slot, the error that the next request raises, because the env was lost without
+            a request that could have ended in it.
         last_loss: its last death; launches: how often a worker of it was started.
         peer: the host that starts the next worker of the same envs; None unless they are recycled.
         is_next: its worker takes over the envs of the one in the peer, which goes on meanwhile.
         recycled: its workers that were replaced so; resident_mb: the most that one is known to
             have had; waits: resets that waited for the start of the next one.
         killable: the host, if it can be killed; place: the host, if its worker starts itself.
-        was_shown: a place has shown a result; needs_reset: what it moves was lost, and only its
-            user may set it in motion again; lost_client: its client was, not its episode alone.
+        was_shown: a place has shown a result.
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
@@ -173,7 +171,9 @@ class HostRecord:
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
-    gone: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
+    unraised: dict[int, WorkerDied | EnvAway] = field(
+        default_factory=dict[int, "WorkerDied | EnvAway"]
+    )
     last_loss: HostLoss | None = None
     launches: int = 0
     peer: HostRecord | None = field(default=None, repr=False)
@@ -184,8 +184,6 @@ class HostRecord:
     killable: Killable | None = field(init=False)
     place: SelfStarting | None = field(init=False)
     was_shown: bool = False
-    needs_reset: bool = False
-    lost_client: bool = False
     limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
     restart_policy: RestartPolicy = field(init=False)

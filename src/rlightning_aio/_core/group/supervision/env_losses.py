@@ -1,6 +1,7 @@
 """`EnvLosses`: losses of single envs, whose hosts go on: one has raised, or is gone.
 
-They count as restarts in a row together with the deaths that an env is blamed for.
+They count as restarts in a row together with the deaths that an env is blamed for. A loss that
+ended no request in its error is raised by the next one, unless the env begins anew without it.
 Left out: what becomes of the request (see `Intake`), and the making of the env (see `EnvRunner`
 and `AwaitedEnvs`).
 """
@@ -9,11 +10,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from rlightning_aio.errors import EnvAway, EnvFault, EnvHung, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvHung, EpisodeLost, WorkerDied
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from rlightning_aio._core.group.supervision.fault_messages import CrashLog
     from rlightning_aio._core.group.tables import Tables
@@ -21,7 +25,7 @@ if TYPE_CHECKING:
     from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.error_text import ErrorText
 
-_ERRORS: Final[dict[str, type[EnvFault]]] = {"env_hung": EnvHung, "env_away": EnvAway}
+_ERRORS: Final[dict[str, type[WorkerDied | EnvAway]]] = {"env_hung": EnvHung, "env_away": EnvAway}
 """By the kind of an outcome; others are `WorkerDied`."""
 
 
@@ -34,14 +38,14 @@ class EnvLosses:
         on_count: called when a loss was counted.
 
     Attributes:
-        any_gone: some env is not replaced, as its entry has deaths raised.
+        any_unraised: some env has an error that its next request raises.
     """
 
     def __init__(self, tables: Tables, crash_log: CrashLog, on_count: Callable[[], object]) -> None:
         self._tables = tables
         self._crash_log = crash_log
         self._on_count = on_count
-        self.any_gone = False
+        self.any_unraised = False
 
     def ends_env(self, slot: int, error: ErrorText) -> bool:
         """Return True if an env that has raised this is rebuilt before its next request."""
@@ -66,7 +70,7 @@ class EnvLosses:
         self._note_restart(slot, message, error.traceback)
         return True
 
-    def count_env(self, slot: int, why: Loss, message: str) -> tuple[bool, EnvFault]:
+    def count_env(self, slot: int, why: Loss, message: str) -> tuple[bool, WorkerDied | EnvAway]:
         """Count an env that is gone; True if an episode begins at once, and the error otherwise.
 
         Args:
@@ -76,21 +80,64 @@ class EnvLosses:
         """
         record = self._tables.record_of(slot)
         is_borne, then = record.restart_policy.count(self._counted(slot), pauses=False)
-        if is_borne and record.is_hardware:
+        if record.is_hardware:
             then += "; it moves nothing until you reset it"
         if is_borne:
             self._note_restart(slot, f"{message}; {then}")
-        elif not record.restart_policy.raises:
-            then += ", so this request ends here; the next one tries again"
         env_id = self._tables.envs.env_ids[slot]
         fault = _ERRORS.get(why.kind, WorkerDied)(f"{message}; {then}", env_id=env_id)
         fault.outcome = why.outcome(env_id)
-        if isinstance(fault, WorkerDied):
-            fault.env_ids = (env_id,)
-        if record.restart_policy.raises:
-            record.gone[slot] = fault
-            self.any_gone = True
+        fault.env_ids = (env_id,)
         return is_borne, fault
+
+    def raise_later(self, slots: Iterable[int], fault: WorkerDied | EnvAway) -> None:
+        """Keep the error of envs that were lost without a request, for the next one to raise."""
+        for slot in slots:
+            self._tables.record_of(slot).unraised[slot] = fault
+            self.any_unraised = True
+
+    def drop_unraised(self) -> None:
+        """Forget the errors that no request has raised yet."""
+        for record in self._tables.records if self.any_unraised else ():
+            record.unraised = {}
+        self.any_unraised = False
+
+    def check(self, slots: NDArray[np.intp]) -> None:
+        """Raise the error of those of `slots` that were lost without a request, if there are any.
+
+        It is raised once, though it may be that of other envs, too.
+        """
+        if not self.any_unraised:
+            return
+        asked = {*slots.tolist()}
+        for record in self._tables.records:
+            for slot in record.unraised.keys() & asked:
+                fault = record.unraised[slot]
+                struck = {k for k, one in record.unraised.items() if one is fault}
+                record.unraised = {k: record.unraised[k] for k in record.unraised.keys() - struck}
+                fault.env_ids = tuple(self._tables.envs.env_ids[k] for k in sorted(struck & asked))
+                raise fault
+
+    def check_step(self, slots: NDArray[np.intp]) -> None:
+        """Raise `EpisodeLost`, of a place `EnvAway`, for one of `slots` that is lost hardware.
+
+        Only a reset that its user asks for sets it in motion again.
+        """
+        tables = self._tables
+        chosen: list[int] = slots.tolist() if tables.episodes.exceptional else []
+        for slot in chosen:
+            record, why = tables.record_of(slot), tables.episodes.why_lost(slot)
+            if why is None or not record.is_hardware:
+                continue
+            what = (
+                f"{tables.envs.describe(slot)} moves something real, and its episode was lost "
+                f"({why.cause}); reset it to go on; nothing was sent"
+            )
+            kind = EpisodeLost if record.place is None else EnvAway
+            env_id = tables.envs.env_ids[slot]
+            fault = kind(what, env_id=env_id)
+            fault.outcome = why.outcome(env_id)
+            raise fault
 
     def _counted(self, slot: int) -> int:
         """Return the number of losses of an env in a row, this one included."""

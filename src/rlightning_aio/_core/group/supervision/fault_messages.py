@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.hosts.messages import Death
-    from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.error_text import ErrorText
 
 _LINES: Final = 3
@@ -164,7 +163,7 @@ def host_loss(
     )
 
 
-def _kind_of(record: HostRecord) -> type[EnvFault]:
+def _kind_of(record: HostRecord) -> type[WorkerDied | EnvAway]:
     if record.is_hung:
         return EnvHung
     return WorkerDied if record.place is None else EnvAway

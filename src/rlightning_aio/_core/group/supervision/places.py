@@ -116,19 +116,13 @@ class Places:
     # -- steps ------------------------------------------------------------------------
 
     def check_step(self, slots: NDArray[np.intp]) -> None:
-        """Raise an error if any of `slots` is a place that only a reset may be sent to."""
+        """Raise an error if any of `slots` is a place that was never reset."""
         for record in self._records_of(slots):
             slot = record.slots.start
             if not record.was_shown:
                 raise ResetNeeded(
                     f"{self._envs.describe(slot)} was never reset, so it can't be stepped; "
                     "nothing was sent"
-                )
-            if record.needs_reset:
-                raise EnvAway(
-                    f"{self._envs.describe(slot)} moves something real, and its client was lost; "
-                    "reset it to go on; nothing was sent",
-                    env_id=self._envs.env_ids[slot],
                 )
 
     def _records_of(self, slots: NDArray[np.intp]) -> list[HostRecord]:

@@ -130,7 +130,7 @@ class Renewals:
     def inherits(self, record: HostRecord) -> bool:
         """Give all envs of a worker that has died to the next one; False if there is none."""
         peer = record.peer
-        if peer is None or not peer.is_next or peer.stage is Stage.GIVEN_UP:
+        if peer is None or not peer.is_next:
             return False
         self._move(peer, self._tables.slots_of(record).tolist())
         peer.deaths |= record.deaths

@@ -38,7 +38,7 @@ class Shutdown:
         interrupt: KeyboardInterrupt | None = None
         for record in alive:
             record.held, record.restart_at = [], None
-            if record.stage in (Stage.GIVEN_UP, Stage.DOWN):
+            if record.stage is Stage.DOWN:
                 record.stage = Stage.CLOSED
             else:
                 try:

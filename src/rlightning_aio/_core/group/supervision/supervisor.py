@@ -11,11 +11,8 @@ from __future__ import annotations
 
 import logging
 import math
-from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
-
-import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import Patient, Procedure, Wait, earliest
 from rlightning_aio._core.group.state.conditions import DEATH
@@ -56,6 +53,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.host_record import HostLoss
@@ -119,7 +117,6 @@ class Supervisor:
         self.losses = EnvLosses(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
         self._now = 0.0
-        self._any_given_up = False
 
     def add(self, host: Host, config: EnvConfig, peer: HostRecord | None = None) -> None:
         """Add a host before the start; its slots follow those of the previous host.
@@ -310,19 +307,6 @@ class Supervisor:
 
     # -- requests --------------------------------------------------------
 
-    def check_usable(self, slots: NDArray[np.intp]) -> None:
-        """Raise the error of a host, or an env, of `slots` that will not be replaced."""
-        for record in self.records if self.losses.any_gone else ():
-            for slot in record.gone.keys() & {*slots.tolist()}:
-                raise copy(record.gone[slot])
-        if not self._any_given_up:
-            return
-        for record in self.records:
-            if record.stage is Stage.GIVEN_UP and record.last_loss is not None:
-                asked = slots[np.isin(slots, self._tables.slots_of(record))]
-                if len(asked):
-                    raise record.last_loss.refusal(asked)
-
     def packed(self, slot: int, arguments: Any, what: str) -> Any:
         """Return arguments as the host of `slot` sends them; `what` names them in an error."""
         try:
@@ -354,6 +338,10 @@ class Supervisor:
                 self.places.hold(record, entries, arguments)
             else:
                 record.held.append((entries, arguments))
+                if record.stage is Stage.DOWN and record.restart_at is None:
+                    self._plan_restart(record)
+                    self._update_any_deaths()
+                    self._restart(record, self.clock())
         else:
             record.host.submit(entries, arguments)
 
@@ -414,27 +402,25 @@ class Supervisor:
         if record.place is not None:
             return self._lose_client(record, death, owed)
         loss = record.last_loss = self._judged(record, death, owed)
-        record.start_by = None
-        if not loss.replaced:
-            record.stage, record.held = Stage.GIVEN_UP, []
-            self._any_given_up = True
+        record.start_by, record.stage = None, Stage.DOWN
+        if not loss.replaced:  # The next request starts a worker.
+            record.held = []
             self._update_any_deaths()
             return loss
-        record.stage = Stage.DOWN
-        record.restart_at = self.clock() + restart_pause(record.deaths[record.culprit])
+        self._plan_restart(record)
         if was_up:
             return loss
         self.replace(record.host.host_id)
         return None
+
+    def _plan_restart(self, record: HostRecord) -> None:
+        record.restart_at = self.clock() + restart_pause(record.deaths.get(record.culprit, 0))
 
     def _lose_client(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Decide what the loss of a client means: whoever takes the place next replaces it."""
         loss = self._judged(record, death, owed)
         # After too many losses in a row the error is raised, and the next request waits again.
         loss = record.last_loss = replace(loss, replaced=True, resets=loss.resets and loss.replaced)
-        # What has shown nothing has lost nothing.
-        record.lost_client |= record.was_shown and record.is_hardware
-        record.needs_reset |= record.lost_client
         self.places.leave(record)
         self._update_any_deaths()
         return loss
@@ -490,7 +476,6 @@ class Supervisor:
             death = Death(f"could not be replaced: {_refusal(record, error)}", refused=True)
             self._tables.completions.append(Died(record.host.host_id, death))
             return
-        record.gone.clear()
         assert record.order is not None
         record.host.attach(record.order)
         record.give_time(self.clock())
@@ -512,7 +497,7 @@ class Supervisor:
             replaced, then = record.restart_policy.count(deaths)
         if record.place is not None:
             then = then if not replaced else "its place waits for a client"
-        if is_fault and replaced and record.is_hardware:
+        if is_fault and record.is_hardware:
             then += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
         loss = host_loss(self._envs, requests, record, death, slots, owed, then, replaced=replaced)
@@ -536,14 +521,13 @@ class Supervisor:
             any(
                 record.deaths
                 for record in self.records
-                if record.stage is not Stage.GIVEN_UP
-                and not (record.place is not None and record.stage is Stage.DOWN)
+                if record.stage is not Stage.DOWN or record.restart_at is not None
             )
         )
 
     def _note_deaths(self, any_deaths: bool) -> None:
         self.any_deaths = any_deaths
-        self._tables.conditions.note(DEATH, any_deaths or self._any_given_up)
+        self._tables.conditions.note(DEATH, any_deaths)
 
 
 def _refusal(record: HostRecord, why: OSError | str) -> str:

@@ -32,7 +32,6 @@ _STATES: Final = {
     Stage.NEW: "new",
     Stage.UP: "up",
     Stage.DOWN: "down",
-    Stage.GIVEN_UP: "failed",
     Stage.CLOSED: "closed",
 }
 
@@ -60,11 +59,9 @@ class Workers:
         slots = self._tables.slots_of(record)
         busy = requests.owed(slots)
         is_empty = record.place is not None and record.stage is Stage.DOWN
-        lost = slots if record.stage is Stage.GIVEN_UP else sorted(record.gone)
         return {
             "entry": record.config.name,
             "env_ids": [env_ids[slot] for slot in slots],
-            "given_up": [env_ids[slot] for slot in lost],
             "pid": getattr(record.host, "pid", None),
             "client": None if record.place is None else record.place.client or None,
             "state": "empty" if is_empty else _STATES.get(record.stage, "starting"),
