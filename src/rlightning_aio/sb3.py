@@ -20,7 +20,7 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch.contents import reported_info_list, reported_infos
 from rlightning_aio.batch.infos import infos_of_each, listed
-from rlightning_aio.envs.adapted.makers import MADE_BEFORE
+from rlightning_aio.envs.adapted.makers import RESTARTS
 from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper, name_of
 from rlightning_aio.errors import ConfigError
@@ -122,7 +122,7 @@ class _Continued(Mapping[str, Any]):
         }
 
     def __getitem__(self, key: str) -> Any:
-        if key == "override_existing" and MADE_BEFORE in os.environ:
+        if key == "override_existing" and RESTARTS in os.environ:
             return False
         return self._given[key]
 

@@ -70,7 +70,7 @@ class Noting(Scripted):
 
     def __init__(self, log: Path) -> None:
         with log.open("a") as file:
-            file.write("again " if "RLIGHTNING_AIO_MADE_BEFORE" in os.environ else "new ")
+            file.write("again " if "RLIGHTNING_AIO_RESTARTS" in os.environ else "new ")
 
 
 @pytest.mark.parametrize("kind", ["worker", "shared", "inline", "awaitable", "loop"])
@@ -97,7 +97,7 @@ def test_a_callable_can_know_that_it_was_called_before(kind: str, tmp_path: Path
                     await group.step(batch.respond(action=[0, 0]))
 
     asyncio.run(play())
-    assert "RLIGHTNING_AIO_MADE_BEFORE" not in os.environ
+    assert "RLIGHTNING_AIO_RESTARTS" not in os.environ
     assert (tmp_path / "0").read_text() == "new " + "again " * (5 if dies else 3)
     deaths = 2 if kind == "shared" else 0
     assert (tmp_path / "1").read_text() == "new " + "again " * deaths

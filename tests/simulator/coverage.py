@@ -42,7 +42,7 @@ ROWS: Final[dict[str, str]] = {
     "a replacement dies while it starts": "refusals",
     "an environment raises in `close`": "close raised",
     "an action of the wrong shape": "BadAction",
-    "a group is used from another": ELSEWHERE + "tests/faults/test_misuse.py, in real threads",
+    "a group is used from another": ELSEWHERE + "tests/group/test_ownership.py, in real threads",
     "a collect while nothing": "NothingPending",
     "`deadline` passes": "deadline",
     "an agent leaves `group.episode`": "attempts cancelled",

@@ -490,7 +490,7 @@ class SimulatedMachine:
     def make(self, code: int) -> None:
         """Check that the env can know whether it takes the place of another."""
         made = self._world.made
-        told = makers.MADE_BEFORE in os.environ
+        told = makers.RESTARTS in os.environ
         if told and not made[code]:
             self._world.wrongs.append(f"{code} is told that it was made before")
         made[code] += 1

@@ -16,7 +16,7 @@ from rlightning_aio.trees import copied
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-MADE_BEFORE: Final = "RLIGHTNING_AIO_MADE_BEFORE"
+RESTARTS: Final = "RLIGHTNING_AIO_RESTARTS"
 """Environment variable that is there while an env is made again, in place of one that is gone."""
 
 

@@ -15,7 +15,7 @@ from rlightning_aio._core.hosts.running.renewal import Renewal
 from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
-from rlightning_aio.envs.adapted.makers import MADE_BEFORE
+from rlightning_aio.envs.adapted.makers import RESTARTS
 from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions, says_hardware
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
@@ -111,7 +111,7 @@ def not_built(
 def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunner:
     """Build one env of a host.
 
-    While it is made, `MADE_BEFORE` is in the environment if it takes the place of another.
+    While it is made, `RESTARTS` is in the environment if it takes the place of another.
 
     Args:
         order: of the host.
@@ -130,11 +130,11 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
         fn = order.preprocess_fns[index]
         hardware = order.is_hardware
         if is_again:
-            os.environ[MADE_BEFORE] = "1"
+            os.environ[RESTARTS] = "1"
         try:
             env = build_env(config, order.env_class, worker_index, fn, is_hardware=hardware)
         finally:
-            os.environ.pop(MADE_BEFORE, None)
+            os.environ.pop(RESTARTS, None)
         env.trainer_pid = None if inline else order.trainer_pid
         return env
 
