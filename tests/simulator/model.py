@@ -585,6 +585,8 @@ class Model:
             acts += state.copy().faults(Request("reset"))
             if request.resets:  # Sent when the loss was known.
                 acts += state.copy().faults(request)
+        if env.lost and request.resets:  # Its replacement knows nothing of what was before.
+            acts += env.fresh().faults(request)
         if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
             acts += env.fresh().faults(self._begun_again(env, request))
         return [act for act in acts if act[0] in (*RAISING, "rubbish")]
@@ -714,6 +716,8 @@ class Model:
     def _judge_fault(self, env: Env, request: Request, fault: EnvFault) -> None:
         if isinstance(fault, WorkerDied):
             self.died(env, fault)
+            if request.resets:  # An awaitable env begins that episode again.
+                env.state.begun = request.seed, request.options
             if request.kind == "restore":  # Its next result says so.
                 self.counts["died in a restore"] += 1
             else:
