@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from kit.processes import kill
 
+import rlightning_aio as rl
 from rlightning_aio import ENVS, BaseEnv, EnvConfig, EnvRet, PolicyResponse, sync
-from rlightning_aio.errors import BadAction, EnvRaised, EpisodeLost, WorkerDied
+from rlightning_aio._core.group.api.facade import lost_hardware
+from rlightning_aio.attempts import Attempt, EpisodeSpec
+from rlightning_aio.errors import BadAction, EnvRaised, EpisodeLost, RLightningError, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,6 +41,9 @@ class Robot(BaseEnv):
 
     def _moved(self) -> EnvRet:
         self.num_moves += 1
+        if log := self.config.env_kwargs.get("log"):
+            with Path(log).open("a") as file:
+                file.write(f"{self.env_id} {os.getpid()}\n")
         return EnvRet(env_id=self.env_id, observation=np.array([self.num_moves], np.float32))
 
     def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:
@@ -92,3 +102,141 @@ def test_an_action_that_an_env_refuses_is_a_bad_action(robots: dict[str, Any]) -
         fault = caught.value
         assert isinstance(fault, EnvRaised)
         assert (fault.env_id, fault.results.ids()) == ("robot-1", ["robot-0"])
+
+
+def end_idle(group: sync.EnvGroup, env_id: str) -> int:
+    """Kill an env's worker while it owes nothing; return its pid, once the group knows of it."""
+    (worker,) = (one for one in group.get_workers() if env_id in one["env_ids"])
+    kill(worker["pid"])
+    while any(env_id in one["env_ids"] and one["state"] == "up" for one in group.get_workers()):
+        group._core.tables.driver.read()  # No call waits, which would do this.
+        group._core.apply_completions()
+    return worker["pid"]
+
+
+def still(batch: Any) -> Any:
+    return batch.respond(action=np.zeros(len(batch), int))
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "moves"
+
+
+def pids_that_moved(log: Path, env_id: str) -> set[int]:
+    lines = map(str.split, log.read_text().splitlines())
+    return {int(pid) for name, pid in lines if name == env_id}
+
+
+@pytest.fixture(params=["raise", "restart"])
+def entry(request: pytest.FixtureRequest, robots: dict[str, Any], log: Path) -> dict[str, Any]:
+    fields = {"max_episode_steps": 2, "on_worker_death": request.param}
+    return {**robots, **fields, "env_kwargs": {"log": str(log)}}
+
+
+@pytest.mark.parametrize("wait_all", [False, True])
+def test_a_collector_resets_no_robot_that_was_lost_between_its_calls(
+    entry: dict[str, Any], log: Path, wait_all: bool
+) -> None:
+    """It goes on with it once its user has reset it."""
+    with sync.build_env_group(entry) as group:
+        collector = rl.Collector(group, still, num_transitions=4, wait_all=wait_all)
+        collector.collect()
+        while "robot-1" in group.pending:
+            collector.collect()
+        pid = end_idle(group, "robot-1")
+        errors = 0
+        for _ in range(4):
+            try:
+                collector.collect()
+            except RLightningError:
+                errors += 1
+        assert errors
+        assert pids_that_moved(log, "robot-1") == {pid}
+        with contextlib.suppress(WorkerDied):  # If it was not raised before.
+            group.reset_async(env_ids=["robot-1"])
+        if "robot-1" not in group.pending:
+            group.reset_async(env_ids=["robot-1"])
+        while len(pids_that_moved(log, "robot-1")) == 1:  # Its worker starts beside the others.
+            collector.collect()
+
+
+def test_a_new_collector_resets_no_robot_that_was_lost_before(
+    entry: dict[str, Any], log: Path
+) -> None:
+    with sync.build_env_group(entry) as group:
+        group.reset()
+        pid = end_idle(group, "robot-1")
+        collector = rl.Collector(group, still, num_transitions=4)
+        with pytest.raises(RLightningError, match="reset only if you ask for it: restart"):
+            collector.collect()
+        assert pids_that_moved(log, "robot-1") == {pid}
+        collector.restart()
+        collector.collect()
+    assert len(pids_that_moved(log, "robot-1")) == 2
+
+
+def test_an_evaluation_gives_no_episode_to_a_robot_that_was_lost_while_it_was_idle(
+    entry: dict[str, Any], log: Path
+) -> None:
+    ended: list[int] = []
+    with sync.build_env_group(entry) as group:
+
+        def end_its_worker(attempt: Attempt) -> None:
+            if attempt.env_id == "robot-1" and not ended:
+                ended.append(end_idle(group, "robot-1"))
+
+        queue = [EpisodeSpec("any", seed) for seed in range(6)]
+        found = rl.evaluate(group, still, queue, on_episode=end_its_worker)
+    assert len(found.attempts) == 6
+    assert {*ended} == pids_that_moved(log, "robot-1")
+
+
+def test_an_abort_keeps_why_an_env_was_lost(entry: dict[str, Any]) -> None:
+    """So that it stays one that only its user resets."""
+    with sync.build_env_group(entry) as group:
+        group.reset()
+        end_idle(group, "robot-1")
+        for _ in range(2):
+            with contextlib.suppress(WorkerDied):
+                group.reset_async(env_ids=["robot-1"])
+                group.abort(["robot-1"])
+        assert lost_hardware(group) == ["robot-1"]
+        batch, _ = group.reset()
+        assert [one.kind for one in batch.outcome if one is not None] == ["env_died"]
+        assert lost_hardware(group) == []
+
+
+def test_a_reset_of_all_drops_a_death_that_nobody_has_read(robots: dict[str, Any]) -> None:
+    with sync.build_env_group(robots) as group:
+        group.reset()
+        kill(group.get_workers()[1]["pid"])
+        while not group._core.tables.completions:
+            group._core.tables.driver.read()
+        batch, _ = group.reset()
+        assert batch.restarted.tolist() == [False, True]
+
+
+async def test_agents_of_several_dead_workers_each_get_their_error(robots: dict[str, Any]) -> None:
+    """Though their steps are sent as one batch, which raises the first alone."""
+    async with rl.build_env_group(robots) as group:
+
+        async def play(env_id: str) -> None:
+            async with group.episode(env_id) as episode:
+                await both.wait()
+                await both.wait()
+                await episode.step(0)
+
+        both = asyncio.Barrier(3)
+        playing = [asyncio.create_task(play(env_id)) for env_id in group.env_ids]
+        await both.wait()
+        for worker in group.get_workers():
+            kill(worker["pid"])
+        while any(worker["state"] == "up" for worker in group.get_workers()):  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await both.wait()
+        for env_id, error in zip(
+            group.env_ids, await asyncio.gather(*playing, return_exceptions=True), strict=True
+        ):
+            assert isinstance(error, WorkerDied)
+            assert error.env_ids == (env_id,)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from rlightning_aio._core.group.api.facade import is_resettable, lost_hardware
+from rlightning_aio._core.group.api.facade import is_lost_hardware, is_resettable, lost_hardware
 from rlightning_aio.attempts.rules import is_from_env
 from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import RLightningError
@@ -56,15 +56,25 @@ class Players:
         for worker in self._group.get_workers():
             if worker["state"] != "empty":
                 present.update(worker["env_ids"])
-        self.left_alone |= lost_hardware(self._group)  # Also what was lost while it was idle.
+        self.left_alone.update(lost_hardware(self._group))
         self.present = present - self.left_alone
         return self.present
 
     def note(self, outcome: Outcome) -> None:
         """Leave what moves something real alone after a failure of it."""
         if is_from_env(outcome) and not is_resettable(self._group, outcome.env_id):
-            self.left_alone.add(outcome.env_id)
-            self.present.discard(outcome.env_id)
+            self._leave_alone(outcome.env_id)
+
+    def has_left(self, env_id: str) -> bool:
+        """Leave what moves something real alone if it was lost while it was idle."""
+        is_lost = is_lost_hardware(self._group, env_id)
+        if is_lost:
+            self._leave_alone(env_id)
+        return is_lost
+
+    def _leave_alone(self, env_id: str) -> None:
+        self.left_alone.add(env_id)
+        self.present.discard(env_id)
 
     def assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
         """Return an episode with the entry that plays it.

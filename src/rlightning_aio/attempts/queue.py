@@ -198,7 +198,12 @@ class AttemptQueue:
         """The next idle env that doesn't rest and that an attempt waits for; None without one."""
         if not len(self):
             return None
-        return next((id_ for id_ in self.free if not rests(id_) and self._has_job(id_)), None)
+        while True:
+            able = (id_ for id_ in self.free if not rests(id_) and self._has_job(id_))
+            env_id = next(able, None)
+            if env_id is None or not self.players.has_left(env_id):
+                return env_id
+            del self.free[env_id]
 
     def _has_job(self, env_id: str) -> bool:
         for queue in self._pinned.get(env_id, {}).values():

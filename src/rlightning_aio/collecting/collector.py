@@ -19,6 +19,7 @@ from rlightning_aio._core.group.api.facade import (
     default_min_results,
     ensure_auto_reset,
     is_resettable,
+    lost_hardware,
 )
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch.contents import readable
@@ -165,6 +166,8 @@ class Collector(Generic[G, R]):
         self._state = _State.WHOLE
         self._metas: dict[str, EnvMeta] = {}
         self._begin_anew()
+        # Its user has asked for a reset of all envs, also of those that were lost.
+        self._is_restarted = False
 
     def _begin_anew(self) -> None:
         """Forget all results and transitions."""
@@ -208,6 +211,7 @@ class Collector(Generic[G, R]):
         if self._state is _State.RUNNING and isinstance(self._group, AsyncEnvGroup):
             raise RuntimeError("restart: a collect is in progress; cancel it first, or await it")
         self._begin_anew()
+        self._is_restarted = True
         self._seed = seed
         self._received = batch
         self._state = _State.WHOLE
@@ -304,7 +308,8 @@ class Collector(Generic[G, R]):
     def _start(self) -> Procedure[None]:
         """Reset all envs, and wait for all of them, unless there is a batch to go on from."""
         if self._received is None:
-            for env_id in self._failed:
+            lost = () if self._is_restarted else lost_hardware(self._group)
+            for env_id in self._failed.union(lost):
                 if not is_resettable(self._group, env_id):
                     raise self._refusal(env_id, "restart() has the next collect reset all envs")
             try:  # It drops what a start that was cancelled, or a call before `restart`, has left.
@@ -377,17 +382,20 @@ class Collector(Generic[G, R]):
         to_reset = [env_id for env_id in left if is_resettable(self._group, env_id)]
         alone = [env_id for env_id in left if env_id not in to_reset]  # Until the program asks.
         if alone and (self._block or not (to_reset or self._has_others())):
-            reset = f"group.reset_async(env_ids=[{alone[0]!r}])"
-            raise self._refusal(alone[0], f"{reset}, whose result the next collect takes")
+            raise self._refusal(alone[0], self._asks_for(alone[0]))
         if to_reset:
             self._group.reset_async(env_ids=to_reset)
             self._expecting = True
 
     @staticmethod
+    def _asks_for(env_id: str) -> str:
+        return f"group.reset_async(env_ids=[{env_id!r}]), whose result the next collect takes"
+
+    @staticmethod
     def _refusal(env_id: str, remedy: str) -> RLightningError:
         return RLightningError(
-            f"env {env_id!r} has raised an error, and may move something real, so it is reset only "
-            f"if you ask for it: {remedy}"
+            f"env {env_id!r} was lost or has raised an error, and may move something real, so it "
+            f"is reset only if you ask for it: {remedy}"
         )
 
     def _has_others(self) -> bool:
@@ -423,7 +431,14 @@ class Collector(Generic[G, R]):
         parts = [kind.held for kind in self._kinds.values() if kind.held is not None]
         over = [env_id for part in parts for env_id in part.waiting_for_reset()]
         if over:
-            self._group.reset_async(env_ids=over)
+            for env_id in set(over).intersection(lost_hardware(self._group)):
+                self._failed.add(env_id)
+                raise self._refusal(env_id, self._asks_for(env_id))
+            try:
+                self._group.reset_async(env_ids=over)
+            except EnvFault as fault:
+                self._note(fault)
+                raise
             return
         most = max(int(part.steps().max()) for part in parts)
         behind = [part.behind(most) for part in parts]
@@ -455,8 +470,7 @@ class Collector(Generic[G, R]):
         try:
             self._group.step_async(responses)
         except EnvFault as error:
-            if not self._block:  # Which needs all envs.
-                self._leave_out(part, self._note(error))
+            self._leave_out(part, self._note(error))
             raise
         part.kind.staging.note_sent()
         del self._unanswered[0]

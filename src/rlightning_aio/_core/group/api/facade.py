@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import GroupDriver, Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
-    from rlightning_aio._core.group.tables import Tables
 
 
 _log = logging.getLogger("rlightning_aio")
@@ -116,16 +115,26 @@ def stop_hardware(group: Any) -> None:
         core.tables.stop_hardware(core.envs.all.tolist())
 
 
-def lost_hardware(group: Any) -> set[str]:
+def is_lost_hardware(group: Any, env_id: str) -> bool:
+    """Return True if an env moves something real and is lost, other than by an abort."""
+    core: Core = group._core  # noqa: SLF001
+    slot = core.envs.find_one(env_id)
+    why = core.episodes.why_lost(slot)
+    is_lost = why is not None and why.kind != "cancelled"
+    return is_lost and core.tables.record_of(slot).is_hardware
+
+
+def lost_hardware(group: Any) -> list[str]:
     """Return the envs that move something real and are lost, other than by an abort."""
-    tables: Tables = group._core.tables  # noqa: SLF001
-    found: set[str] = set()
-    for record in tables.records:
-        for slot in record.slots if record.is_hardware else ():
-            why = tables.episodes.why_lost(slot)
-            if why is not None and why.kind != "cancelled":
-                found.add(tables.envs.env_ids[slot])
-    return found
+    core: Core = group._core  # noqa: SLF001
+    moving = [record.slots for record in core.tables.records if record.is_hardware]
+    each = [core.envs.env_ids[slot] for slots in moving for slot in slots]
+    return [env_id for env_id in each if is_lost_hardware(group, env_id)]
+
+
+def drop_errors(group: Any) -> None:
+    """Drop the errors of losses that no request has raised, as a reset of all envs does."""
+    group._core.drop_unraised()  # noqa: SLF001
 
 
 def request_number(group: Any, env_id: str) -> int:

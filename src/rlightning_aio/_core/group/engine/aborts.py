@@ -46,6 +46,8 @@ class Aborts:
         self._results = results
         self._waiting = waiting
         self._sums = tables.sums
+        # The last request of each slot that was aborted while it was in flight.
+        self._aborted: dict[int, int] = {}
 
     def drop(self, slots: NDArray[np.intp]) -> None:
         """Drop those results of `slots` that wait for the collector; errors that do so stay."""
@@ -68,6 +70,7 @@ class Aborts:
         new = slots[np.array([self._is_wanted(slot) for slot in slots.tolist()], np.bool_)]
         wanted = new[requests.owner[new] != NOBODY]
         requests.abort(wanted, [self._fault(slot) for slot in wanted.tolist()])
+        self._aborted.update(zip(new.tolist(), requests.numbering.entry[new].tolist(), strict=True))
         self._sums.note_failures(new, _WHY.kind)
         self._lose(new)
         self._supervisor.places.drop_unwanted(new)
@@ -80,9 +83,8 @@ class Aborts:
         return now
 
     def _is_wanted(self, slot: int) -> bool:
-        """Return False if nobody wants the reply of `slot`, because it was aborted."""
-        is_aborted = self._episodes.why_lost(slot) is _WHY
-        return not (is_aborted and slot in self._requests.unwanted)
+        """Return False if the request of `slot` was aborted before."""
+        return self._aborted.get(slot) != self._requests.numbering.entry.item(slot)
 
     def _fault(self, slot: int) -> EpisodeLost:
         doing = Operation(self._requests.numbering.op(slot)).name.lower()
@@ -96,11 +98,12 @@ class Aborts:
         return fault
 
     def _lose(self, slots: NDArray[np.intp]) -> None:
-        """Note that episodes are over."""
+        """Note that episodes are over; how one was lost before says more."""
         chosen: list[int] = slots.tolist()
         for slot in chosen:
             record = self._record_of(slot)
             if record.place is not None and not record.was_shown:
                 continue  # It has no episode yet.
-            self._episodes.lose([slot], _WHY)
+            known = self._episodes.why_lost(slot)
+            self._episodes.lose([slot], _WHY if known is None else known)
         self._episodes.note_counted(chosen)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from asyncio import CancelledError
+from copy import copy
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
@@ -18,7 +19,7 @@ from rlightning_aio._core.group.drivers.wait import TURN, Wait
 from rlightning_aio._core.group.engine.waiting import REPLIES
 from rlightning_aio.batch.contents import are_over, lost_rows, values_or_faults
 from rlightning_aio.batch.data import BatchedData
-from rlightning_aio.errors import EnvFault
+from rlightning_aio.errors import EnvAway, EnvFault, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -232,10 +233,12 @@ class AgentSteps:
         try:
             slots, send = self._prepared(asked, now)
         except Exception as error:  # noqa: BLE001  # Nothing was sent.
-            if len(asked) == 1:
-                asked[0].reply.set_exception(error)
-            else:
-                for step in asked:
+            # A loss is raised once, for all envs that it names.
+            named = error.env_ids if isinstance(error, WorkerDied | EnvAway) else ()
+            for step in asked:
+                if len(asked) == 1 or step.env_id in named:
+                    step.reply.set_exception(copy(error))
+                else:
                     self._send([step], ticket, now)
             return
         for slot, step in zip(slots.tolist(), asked, strict=True):

@@ -118,9 +118,15 @@ class Core:
                 self.supervisor.places.drop_of(COLLECTOR)
                 with suppress(EnvFault):
                     yield from self._drain(now, None)
-                self.supervisor.losses.drop_unraised()
+                self.drop_unraised()
                 now = self.tables.clock()
             return self.steps.settled(*(yield from self._resets.reset(now, seed, options, env_ids)))
+
+    def drop_unraised(self) -> None:
+        """Drop the errors of losses that no request has raised, as a reset of all envs does."""
+        self.tables.driver.read()
+        self.apply_completions()
+        self.supervisor.losses.drop_unraised()
 
     def reset_async(
         self,

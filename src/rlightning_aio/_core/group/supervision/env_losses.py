@@ -115,6 +115,7 @@ class EnvLosses:
                 fault = record.unraised[slot]
                 struck = {k for k, one in record.unraised.items() if one is fault}
                 record.unraised = {k: record.unraised[k] for k in record.unraised.keys() - struck}
+                self.any_unraised = any(one.unraised for one in self._tables.records)
                 fault.env_ids = tuple(self._tables.envs.env_ids[k] for k in sorted(struck & asked))
                 raise fault
 
