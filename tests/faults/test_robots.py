@@ -240,3 +240,12 @@ async def test_agents_of_several_dead_workers_each_get_their_error(robots: dict[
         ):
             assert isinstance(error, WorkerDied)
             assert error.env_ids == (env_id,)
+
+
+def test_a_reset_of_all_with_a_wrong_seed_drops_nothing(robots: dict[str, Any]) -> None:
+    with sync.build_env_group(robots) as group:
+        batch, _ = group.reset()
+        group.step_async(still(batch))
+        with pytest.raises(ValueError, match="3 seeds for 2 envs"):
+            group.reset(seed=[1, 2, 3])
+        assert len(group.collect_async(wait_all=True)[0]) == 2

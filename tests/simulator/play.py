@@ -1115,7 +1115,15 @@ class Play(Session):
             return
         limbo = any(env.limbo and env.host.mortal for env in envs)
         with self.expected((wrong, WorkerDied, *[EnvBusy] * limbo), kind):
-            self.group.step_async(BatchedData(ids, values))
+            self.step_wrongly(BatchedData(ids, values))
+
+    def step_wrongly(self, batch: BatchedData) -> None:
+        try:
+            self.group.step_async(batch)
+        except WorkerDied as fault:  # Of an env that was lost before.
+            for env_id in fault.env_ids:
+                self.model.died(self.model.envs[env_id], fault)
+            raise
 
     async def op_look(self, rng: Random) -> None:
         """What is asked of a group without waiting."""

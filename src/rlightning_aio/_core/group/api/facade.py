@@ -134,7 +134,7 @@ def lost_hardware(group: Any) -> list[str]:
 
 def drop_errors(group: Any) -> None:
     """Drop the errors of losses that no request has raised, as a reset of all envs does."""
-    group._core.drop_unraised()  # noqa: SLF001
+    group._driver.call(group._core.drop_unraised)  # noqa: SLF001
 
 
 def request_number(group: Any, env_id: str) -> int:

@@ -115,6 +115,7 @@ class Core:
             # What another call waits for is not dropped; the reset is refused then.
             others = self.waiting.collecting or np.count_nonzero(self.requests.owner > COLLECTOR)
             if env_ids is None and not others:
+                self._resets.check(seed, options)  # Else what is in flight would be lost.
                 self.supervisor.places.drop_of(COLLECTOR)
                 with suppress(EnvFault):
                     yield from self._drain(now, None)

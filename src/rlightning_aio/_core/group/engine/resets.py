@@ -65,6 +65,11 @@ class Resets:
         ticket, _ = yield from self._waiting.ask(now, slots, send)
         return ticket, slots
 
+    def check(self, seed: Seeds, options: dict[str, Any] | None) -> None:
+        """Raise an error if the arguments of a reset of all envs are wrong."""
+        seeds = seeds_for(self._envs, seed, self._envs.all)
+        self._packed_resets(self._envs.all, seeds, options)
+
     def prepared(
         self,
         now: float,
