@@ -225,8 +225,9 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             self._check_whole()
         else:
             self._drop_outstanding()
-            drop_errors(self.group)
         self._is_whole = False
+        if mask is None:
+            drop_errors(self.group)
         places = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         group, env_ids = self.group, self.group.env_ids
         # As many at once as have the same options.
