@@ -58,7 +58,6 @@ _OTHERS: Final = ELSEWHERE + "tests/group/test_aborting.py; programs abort no ca
 OTHERS: Final[dict[str, str]] = {
     "BUSY TICKET ABORTED": _OTHERS,
     "GroupClosed": ELSEWHERE + "tests/group/test_life.py; programs use no closed group",
-    "INTACT GIVEN_UP": ELSEWHERE + "nowhere: what is intact is not in the table of losses",
 }
 """The same for transitions and errors that no program reaches."""
 

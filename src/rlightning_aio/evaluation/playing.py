@@ -358,8 +358,6 @@ class PolicyPlay:
         if isinstance(fault, WorkerDied | EnvAway):
             # The env at fault may be another one, whose own request a replacement answers.
             struck = {*fault.env_ids} or struck
-        if isinstance(fault, WorkerDied):
-            self._queue.players.refresh()
         self._pending -= struck
         for env_id in struck:
             outcome = replace(fault.outcome, env_id=env_id)

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded as GymnasiumResetNeeded
 from gymnasium.vector import AutoresetMode, utils
 
-from rlightning_aio._core.group.api.facade import drop_errors
+from rlightning_aio._core.group.api.facade import drop_unraised
 from rlightning_aio._core.group.api.sync import due_for_reset
 from rlightning_aio._core.group.state.episodes import as_int
 from rlightning_aio.batch import BatchedData
@@ -227,7 +227,7 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             self._drop_outstanding()
         self._is_whole = False
         if mask is None:
-            drop_errors(self.group)
+            drop_unraised(self.group)
         places = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         group, env_ids = self.group, self.group.env_ids
         # As many at once as have the same options.

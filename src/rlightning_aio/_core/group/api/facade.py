@@ -132,7 +132,7 @@ def lost_hardware(group: Any) -> list[str]:
     return [env_id for env_id in each if is_lost_hardware(group, env_id)]
 
 
-def drop_errors(group: Any) -> None:
+def drop_unraised(group: Any) -> None:
     """Drop the errors of losses that no request has raised, as a reset of all envs does."""
     group._driver.call(group._core.drop_unraised)  # noqa: SLF001
 

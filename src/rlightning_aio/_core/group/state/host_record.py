@@ -133,8 +133,6 @@ class HostRecord:
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
-        unraised: by slot, the error that the next request raises, because the env was lost without
-            a request that could have ended in it.
         last_loss: its last death; launches: how often a worker of it was started.
         peer: the host that starts the next worker of the same envs; None unless they are recycled.
         is_next: its worker takes over the envs of the one in the peer, which goes on meanwhile.
@@ -171,9 +169,6 @@ class HostRecord:
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
-    unraised: dict[int, WorkerDied | EnvAway] = field(
-        default_factory=dict[int, "WorkerDied | EnvAway"]
-    )
     last_loss: HostLoss | None = None
     launches: int = 0
     peer: HostRecord | None = field(default=None, repr=False)

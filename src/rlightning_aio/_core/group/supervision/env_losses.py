@@ -36,16 +36,14 @@ class EnvLosses:
         tables: of the group.
         crash_log: of the group.
         on_count: called when a loss was counted.
-
-    Attributes:
-        any_unraised: some env has an error that its next request raises.
     """
 
     def __init__(self, tables: Tables, crash_log: CrashLog, on_count: Callable[[], object]) -> None:
         self._tables = tables
         self._crash_log = crash_log
         self._on_count = on_count
-        self.any_unraised = False
+        # By slot, the error of an env that was lost without a request that could end in it.
+        self._unraised: dict[int, WorkerDied | EnvAway] = {}
 
     def ends_env(self, slot: int, error: ErrorText) -> bool:
         """Return True if an env that has raised this is rebuilt before its next request."""
@@ -92,32 +90,25 @@ class EnvLosses:
 
     def raise_later(self, slots: Iterable[int], fault: WorkerDied | EnvAway) -> None:
         """Keep the error of envs that were lost without a request, for the next one to raise."""
-        for slot in slots:
-            self._tables.record_of(slot).unraised[slot] = fault
-            self.any_unraised = True
+        self._unraised.update(dict.fromkeys(slots, fault))
 
     def drop_unraised(self) -> None:
         """Forget the errors that no request has raised yet."""
-        for record in self._tables.records if self.any_unraised else ():
-            record.unraised = {}
-        self.any_unraised = False
+        self._unraised.clear()
 
     def check(self, slots: NDArray[np.intp]) -> None:
         """Raise the error of those of `slots` that were lost without a request, if there are any.
 
         It is raised once, though it may be that of other envs, too.
         """
-        if not self.any_unraised:
+        asked = self._unraised.keys() & {*slots.tolist()} if self._unraised else ()
+        if not asked:
             return
-        asked = {*slots.tolist()}
-        for record in self._tables.records:
-            for slot in record.unraised.keys() & asked:
-                fault = record.unraised[slot]
-                struck = {k for k, one in record.unraised.items() if one is fault}
-                record.unraised = {k: record.unraised[k] for k in record.unraised.keys() - struck}
-                self.any_unraised = any(one.unraised for one in self._tables.records)
-                fault.env_ids = tuple(self._tables.envs.env_ids[k] for k in sorted(struck & asked))
-                raise fault
+        fault, env_ids = self._unraised[min(asked)], self._tables.envs.env_ids
+        named = sorted(slot for slot in asked if self._unraised[slot] is fault)
+        fault.env_ids = tuple(env_ids[slot] for slot in named)
+        self._unraised = {slot: one for slot, one in self._unraised.items() if one is not fault}
+        raise fault
 
     def check_step(self, slots: NDArray[np.intp]) -> None:
         """Raise `EpisodeLost`, of a place `EnvAway`, for one of `slots` that is lost hardware.
