@@ -112,6 +112,7 @@ class HangDetector:
         record.kill(dump=dump)
         if record.killable is not None:
             record.dying = self.any_ending = True
+            record.halves_left = 2
 
     def _in_flight(self, record: HostRecord) -> int:
         return self._requests.in_flight[record.host.host_id]
@@ -157,16 +158,20 @@ class HangDetector:
         return self._in_flight(record), entries, record.killable.traffic, *current
 
     def _check_dying(self) -> None:
-        """Destroy hosts that a kill has not ended, together with their fork server."""
+        """Destroy hosts that a kill has not ended, together with their fork server.
+
+        They have twice half the time. If the trainer is stopped in one half, the order to kill, or
+        the report of the exit, may have waited for it to make room, and arrives in the other.
+        """
         for record in self._records:
-            if not record.dying:
+            if not record.dying or self._now < (record.die_by or 0.0) or self.read_news(record):
                 continue
-            if record.die_by is None:
-                # The trainer may have been stopped until it was killed.
-                record.die_by = self._tables.clock() + times.OBEY
-            elif self._now >= record.die_by and not self.read_news(record):
+            if record.halves_left:
+                record.die_by = self._tables.clock() + times.OBEY / 2
+                record.halves_left -= 1
+            else:
                 assert record.killable is not None
-                record.die_by = None
+                record.die_by, record.halves_left = None, 2
                 record.killable.destroy()
 
     def read_news(self, record: HostRecord) -> bool:
