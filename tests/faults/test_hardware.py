@@ -31,6 +31,7 @@ from rlightning_aio import (
     build_env_group,
     sync,
 )
+from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.attempts import EpisodeSpec, play
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.errors import (
@@ -181,7 +182,8 @@ def driven(entry: dict[str, Any]) -> Iterator[Any]:
         with sync.build_env_group(entry) as group:
             yield group
         return
-    env, is_over = Arm(EnvConfig(**entry | {"placement": "inline"})), Event()
+    config, is_over = EnvConfig(**entry | {"placement": "inline"}), Event()
+    env = build_env(config, is_hardware=True)  # As the command `client` does.
     env.on_disconnect, env.is_finish = is_over.set, is_over.is_set
     with sync.build_env_group(name="arm", backend="env_server") as group:
         client = ClientThread(group["arm-0"].address, "c", env)
@@ -505,13 +507,13 @@ class InHalves(Arm):
 
 
 @pytest.mark.parametrize("kind", [Arm, InHalves])
-@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("placement", [*PLACEMENTS, "client"])
 def test_a_program_that_sends_no_action_in_time_stops_the_arm(
     arm: Any, log: Path, placement: str, kind: type[Arm]
 ) -> None:
     """With action_timeout, for robots that go on moving without one."""
     ENVS.register("test arm", hardware=True)(kind)
-    with sync.build_env_group(arm(placement, action_timeout=0.2)) as group:
+    with driven(arm(placement, action_timeout=0.2)) as group:
         batch, _ = group.reset()
         wait_for(log, "stop")
         with pytest.raises(EnvRaised, match=r"no action came for 0\.2 s \(action_timeout\)"):
