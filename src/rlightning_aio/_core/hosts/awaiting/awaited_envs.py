@@ -403,7 +403,8 @@ class AwaitedEnvs:
             return
         log.warning(
             "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
-            "meanwhile: await what it waits for, or run it by asyncio.to_thread()%s",
+            "meanwhile: await what it waits for, or run it by asyncio.to_thread() (a large "
+            "collection of Python's garbage collector is counted, too)%s",
             self._records[slot_of(entry) - self._first_slot].name,
             self._order.config.name,
             1e3 * seconds,
