@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,36 +73,14 @@ class CountingEnv(BaseEnv):
         self.rollouts += 1
 
 
-@ENVS.register("interrupting")
-class InterruptingEnv(CountingEnv):
-    """Can interrupt the trainer in its next request, which ends when a file is there."""
-
-    interrupts: tuple[int, str] | None = None
-
-    def interrupt_next(self, pid: int, go_on: str) -> None:
-        self.interrupts = pid, go_on
-
-    def _interrupt(self) -> None:
-        if self.interrupts is None:
-            return
-        (pid, go_on), self.interrupts = self.interrupts, None
-        os.kill(pid, signal.SIGINT)
-        while not Path(go_on).exists():
-            time.sleep(0.001)
+@ENVS.register("failing")
+class FailingEnv(CountingEnv):
+    """Raises in a reset if it is asked to."""
 
     def reset(self, fails: int | None = None) -> EnvRet:
-        self._interrupt()
         if fails == self.index:
             raise RuntimeError("as asked")
         return super().reset()
-
-    def step(self, policy_resp: Any) -> EnvRet:
-        self._interrupt()
-        return super().step(policy_resp)
-
-    def apply_evaluate_cfg(self) -> None:
-        self._interrupt()
-        super().apply_evaluate_cfg()
 
 
 @ENVS.register("arm")

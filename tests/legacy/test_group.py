@@ -232,16 +232,21 @@ def test_an_unknown_id_is_named_before_anything_is_sent(group: EnvGroup) -> None
         assert flags == [False] * 3
 
 
-def test_a_replaced_env_counts_its_steps_anew() -> None:
-    """The limit is that of the new episode."""
+def test_a_replaced_env_counts_its_steps_anew_and_keeps_its_id() -> None:
+    """Its first result is marked; the limit is that of the new episode."""
     with contextlib.closing(build_env_group(entry("counting"))) as group, group.auto_reset(3):
+        (env_id,) = ids = group.env_ids
         group.reset()
-        group.step(responses(group.env_ids))
-        batch, flags = group.step(one_wants(group.env_ids, "an end"))
-        assert (batch.values()[0].observation[1], flags) == (0.0, [False])
+        group.step(responses(ids))
+        batch, flags = group.step(one_wants(ids, "an end"))
+        ret = batch[env_id]
+        assert (ret.env_id, ret.last_truncated) == (env_id, True)
+        assert (ret.observation[1], flags) == (0.0, [False])
+        assert "SIGKILL" in str(ret.info["worker_restarted"])
         for step in range(1, 4):
-            batch, flags = group.step(responses(group.env_ids))
-            assert (batch.values()[0].observation[1], flags) == (float(step), [step == 3])
+            batch, flags = group.step(responses(ids))
+            assert (batch[env_id].observation[1], flags) == (float(step), [step == 3])
+        assert group.env_list[0].get_env_id() == env_id
 
 
 def test_statistics_are_means_over_all_envs(group: EnvGroup) -> None:
@@ -345,21 +350,6 @@ def test_a_wrong_argument_fails_when_the_group_is_built() -> None:
         EnvGroup([])
     with pytest.raises(ValueError, match="2 preprocess functions for 1"):
         EnvGroup([entry("counting")], [None, None])
-
-
-def test_an_env_keeps_its_id_after_a_restart() -> None:
-    """Its result is marked, and later results have the same id."""
-    group = build_env_group(entry("counting"))
-    (env_id,) = ids = group.env_ids
-    group.reset()
-    batch, _ = group.step(responses(ids, wants="an end"))
-    ret = batch[env_id]
-    assert (ret.last_truncated, ret.env_id, ret.observation.tolist()) == (True, env_id, [0.0, 0.0])
-    assert "SIGKILL" in str(ret.info["worker_restarted"])
-    batch, _ = group.step(responses(ids))
-    assert batch[env_id].observation.tolist() == [0.0, 1.0]
-    assert group.env_list[0].get_env_id() == env_id
-    group.close()
 
 
 def test_an_arm_stops_before_it_is_closed_and_when_its_step_raises(tmp_path: Path) -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from faults.striking import struck
 
 from rlightning_aio.errors import BadAction, EnvRaised
 from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Callable, Iterator
 
     from rlightning.env.env_group import EnvGroup
 
@@ -25,12 +24,16 @@ from rlightning.types import BatchedData  # noqa: E402
 from rlightning.utils.builders import build_env_group  # noqa: E402
 
 LIMIT = 3
+STRIDE = 61
+"""Every so many lines, Ctrl-C is pressed."""
+NUM_LINES = 9000
+"""More lines than any of the calls below executes."""
 
 
 @pytest.fixture
 def group() -> Iterator[EnvGroup]:
     """Two envs in two workers."""
-    group = build_env_group(entry("interrupting", num_workers=2, max_episode_steps=LIMIT))
+    group = build_env_group(entry("failing", num_workers=2, max_episode_steps=LIMIT))
     yield group
     group.close()
 
@@ -40,39 +43,30 @@ def counts(batch: Any) -> dict[int, float]:
     return {int(ret.observation[0]): ret.observation[1] for ret in batch.values()}
 
 
-def interrupt(group: EnvGroup, folder: Path, run: Any) -> None:
-    """Have `run` interrupted by env 1 while that executes a request."""
-    go_on = folder / "go-on"
-    group.env_list[1].interrupt_next(os.getpid(), str(go_on))
-    with pytest.raises(KeyboardInterrupt):
-        run()
-    go_on.touch()
+USES: dict[str, Callable[[EnvGroup], Any]] = {
+    "step": lambda group: group.step(responses(group.env_ids)),
+    "reset": lambda group: group.reset(),
+    "call": lambda group: group.apply_evaluate_cfg(),
+}
 
 
-def test_a_reset_drops_what_an_interrupted_call_has_left_in_flight(
-    group: EnvGroup, tmp_path: Path
-) -> None:
-    ids = group.env_ids
-    interrupt(group, tmp_path, group.reset)
-    assert counts(group.reset()[0]) == {0: 0, 1: 0}
-    interrupt(group, tmp_path, lambda: group.step(responses(ids)))
-    assert counts(group.reset()[0]) == {0: 0, 1: 0}
-    assert not len(group.collect_async()[0])
-    assert counts(group.step(responses(ids))[0]) == {0: 1, 1: 1}
-
-
-def test_an_interrupted_step_can_be_collected(group: EnvGroup, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("pressed_again")
+@pytest.mark.parametrize("use", USES)
+def test_a_reset_goes_on_wherever_a_call_was_interrupted(group: EnvGroup, use: str) -> None:
+    """What was left in flight can be collected; a reset drops it."""
     group.reset()
-    interrupt(group, tmp_path, lambda: group.step(responses(group.env_ids)))
-    assert counts(group.collect_async(wait_all=True)[0]) == {0: 1, 1: 1}
-
-
-def test_an_interrupted_call_drops_its_values(group: EnvGroup, tmp_path: Path) -> None:
-    """It ends in the envs."""
-    group.reset()
-    interrupt(group, tmp_path, group.apply_evaluate_cfg)
-    assert counts(group.reset()[0]) == {0: 0, 1: 0}
-    assert [env.evaluates for env in group.env_list] == [True, True]
+    for number, line in enumerate(range(1, NUM_LINES, STRIDE)):
+        reached, _, _ = struck(line, lambda: USES[use](group))
+        if number % 2:
+            assert len(group.collect_async(wait_all=True)[0]) in (0, 2)
+        assert counts(group.reset()[0]) == {0: 0, 1: 0}
+        assert not len(group.collect_async()[0])
+        assert counts(group.step(responses(group.env_ids))[0]) == {0: 1, 1: 1}
+        if not reached:
+            break
+    else:
+        pytest.fail(f"a call executes more than {NUM_LINES} lines")
+    assert [env.evaluates for env in group.env_list] == [use == "call"] * 2
 
 
 def test_a_refused_step_resets_nothing(group: EnvGroup) -> None:

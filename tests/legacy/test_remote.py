@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import threading
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from patience import HANG
 
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.plugins.legacy.names import is_rlightning_installed, make_importable
@@ -31,13 +28,16 @@ STEPS = 3
 
 
 class Robot(BaseEnv):
-    """It is finished after some steps."""
+    """It is finished after some steps; its resets may wait for those of others."""
 
     resets = steps = 0
     fails_in = 0
+    together: threading.Barrier | None = None
 
     def reset(self) -> EnvRet:
         self.resets += 1
+        if self.together is not None:
+            self.together.wait(HANG)
         if self.resets == self.fails_in:
             raise RuntimeError("stuck")
         self.steps = 0
@@ -60,10 +60,13 @@ class Robot(BaseEnv):
         return self.steps >= STEPS
 
 
-def serving(address: tuple[str, int], times: int) -> tuple[threading.Thread, Robot]:
+def serving(
+    address: tuple[str, int], times: int, together: threading.Barrier | None = None
+) -> tuple[threading.Thread, Robot]:
     """Start a thread in which a robot connects and serves `times` times."""
     config = EnvConfig(name="arm", backend="piper", task="any")
     robot = Robot(config, preprocess_fn=lambda response: response.action * 2)
+    robot.together = together
 
     def serve() -> None:
         client = RemoteEnvClient(robot, *address)
@@ -136,48 +139,29 @@ def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:
         thread.join()
 
 
-def test_a_loop_over_robots_that_come_and_go(tmp_path: Path) -> None:
-    """Each of four serves twice, in a process of its own; a fifth one that comes late plays."""
+def test_a_loop_over_robots_that_come_and_go() -> None:
+    """Each of four serves twice, all at the same time; a fifth one that comes late plays."""
     group = build_env_group(
         EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
     )
-    started: list[subprocess.Popen[bytes]] = []
-    folders = [str(Path(__file__).parents[1]), *sys.path]
-
-    def start() -> None:
-        host, port = group.env_servers[0].get_address_port()
-        script = str(Path(__file__).parent / "dialling_robot.py")
-        started.append(
-            subprocess.Popen(
-                [sys.executable, script, host, str(port), str(tmp_path)],
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(folders)},
-            )
-        )
-
-    try:
-        for _ in range(4):
-            start()
-        batch, _ = group.reset()
-        results = len(batch.ids())
-        most = 0
-        while results < 4 * 2 * 11:
-            group.step_async(answers(batch))
-            batch, _ = group.collect_async()
-            results += len(batch.ids())
-            most = max(most, len(group._group["robots-0"].clients))
-        assert results == 88
-        assert most == 4
+    address, together = group.env_servers[0].get_address_port(), threading.Barrier(4)
+    threads = [serving(address, times=2, together=together)[0] for _ in range(4)]
+    batch, _ = group.reset()
+    results, most = len(batch.ids()), 0
+    while results < 4 * 2 * (STEPS + 1):
         group.step_async(answers(batch))
-        with pytest.raises(TimeoutError):
-            group._group.collect_async(deadline=2.0)
-        start()
+        batch, _ = group.collect_async()
+        results += len(batch.ids())
+        most = max(most, len(group._group["robots-0"].clients))
+    assert most == 4
+    group.step_async(answers(batch))
+    with pytest.raises(TimeoutError):
+        group._group.collect_async(deadline=0.5)
+    threads.append(serving(address, times=1)[0])
+    for _ in range(STEPS + 1):
         batch, _ = group.collect_async()
         assert len(batch.ids()) == 1
-        for _ in range(21):
-            group.step_async(answers(batch))
-            batch, _ = group.collect_async()
-    finally:
-        for one in started:
-            one.kill()
-            one.wait()
-        group.close()
+        group.step_async(answers(batch))
+    for thread in threads:
+        thread.join()
+    group.close()
