@@ -127,8 +127,8 @@ class HostRecord:
         deaths: by slot, deaths of workers that this env is blamed for, and exceptions that it was
             restarted after, since it last completed a step; key None for deaths of unknown cause.
         culprit: the slot of the env that the last worker was executing when it died.
-        dying: it was killed, and its exit was not reported yet; die_by: the deadline of that, and
-            halves_left: of its time, which do not count yet.
+        dying: it was killed, and its exit was not reported yet; die_by: the end of the present half
+            of its time for that; halves_left: those that have not begun.
         is_hung: its worker hung and is being killed.
         abort_by: by slot, when its worker is killed unless an aborted request has ended before;
             aborted_slot: of the env for whose request that is being done.
