@@ -11,8 +11,7 @@ import os
 import time
 from typing import Any
 
-import gymnasium as gym
-from kit.scripted import Awaitable
+from kit.scripted import Awaitable, Counts
 
 from rlightning_aio.errors import EnvError
 from rlightning_aio.spaces import Anything
@@ -20,52 +19,35 @@ from rlightning_aio.spaces import Anything
 __all__ = ["AwaitedRoom", "Room"]
 
 
-class Room(gym.Env[Any, Any]):
+class Room(Counts):
     """Its observation is the seed, the options and the number of steps; five steps end it."""
 
-    observation_space = Anything()
-    action_space = Anything()
+    observation_space = action_space = Anything()
+    length = 5
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        self.told: dict[str, Any] = {"seed": seed, **(options or {}), "pid": os.getpid()}
-        self.steps = 0
-        if (deed := self.told.get("reset")) is not None:
-            self._do(deed)
-        return self._observed(), {}
+    def does(self, action: Any) -> None:
+        self.cut = action == "cut"
+        if action == "raise":
+            raise ValueError("as asked")
+        if action == "blame":
+            raise EnvError("a nonsensical action", blame="policy")
+        if action == "die":
+            os._exit(3)
+        if action == "hang":
+            time.sleep(3600)
 
     def step(self, action: Any) -> Any:
-        if isinstance(action, str):
-            self._do(action)
-            action = 0.0
-        reward = action["reward"] if isinstance(action, dict) else float(action)
-        self.steps += 1
-        return self._observed(), reward, self.steps == 5, action == "cut", {}
+        observed, _, *others = super().step(action)
+        earned = 0.0 if isinstance(action, str) else action
+        return observed, earned["reward"] if isinstance(earned, dict) else float(earned), *others
 
-    def tool(self, number: int) -> int:
-        """Something to call."""
-        return 2 * number
+    def observed(self) -> dict[str, Any]:
+        return {"seed": self.seed, **self.options, "steps": self.steps}
 
     def mark(self, number: int = 0) -> int:
         """Leave a number behind; return what was left, at first 0."""
         self.number = number or getattr(self, "number", 0)
         return self.number
-
-    def stall(self) -> None:
-        """Something that does not return."""
-        time.sleep(3600)
-
-    def _observed(self) -> dict[str, Any]:
-        return {**self.told, "steps": self.steps}
-
-    def _do(self, deed: str) -> None:
-        if deed == "raise":
-            raise ValueError("as asked")
-        if deed == "blame":
-            raise EnvError("a nonsensical action", blame="policy")
-        if deed == "die":
-            os._exit(3)
-        if deed == "hang":
-            time.sleep(3600)
 
 
 class AwaitedRoom(Awaitable):
@@ -74,17 +56,9 @@ class AwaitedRoom(Awaitable):
     def __init__(self) -> None:
         super().__init__(Room)
 
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        await self.pause((options or {}).get("reset"))
-        return await super().reset(seed=seed, options=options)
-
     async def pause(self, action: Any = None) -> None:
         seconds = action.get("seconds", 0) if isinstance(action, dict) else 0
         await asyncio.sleep(3600 if action == "hang" else seconds)
-
-    async def tool(self, number: int) -> int:
-        """Something to call."""
-        return self.env.tool(number)
 
     async def mark(self, number: int = 0) -> int:
         """As of a room."""

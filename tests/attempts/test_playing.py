@@ -29,6 +29,7 @@ from rlightning_aio.attempts.health import Health
 from rlightning_aio.attempts.records import success_of
 from rlightning_aio.attempts.rules import is_unnamed
 from rlightning_aio.errors import EnvBusy, EpisodeLost
+from rlightning_aio.outcomes import Loss
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -81,13 +82,6 @@ async def test_what_the_policy_is_to_blame_for_is_not_tried_again(place: dict[st
         ((attempt,),) = await played(group, tasks(1), agent)
     assert (attempt.outcome.kind, attempt.outcome.blame) == ("env_raised", "policy")
     assert attempt.failures == ()
-
-
-async def test_a_reset_that_fails_has_not_started(place: dict[str, Any]) -> None:
-    async with rooms(place) as group:
-        ((attempt,),) = await played(group, tasks(1, reset="raise"), earner)
-    assert (attempt.outcome.kind, attempt.outcome.blame) == ("not_started", "env")
-    assert (attempt.reward, attempt.first, len(attempt.failures)) == (None, None, 2)
 
 
 def client_error(package: str, name: str, base: str = "", **attributes: Any) -> Exception:
@@ -256,19 +250,6 @@ async def test_an_iterator_that_is_left_open_logs_no_error(
     assert not [text for text in caplog.messages if "raised" in text or "retrieved" in text]
 
 
-async def test_deaths_that_are_raised_are_failures_of_their_attempts() -> None:
-    """The worker is replaced for the next attempt."""
-
-    async def agent(episode: AttemptEpisode) -> None:
-        await episode.step("die" if episode.spec.seed == 1 else "finish")
-
-    async with rooms(PLACES["workers"], num_workers=1, on_worker_death="raise") as group:
-        found = await played(group, tasks(3), agent, 1, Rules(retries=0))
-    kinds = {attempts[0].spec.seed: attempts[0].outcome.kind for attempts in found}
-    assert kinds[1] == "env_died"
-    assert "env_died" not in (kinds[0], kinds[2])
-
-
 async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() -> None:
     """However many wait; all are played when it comes."""
 
@@ -302,13 +283,6 @@ async def test_a_file_has_each_task_once(tmp_path: Path) -> None:
                 await played(group, twice, earner, results=results)
             await played(group, tasks(2), earner, results=results)
             assert sorted(one.spec.seed for one in results) == [0, 1]
-
-
-async def test_attempts_are_played_in_the_order_of_their_tasks() -> None:
-    """First in, first out; also if an env would have to switch."""
-    async with rooms(PLACES["loop"], num_workers=1) as group:
-        found = await played(group, tasks(4), earner, size=2)
-    assert [attempts.spec.seed for attempts in found] == [*range(4)]
 
 
 @pytest.mark.parametrize(
@@ -612,10 +586,22 @@ async def test_an_outage_does_not_burn_the_data_set(caplog: pytest.LogCaptureFix
     assert len([one for one in said if "succeed again" in one]) == 1
 
 
+def test_the_death_of_a_worker_is_no_outage() -> None:
+    """Its envs were waiting together, or one of them is to blame and the others are not."""
+    health, cause = Health(), "was killed by SIGKILL"
+    for loss in (
+        Loss(cause, "env_died", "infrastructure"),
+        Loss(cause, "env_died", "env", "box-0"),
+    ):
+        for env_id in ("box-0", "box-1", "box-2", "box-3"):
+            health.note(loss.outcome(env_id), 4, 10.0)
+    assert not health.is_slow
+
+
 async def test_it_is_said_once_if_all_resets_fail(caplog: pytest.LogCaptureFixture) -> None:
     """With their number and an env; then attempts begin one at a time."""
     async with rooms(PLACES["loop"]) as group:
-        found = await played(group, tasks(5, reset="raise"), once, 1, Rules(retries=0))
+        found = await played(group, tasks(5, deed="raise"), once, 1, Rules(retries=0))
     assert [attempts[0].outcome.kind for attempts in found] == ["not_started"] * 5
     # On a busy machine asyncio's debug mode warns of slow callbacks.
     (said,) = [one.getMessage() for one in caplog.records if one.name != "asyncio"]
