@@ -26,29 +26,6 @@ def stable_baselines3() -> Any:
     return pytest.importorskip("stable_baselines3")
 
 
-def test_infos_are_made_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that ends no episode decodes none; a program that reads one finds all."""
-    from rlightning_aio import sb3
-
-    decoded: list[None] = []
-    info_list = sb3.reported_info_list
-
-    def counted(batch: Any) -> list[dict[str, Any]]:
-        decoded.append(None)
-        return info_list(batch)
-
-    envs = sb3.VecEnv([Counts] * 2)
-    envs.reset()
-    monkeypatch.setattr(sb3, "reported_info_list", counted)
-    first = envs.step([0, 0])[3]
-    for _ in range(20):
-        envs.step([0, 0])
-    assert not decoded
-    assert first == [{"TimeLimit.truncated": False}] * 2
-    assert len(decoded) == 1
-    envs.close()
-
-
 def test_after_an_env_has_raised_all_are_reset() -> None:
     """In a step, or in the reset of the one whose options say so."""
     from rlightning_aio.errors import EnvRaised

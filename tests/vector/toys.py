@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -46,38 +44,6 @@ class Toy(gym.Env[Any, Any]):
 
     def double(self, value: float, *, plus: float = 0.0) -> float:
         return 2 * value + plus
-
-
-class Mortal(gym.Env[Any, Any]):
-    """Counts steps; some actions end its episode, or the life of its worker.
-
-    Without `dies`, it is what a program is to see of that: an episode that is cut short.
-    """
-
-    DIE, HANG, TERMINATE, TRUNCATE, STEP = range(5)
-    action_space = spaces.Discrete(8)
-    observation_space = spaces.Box(-1, 100, (3,), np.float64)
-
-    def __init__(self, index: int, *, dies: bool) -> None:
-        self.index, self.dies = index, dies
-
-    def _observed(self) -> Any:
-        return np.array([self.index, self.count, self.sum], np.float64)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.count = self.sum = 0
-        return self._observed(), {"begun": self.index}
-
-    def step(self, action: Any) -> Any:
-        if action in (self.DIE, self.HANG):
-            if self.dies:
-                while True:  # The signal that requests stacks doesn't end a hang.
-                    os.kill(os.getpid(), signal.SIGKILL) if action == self.DIE else signal.pause()
-            return self._observed(), 0.0, False, True, {"worker_restarted": "lost"}
-        self.count += 1
-        self.sum += int(action)
-        ends = action == self.TERMINATE, action == self.TRUNCATE
-        return self._observed(), 1.5 + self.count, *ends, {"count": self.count}
 
 
 class Counted(Scripted):
