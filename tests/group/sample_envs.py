@@ -7,11 +7,8 @@ are registered backends.
 
 from __future__ import annotations
 
-import os
-from contextlib import contextmanager
 from copy import deepcopy
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -20,9 +17,6 @@ from gymnasium import spaces
 from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
 from rlightning_aio.envs.base import result_of, sub_env_seeds
 from rlightning_aio.envs.fast_path import BareStep, FastPath
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 TREE = spaces.Dict(
     place=spaces.Box(-1, 1, (3,), np.float32),
@@ -167,53 +161,6 @@ class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
 
     def stack(self) -> str:
         return "wrapped"
-
-
-@ENVS.register("gated")
-class Gated(Probe):
-    """Each step waits until the test opens the gate, a FIFO in the folder ``gates``."""
-
-    def wait_at_gate(self) -> None:
-        Gate(self.config.env_kwargs["gates"], self.env_id).wait()
-
-    def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        self.wait_at_gate()
-        return super().step(policy_resp)
-
-
-@ENVS.register("gated_where_there_is_one")
-class SometimesGated(Gated):
-    """Each step waits at the gate, if the test has made one."""
-
-    def wait_at_gate(self) -> None:
-        if Path(self.config.env_kwargs["gates"], self.env_id).exists():
-            super().wait_at_gate()
-
-
-class Gate:
-    """Lets one step of one env through; opening the FIFO for reading announces the step."""
-
-    def __init__(self, folder: str, env_id: str) -> None:
-        self._path = Path(folder, env_id)
-
-    def make(self) -> Gate:
-        os.mkfifo(self._path)
-        return self
-
-    def wait(self) -> None:
-        with self._path.open("rb") as gate:
-            gate.read()
-
-    @contextmanager
-    def held(self) -> Iterator[None]:
-        """Hold the env at the gate while the context is open."""
-        with self._path.open("wb"):
-            yield
-
-    def open(self) -> None:
-        """Let the env through once it waits at the gate."""
-        with self.held():
-            pass
 
 
 @ENVS.register("chunked")

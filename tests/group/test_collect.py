@@ -1,4 +1,4 @@
-"""`collect_async` on real workers, whose envs step when the test opens their gates.
+"""`collect_async` on real workers.
 
 Random programs show how many results a collect returns, and that it loses none. Rules that need an
 exact order of events and a clock are in `tests/simulator/test_moments.py`.
@@ -7,131 +7,75 @@ exact order of events and a clock are in `tests/simulator/test_moments.py`.
 from __future__ import annotations
 
 import asyncio
-import threading
-from contextlib import contextmanager
+import os
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
-import pytest_asyncio
-from group.sample_envs import Gate
+from kit.scripted import GO, HANG, Scripted
 
-import rlightning_aio
-import rlightning_aio.sync
-from rlightning_aio import (
-    BatchedData,
-    PolicyResponse,
-)
+from rlightning_aio import BatchedData, PolicyResponse, build_env_group, sync
 from rlightning_aio.errors import GroupClosed
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
-    from pathlib import Path
+    from collections.abc import Iterator
 
-IDS = [f"gated-{k}" for k in range(4)]
-
-
-def responses(*indices: int) -> BatchedData:
-    ids = [IDS[k] for k in indices]
-    return BatchedData(
-        ids, [PolicyResponse(id_, [0, k]) for k, id_ in zip(indices, ids, strict=True)]
-    )
+ENTRY: dict[str, Any] = {"name": "e", "task": Scripted, "num_workers": 4}
+IDS = [f"e-{k}" for k in range(4)]
 
 
-@pytest.fixture
-def gates(tmp_path: Path) -> list[Gate]:
-    return [Gate(str(tmp_path), env_id).make() for env_id in IDS]
-
-
-def entry(tmp_path: Path, **fields: Any) -> dict[str, Any]:
-    return {
-        "name": "gated",
-        "backend": "gated",
-        "task": "x",
-        "num_workers": 4,
-        "env_kwargs": {"gates": str(tmp_path)},
-        **fields,
-    }
-
-
-@pytest_asyncio.fixture
-async def group(tmp_path: Path, gates: list[Gate]) -> AsyncIterator[Any]:
-    """Four envs, each in its own worker."""
-    async with rlightning_aio.build_env_group(entry(tmp_path, envs_per_process=1)) as group:
-        await group.reset()
-        yield group
+def steps(**actions: int) -> BatchedData:
+    """Steps of envs, by their numbers."""
+    ids = [f"e-{name[1:]}" for name in actions]
+    return BatchedData(ids, list(map(PolicyResponse, ids, actions.values())))
 
 
 @pytest.fixture
-def sync_group(tmp_path: Path, gates: list[Gate]) -> Iterator[Any]:
+def group() -> Iterator[Any]:
     """Four envs in one worker, which steps them in the order of the requests."""
-    with rlightning_aio.sync.build_env_group(entry(tmp_path, envs_per_process=4)) as group:
+    with sync.build_env_group({**ENTRY, "envs_per_process": 4}) as group:
         group.reset()
         yield group
+        group.abort()
 
 
-@contextmanager
-def opened(*gates: Gate) -> Iterator[None]:
-    """Open the gates one after the other while the context is open."""
-    opener = threading.Thread(target=lambda: [gate.open() for gate in gates])
-    opener.start()
-    yield
-    opener.join()
-
-
-async def open_gates(*gates: Gate) -> None:
-    with opened(*gates):
-        await asyncio.sleep(0)
-
-
-# -- the rules, synchronously
-
-
-def test_leftovers_of_a_collect_come_first(sync_group: Any, gates: list[Gate]) -> None:
-    sync_group.step_async(responses(3, 1, 0))
-    with opened(gates[3], gates[1], gates[0]):
-        pass
+def test_leftovers_of_a_collect_come_first(group: Any) -> None:
+    group.step_async(steps(e3=GO, e1=GO, e0=GO))
+    while group.get_workers()[0]["owed"]:
+        os.sched_yield()
     came: list[str] = []
     for size in (2, 1):
-        batch, flags = sync_group.collect_async(min_results=2, max_results=2)
+        batch, flags = group.collect_async(min_results=2, max_results=2)
         assert len(batch) == len(flags) == size
         came += batch.ids()
-    assert came == ["gated-1", "gated-3", "gated-0"]
+    assert came == ["e-1", "e-3", "e-0"]
 
 
-def test_workers_are_described_with_what_they_are_doing(sync_group: Any, gates: list[Gate]) -> None:
+def test_workers_are_described_with_what_they_are_doing(group: Any) -> None:
     """The description has the env that steps, and the outstanding results, oldest first."""
-    (worker,) = sync_group.get_workers()
-    assert (worker["entry"], worker["env_ids"], worker["state"]) == ("gated", IDS, "up")
+    (worker,) = group.get_workers()
+    assert (worker["entry"], worker["env_ids"], worker["state"]) == ("e", IDS, "up")
     assert (worker["owed"], worker["owed_seconds"]) == ([], 0.0)
-    sync_group.step_async(responses(2))
-    sync_group.step_async(responses(0, 1))
-    with gates[2].held():
-        (worker,) = sync_group.get_workers()
-        assert worker["owed"] == ["gated-2", "gated-0", "gated-1"]
-        assert worker["owed_seconds"] > 0
-    assert sync_group.collect_async()[0].ids() == ["gated-2"]
-    assert sync_group.get_workers()[0]["owed"] == ["gated-0", "gated-1"]
-    with opened(*gates[:2]):
-        assert len(sync_group.collect_async(wait_all=True)[0]) == 2
+    group.step_async(steps(e2=GO, e1=HANG))
+    group.step_async(steps(e0=GO))
+    assert group.collect_async()[0].ids() == ["e-2"]
+    while not (worker := group.get_workers()[0])["owed_seconds"]:
+        os.sched_yield()
+    assert worker["owed"] == ["e-1", "e-0"]
 
 
-def test_waiting_for_all_ignores_a_window_and_says_so(sync_group: Any, gates: list[Gate]) -> None:
+def test_waiting_for_all_ignores_a_window_and_says_so(group: Any) -> None:
     """The collect returns all pending results."""
-    sync_group.step_async(responses(0, 1, 2))
-    with opened(*gates[:3]), pytest.warns(UserWarning, match="ignores timeout"):
-        batch, _ = sync_group.collect_async(wait_all=True, timeout=0.001)
+    group.step_async(steps(e0=GO, e1=GO, e2=GO))
+    with pytest.warns(UserWarning, match="ignores timeout"):
+        batch, _ = group.collect_async(wait_all=True, timeout=1e-9)
     assert sorted(batch.ids()) == IDS[:3]
 
 
-def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gate]) -> None:
-    """The first result opens it; results that come later are left to the next call."""
-    sync_group.step_async(responses(0, 1))
-    with opened(gates[0]):
-        batch, _ = sync_group.collect_async(timeout=0.05)
-    assert batch.ids() == ["gated-0"]
-    with opened(gates[1]):
-        assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
+def test_a_window_ends_while_others_are_pending(group: Any) -> None:
+    """The first result opens it."""
+    group.step_async(steps(e0=GO, e1=HANG))
+    batch, _ = group.collect_async(timeout=0.05)
+    assert batch.ids() == ["e-0"]
 
 
 @pytest.mark.parametrize(
@@ -148,27 +92,24 @@ def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gat
 )
 def test_invalid_arguments_are_refused(rules: dict[str, Any], said: str) -> None:
     """The error has the argument's name and value."""
-    config = {"name": "a", "backend": "probe", "task": "x", "placement": "inline"}
-    with rlightning_aio.sync.build_env_group(config) as group:
+    with sync.build_env_group({**ENTRY, "placement": "inline"}) as group:
         batch, _ = group.reset()
-        group.step_async(batch.respond(action=np.zeros((1, 2))))
+        group.step_async(batch.respond(action=[GO] * 4))
         with pytest.raises(ValueError, match=said):
             group.collect_async(**rules)
-        assert len(group.collect_async()[0]) == 1
+        assert len(group.collect_async(wait_all=True)[0]) == 4
 
 
-# -- awaited
-
-
-async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:
+async def test_closing_wakes_all_waiters() -> None:
     """A collect and a step raise at once; the envs get time to close."""
-    group.step_async(responses(0))
-    waiting = [
-        asyncio.create_task(group.collect_async()),
-        asyncio.create_task(group.step(responses(1))),
-    ]
-    await asyncio.sleep(0)
-    with gates[0].held(), gates[1].held():
+    async with build_env_group(ENTRY) as group:
+        await group.reset()
+        group.step_async(steps(e0=HANG))
+        waiting = [
+            asyncio.create_task(group.collect_async()),
+            asyncio.create_task(group.step(steps(e1=HANG))),
+        ]
+        await asyncio.sleep(0)
         closing = asyncio.create_task(group.close())
         await asyncio.wait(waiting)
         assert not closing.done()

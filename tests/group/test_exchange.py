@@ -12,6 +12,7 @@ import pytest
 from group import sample_envs
 from gymnasium import spaces
 from kit.scripted import Counts
+from vector.toys import assert_alike
 
 from rlightning_aio import (
     BadAction,
@@ -40,16 +41,6 @@ def gym_entry(task: str, **fields: Any) -> dict[str, Any]:
         "imports": ["group.sample_envs"],
         **fields,
     }
-
-
-def same(one: Any, other: Any) -> bool:
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
-    if isinstance(one, tuple):
-        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, np.ndarray | np.generic):
-        return one.dtype == other.dtype and np.array_equal(one, other)
-    return type(one) is type(other) and one == other
 
 
 # -- preprocess functions
@@ -278,7 +269,7 @@ async def test_each_entry_is_read_by_its_own_space(start: Any, task: str) -> Non
     batch, _ = await group.reset()
     for _ in range(3):
         for part in batch.by_entry().values():
-            assert same(first_row(part.observation), part.values()[0].observation)
+            assert_alike(first_row(part.observation), part.values()[0].observation)
         batch, _ = await group.step(batch.respond(action=np.zeros(len(tasks), int)))
 
 

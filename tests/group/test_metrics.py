@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pytest
-from group.sample_envs import Gate
 from group.test_stepping import DO_NOTHING, END, ENTRY, TRUNCATE, one_driver, responses
 from hosts.awaited import GATE, OWN, STEP, Scripted
 from kit.scripted import CUT, DIE, GO, RAISE, Counts
 from kit.scripted import END as FAIL_END
 from kit.scripted import HANG as HANG_UP
+from kit.scripted import Scripted as Failing
 
 import rlightning_aio
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
@@ -31,7 +31,6 @@ from rlightning_aio.protocol.slab import IS_RESET
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
 SECONDS = ("seconds_in_envs", "seconds_queued", "seconds_uncollected", "seconds_idle")
 NAMES = {
@@ -287,16 +286,12 @@ def test_outcomes_are_those_that_the_caller_gets(fields: dict[str, Any]) -> None
 
 
 @pytest.mark.parametrize("num_aborts", [1, 2])
-async def test_an_episode_that_is_aborted_counts_once(num_aborts: int, tmp_path: Path) -> None:
+async def test_an_episode_that_is_aborted_counts_once(num_aborts: int) -> None:
     """However often that is asked for meanwhile, and though the next result tells of it."""
-    Gate(str(tmp_path), "gated-0").make()
-    config = {"name": "gated", "backend": "gated_where_there_is_one", "task": "-"}
-    config["env_kwargs"] = {"gates": str(tmp_path)}
-    async with rlightning_aio.build_env_group(config) as group:
-        await group.reset()
-        group.step_async(responses(["gated-0"], 1.0, what=DO_NOTHING))
+    async with rlightning_aio.build_env_group(Failing) as group:
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=[HANG_UP]))
         await asyncio.gather(*(group.abort() for _ in range(num_aborts)))
-        (tmp_path / "gated-0").unlink()
-        batch, _ = await group.step(responses(["gated-0"], 1.0, what=DO_NOTHING))
+        batch, _ = await group.step(batch.respond(action=[GO]))
         assert [one.kind for one in batch.outcome] == ["cancelled"]
         assert numbers(group).outcomes_cancelled == 1
