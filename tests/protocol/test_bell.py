@@ -1,4 +1,4 @@
-"""The bell: a worker rings when the goal is reached, and not before.
+"""The bell, once it is released, and between processes.
 
 That it rings in any order of events, random programs show, and `test_interleavings`.
 """
@@ -30,41 +30,10 @@ from rlightning_aio.protocol.rings import (
 pytestmark = pytest.mark.usefixtures("implementation")
 
 
-def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
-    memory = memoryview(bytearray(bell_size(num_workers)))
-    trainer = TrainerBell(memory, num_workers)
-    return trainer, [WorkerBell(memory, num_workers, k) for k in range(num_workers)]
-
-
-def test_for_all_results_workers_check_when_they_run_out_of_work() -> None:
-    """Not after each report, which would need a fence each time."""
-    trainer, (worker, _) = bells(2)
-    trainer.arm(trainer.goal(300), at_last=True)
-    assert not any(worker.publish(count) for count in range(1, 300))
-    trainer.arm(trainer.goal(301), at_last=False)
-    assert worker.publish(300)
-
-
-def test_a_disarmed_bell_is_not_rung() -> None:
-    """The trainer is already awake; arming again, even with the same goal, is new."""
-    trainer, (worker,) = bells(1)
-    trainer.arm(trainer.goal(2), at_last=False)
-    trainer.disarm()
-    worker.publish(2)
-    assert not worker.is_due()
-    trainer.took(0, 2)
-    for round_ in (3, 4):
-        trainer.arm(trainer.goal(1), at_last=False)
-        worker.publish(round_)
-        assert worker.is_due()
-        assert not worker.is_due()
-        trainer.took(0, 1)
-        trainer.disarm()
-
-
 def test_a_released_bell_is_silent() -> None:
     """Its memory may be gone, and it no longer reads it."""
-    trainer, (worker,) = bells(1)
+    memory = memoryview(bytearray(bell_size(1)))
+    trainer, worker = TrainerBell(memory, 1), WorkerBell(memory, 1, 0)
     worker.publish(3)
     trainer.release()
     assert trainer.unread() == 0
