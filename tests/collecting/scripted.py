@@ -2,50 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from kit.scripted import Counts
 
 from rlightning_aio import sync
 from rlightning_aio.envs.adapted.makers import SameStep
 
-if TYPE_CHECKING:
-    import numpy.typing as npt
 
-
-@dataclass
-class Script(gym.Env[Any, Any]):
+class Script(Counts):
     """Observes [number of the env, episodes, steps]; episodes end at random."""
-
-    number: int
-    ends: float
-    generator: np.random.Generator = field(init=False)
-    episode: int = 0
-    steps: int = 0
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
     action_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
-    def __post_init__(self) -> None:
-        self.generator = np.random.default_rng(self.number)
+    def __init__(self, number: int, ends: float) -> None:
+        self.number, self.ends = number, ends
+        self.generator = np.random.default_rng(number)
 
-    def _observation(self) -> npt.NDArray[np.float64]:
-        return np.array([self.number, self.episode, self.steps], np.float64)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self.episode += 1
-        self.steps = 0
-        return self._observation(), {}
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.steps += 1
+    def does(self, action: Any) -> float:
         chance = self.generator.random()
-        terminated, truncated = chance < self.ends / 2, 1 - chance < self.ends / 2
-        reward = float(self.generator.integers(100))
-        return self._observation(), reward, terminated, truncated, {}
+        self.over, self.cut = chance < self.ends / 2, 1 - chance < self.ends / 2
+        return float(self.generator.integers(100))
+
+    def observed(self) -> Any:
+        return np.array([self.number, self.resets, self.steps], np.float64)
 
 
 KINDS = {

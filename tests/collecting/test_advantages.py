@@ -52,17 +52,6 @@ def cleanrl(
     return advantages
 
 
-def test_an_example_by_hand() -> None:
-    """The value after a termination is 0, after a truncation or a seam the given one."""
-    rollout = rollout_of([1, 2, 3, 4], [0, 1, 0, 0], [0, 0, 1, 0], lengths=[4])
-    values, next_values = [10.0, 20.0, 30.0, 40.0], [50.0, 60.0, 70.0]
-    assert rollout.ends.tolist() == [3, 1, 2]
-    found = rollout.advantages(np.array(values, np.float32), next_values, 0.5, 0.5)
-    # Errors, last first: 4 + 25 - 40; 3 + 35 - 30; 2 + 0 - 20; and 1 + 10 - 10, with -18 / 4.
-    assert found.tolist() == [-3.5, -18.0, 8.0, -11.0]
-    assert found.dtype == np.float32
-
-
 def test_v_trace_by_hand() -> None:
     """Ratios are clipped at 1; values after an end don't affect those before it."""
     rollout = rollout_of([1, 2], [0, 0], [0, 0], lengths=[2])

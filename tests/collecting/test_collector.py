@@ -13,9 +13,6 @@ import pytest
 from collecting.scripted import scripted_group
 from group import sample_envs
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from kit.counting import ClientThread, CountingEnv
-from kit.scripted import Scripted
-from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -40,26 +37,6 @@ def poles(count: int, **fields: Any) -> Any:
 
 
 # -- kinds of envs
-
-
-def sizes_of_batches(group: Any, **options: Any) -> set[int]:
-    """Numbers of results in each call of the policy, after the reset."""
-    sizes: list[int] = []
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        sizes.append(len(batch))
-        return zeros(batch)
-
-    with group, group.auto_reset():
-        Collector(group, policy, num_transitions=40, **options).collect()
-    return set(sizes[1:])
-
-
-def test_half_of_the_envs_is_the_default() -> None:
-    """Inline envs are executed only while too few results are ready."""
-    assert sizes_of_batches(poles(4)) == {2}, "half of the envs"
-    assert sizes_of_batches(poles(1)) == {1}
-    assert sizes_of_batches(poles(4), min_results=3) == {3}
 
 
 def test_each_kind_of_env_has_its_own_policy_and_rollout() -> None:
@@ -108,26 +85,6 @@ def test_envs_of_several_kinds_need_several_policies() -> None:
         collector = Collector(group, zeros, num_transitions=4)
         with pytest.raises(ValueError, match="by_entry"):
             collector.collect()
-
-
-def test_columns_of_dict_observations_are_trees() -> None:
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        return {"action": [sample_envs.MOVES.sample() for _ in range(len(batch))]}
-
-    tree = {"name": "tree", "backend": "gymnasium", "task": "Tree-v0", "num_workers": 2}
-    group = sync.build_env_group({**tree, "placement": "inline"})
-    with group, group.auto_reset(50):
-        rollout = Collector(group, policy, num_transitions=60, seed=1).collect()
-        assert rollout.observation["image"].shape == (60, 4, 5, 3)
-        assert rollout.observation["image"].dtype == np.uint8
-        assert rollout.observation["pair"][0].shape == (60, 2)
-        assert rollout.end_observation["inner"]["count"].shape == rollout.ends.shape
-        after = rollout.next_observation["place"]
-        for k in range(59):
-            if k not in rollout.ends:
-                assert (after[k] == rollout.observation["place"][k + 1]).all()
-        assert len(rollout.action) == 60  # Values that do not stack stay in a list.
-        assert set(rollout.action[0]) == {"push", "hands", "jump"}
 
 
 class Judged(gym.Wrapper[Any, Any, Any, Any]):
@@ -219,98 +176,6 @@ def test_blocks_that_would_have_holes_raise() -> None:
                 collector.collect()
 
 
-def test_a_block_equals_the_steps_of_gymnasiums_vector_env() -> None:
-    """With same-step autoreset, bit for bit."""
-    generator = np.random.default_rng(0)
-    actions: list[Any] = []
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        actions.append(generator.integers(2, size=len(batch)))
-        return {"action": actions[-1]}
-
-    with poles(3) as group, group.auto_reset():
-        collector = Collector(group, policy, num_transitions=90, wait_all=True, seed=7)
-        blocks = [collector.collect() for _ in range(2)]
-    assert len(actions) == 60
-    envs = gym.make_vec(
-        "CartPole-v1",
-        3,
-        vectorization_mode="sync",
-        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-    )
-    observation, _ = envs.reset(seed=7)
-    for k, action in enumerate(actions):
-        block, t = blocks[k // 30], k % 30
-        np.testing.assert_array_equal(block.observation[t], observation)
-        observation, reward, terminated, truncated, _ = envs.step(action)
-        np.testing.assert_array_equal(block.reward[t], reward)
-        np.testing.assert_array_equal(block.done[t], terminated | truncated)
-    envs.close()
-
-
-def test_the_step_limit_truncates() -> None:
-    with poles(1) as group, group.auto_reset(4):
-        rollout = Collector(group, zeros, num_transitions=10, seed=0).collect()
-    assert np.flatnonzero(rollout.truncated).tolist() == [3, 7]
-    assert not rollout.terminated.any()
-    assert rollout.ends.tolist() == [9, 3, 7]
-    assert (rollout.end_observation[1] != rollout.observation[4]).any()
-
-
-def test_clients_are_envs_like_any_other() -> None:
-    """Each has a chain of its own, cut at the step limit."""
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        return {"action": np.zeros((len(batch), 2), np.float32)}
-
-    kwargs = {"clients": 2, "connect_timeout": HANG}
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
-    with sync.build_env_group(server) as group:
-        address = group["robots-0"].address
-        clients = [ClientThread(address, f"c{k}", CountingEnv(k)) for k in range(2)]
-        seen: set[int] = set()
-        with group.auto_reset(4):
-            collector = Collector(group, policy, num_transitions=6)
-            while len(seen) < 2:
-                rollout = collector.collect()
-                assert len(rollout) == 6
-                for index in set(rollout.index.tolist()):
-                    own = rollout.index == index
-                    after = rollout.next_observation[own]
-                    assert (after[:, 2] == rollout.observation[own][:, 2] + 1).all()
-                    assert (rollout.truncated[own] == (after[:, 2] == 4)).all()
-                    seen.add(index)
-        group.close()
-        for client in clients:
-            client.join()
-
-
-async def test_a_cancelled_wait_for_clients_is_repeated() -> None:
-    """It has sent nothing, so local envs begin with their seeds."""
-
-    def policy(batch: BatchedData) -> dict[str, Any]:
-        return {"action": np.zeros((len(batch), 2), np.float32)}
-
-    kwargs = {"connect_timeout": HANG}
-    server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
-    local = {"name": "here", "task": lambda: CountingEnv(7), "placement": "inline"}
-    async with rl.build_env_group([local, server]) as group:
-        with group.auto_reset(4):
-            collector = Collector(group, policy, num_transitions=4, seed=3)
-            task = asyncio.ensure_future(collector.collect())
-            await asyncio.sleep(0)  # The wait has begun.
-            task.cancel()
-            with pytest.raises(asyncio.CancelledError):
-                await task
-            client = ClientThread(group["robots-0"].address, "c0", CountingEnv(0))
-            rollout = await collector.collect()
-            while 0 not in rollout.index:
-                rollout = await collector.collect()
-            first = rollout.observation[rollout.index == 0][0]
-            assert first.tolist() == [7, 3, 0]
-    client.join()
-
-
 # -- policies
 
 
@@ -355,11 +220,6 @@ def test_a_coroutine_needs_an_asynchronous_group() -> None:
     ("answer", "error", "named"),
     [
         (
-            {"actions": [0, 0]},
-            BadAction,
-            "a dict of columns with 'action'.* not a dict of 'actions'",
-        ),
-        (
             {"action": np.zeros(2, int), "value": np.zeros(3)},
             BadAction,
             "'value' has 3 rows for a batch of 2",
@@ -403,24 +263,6 @@ def test_a_policy_must_give_the_same_columns_each_time() -> None:
 
 
 # -- the collector itself
-
-
-def test_it_resets_envs_at_their_ends_by_itself() -> None:
-    """At their own limits, or at none; between its calls no context is open."""
-    with poles(2) as group:
-        collector = Collector(group, zeros, num_transitions=60, min_results=2, seed=0)
-        rollouts = [collector.collect() for _ in range(2)]
-        assert all(len(rollout.episodes["length"]) > 2 for rollout in rollouts)
-        with group.auto_reset(5):
-            collector.collect()  # Episodes that were longer end.
-            assert set(collector.collect().episodes["length"]) == {5}
-        with group.auto_reset(math.inf):
-            pass
-    endless = {"name": "endless", "task": Scripted, "num_workers": 2, "placement": "inline"}
-    for limit, number in ((None, 0), (4, 5)):
-        with sync.build_env_group({**endless, "max_episode_steps": limit}) as group:
-            rollout = Collector(group, zeros, num_transitions=40, min_results=2).collect()
-            assert rollout.truncated.sum() == 2 * number
 
 
 def test_a_rollouts_memory_is_valid_until_the_second_collect_after_it() -> None:
@@ -489,29 +331,3 @@ def test_sub_environments_of_a_vector_env_without_resets_wait_for_the_others(
     for one in episodes:
         assert one.terminated.tolist() == [False] * (len(one.reward) - 1) + [True]
     assert sum(len(rollout) for rollout in rollouts) == 900
-
-
-class EndsForGood(gym.Env[Any, Any]):
-    """An episode has some steps; one more is an error."""
-
-    observation_space = gym.spaces.Discrete(50)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.left = int(self.np_random.integers(1, 30))
-        return self.left, {}
-
-    def step(self, action: int) -> Any:
-        assert self.left > 0, "a step after the end"
-        self.left -= 1
-        return self.left, 1.0, self.left == 0, False, {}
-
-
-async def test_no_rollout_begins_with_a_step_after_the_end_of_an_episode() -> None:
-    """Each has a context of its own, and knows what the last one has left to be reset."""
-    async with rl.build_env_group(EndsForGood, num_workers=6, placement="inline") as group:
-        policy = lambda batch: np.zeros(len(batch), int)  # noqa: E731
-        collector = Collector(group, policy, num_transitions=64, min_results=3, seed=0)
-        for _ in range(20):
-            await collector.collect()

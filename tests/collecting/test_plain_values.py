@@ -1,4 +1,4 @@
-"""Columns of plain values after results of several batches were joined."""
+"""Columns of values of several sizes, and of plain ones."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 from collections import Counter
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from kit.scripted import Counts
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -19,56 +19,10 @@ from rlightning_aio.errors import BadAction
 from rlightning_aio.spaces import Anything
 
 
-class Counting:
-    """Observes lists of one length, which could all be stacked to an array; see `step`."""
+class Cloud(Counts):
+    """Observes one point more after each step; acts with as many."""
 
-    observation_space = spaces.Dict(
-        word=Anything(), pair=spaces.Tuple([Anything(), spaces.Box(0, 99, (), np.float32)])
-    )
-    action_space = Anything()
-
-    def _observation(self) -> dict[str, Any]:
-        return {"word": ["count", self.count], "pair": ([self.count], self.count)}
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        self.count = 0
-        return self._observation(), {}
-
-    async def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """End if the action says so."""
-        self.count += 1
-        return self._observation(), 1.0, action == "end", False, {}
-
-
-def check(observation: Any) -> None:
-    """Each row has values of one count, as they are."""
-    numbers, exact = observation["pair"]
-    for word, number, count in zip(observation["word"], numbers, exact.tolist(), strict=True):
-        assert word == ["count", count]
-        assert number == [count]
-        assert type(word[1]) is int
-
-
-async def test_blocks_hold_values_of_envs_that_are_reset_apart() -> None:
-    """Results of those that were not are joined to the others' first observations."""
-
-    def policy(batch: rl.BatchedData) -> dict[str, Any]:
-        check(batch.observation)
-        return {"action": ["end" if k == 1 else "on" for k in range(len(batch))]}
-
-    config = rl.EnvConfig(name="c", task=Counting, num_workers=3, placement="loop")
-    async with rl.build_env_group(config) as group:
-        with group.auto_reset(math.inf):
-            collector = Collector(group, policy, num_transitions=15, wait_all=True)
-            for _ in range(2):
-                rollout = await collector.collect()
-                counts = [[word[1] for word in row] for row in rollout.observation["word"]]
-                assert [row[1] for row in counts] == [0] * 5
-                assert counts[0][0] in (0, 5)
-
-
-class Cloud(gym.Env[Any, Any]):
-    """Observes one point more after each step, and tells of the newest action."""
+    length = 3
 
     def __init__(self, kind: str) -> None:
         points = spaces.Box(-9, 9, (3,))
@@ -76,16 +30,11 @@ class Cloud(gym.Env[Any, Any]):
         self.observation_space = Anything() if kind == "anything" else stacked
         self.action_space = self.observation_space
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        self.count = 1
-        return np.full((1, 3), 1, np.float32), {}
+    def does(self, action: Any) -> None:
+        assert action.shape == (self.steps + 1, 3)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        assert action.shape == (self.count, 3)
-        self.count += 1
-        observation = np.full((self.count, 3), self.count, np.float32)
-        return observation, 1.0, self.count == 4, False, {}
+    def observed(self) -> Any:
+        return np.full((self.steps + 1, 3), self.steps + 1, np.float32)
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
@@ -136,13 +85,18 @@ def test_a_policys_values_of_several_sizes_are_refused_with_what_to_do() -> None
             collector.collect()
 
 
+class Obeying(Counts):
+    """Acts with anything."""
+
+    action_space = Anything()
+
+
 @pytest.mark.parametrize("action", [("ab", "cd"), (["a", "b"], ["c", "d"]), ((1, 2), (3, 4))])
-async def test_a_tuple_is_no_list_of_actions(action: Any) -> None:
+def test_a_tuple_is_no_list_of_actions(action: Any) -> None:
     """It is one of columns, of a Tuple space: none of its parts is turned over or taken apart."""
-    config = rl.EnvConfig(name="c", task=Counting, num_workers=2, placement="loop")
-    async with rl.build_env_group(config) as group:
-        batch, _ = await group.reset()
+    with sync.build_env_group(Obeying, num_workers=2, placement="inline") as group:
+        batch, _ = group.reset()
         with pytest.raises(BadAction, match="list"):
-            await group.step(batch.respond(action=action))
-        batch, _ = await group.step(batch.respond(action=list(action)))
+            group.step(batch.respond(action=action))
+        batch, _ = group.step(batch.respond(action=list(action)))
         assert batch.sent.action == list(action)

@@ -46,20 +46,3 @@ def test_what_follows_is_the_same_bit_for_bit() -> None:
         for name in ("index", "total_reward", "length"):
             assert np.array_equal(one.episodes[name], other.episodes[name]), name
         assert len(one.episodes["index"])
-
-
-def test_envs_of_different_shapes_are_resumed_too() -> None:
-    """One policy for each entry, some envs with sub-environments."""
-    both = [POLES, {**POLES, "name": "many", "num_envs": 2}]
-    policies = {"pole": None, "many": None}
-    with sync.build_env_group(both) as group:
-        collector = Collector(group, policies, num_transitions=30, min_results=6)
-        batch, _ = group.reset(seed=3)
-        collector.restart(batch=batch)
-        first = collector.collect()
-    for name, one in batch.by_entry().items():
-        found = first[name]
-        shown = one.observation.reshape(-1, 4)
-        for index, observation in zip(one.index.ravel(), shown, strict=True):
-            (own, *_) = np.flatnonzero(found.index == index)
-            assert np.array_equal(found.observation[own], observation)

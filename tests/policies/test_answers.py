@@ -87,7 +87,7 @@ def played(group: Any, policy: Any) -> list[Any]:
     return [
         lambda: Collector(group, policy, num_transitions=12, wait_all=True).collect(),
         lambda: evaluate(group, policy, 2, min_results=4),
-        lambda: evaluate(group, policy, specs),
+        lambda: evaluate(group, policy, specs, min_results=4),
     ]
 
 
@@ -164,7 +164,7 @@ def test_an_action_space_with_a_key_action_needs_respond() -> None:
 )
 def test_other_answers_are_refused(answer: Callable[[BatchedData], Any], named: str) -> None:
     """In words about the policy, before anything is sent."""
-    for number in range(2):
+    for number in range(3):
         with sync.build_env_group(entry(Plain)) as group:
             with pytest.raises(BadAction, match=named):
                 played(group, answer)[number]()
@@ -182,7 +182,7 @@ def test_a_collectors_policy_answers_in_the_order_of_its_batch() -> None:
 
 
 def test_half_of_the_envs_are_waited_for() -> None:
-    """In each of them: one call of a network for each env would be slow."""
+    """In each of them, unless a number is given: a network's call for each env would be slow."""
     sizes: list[int] = []
 
     def policy(batch: BatchedData) -> Any:
@@ -193,5 +193,7 @@ def test_half_of_the_envs_are_waited_for() -> None:
         evaluate(group, policy, 1)
         evaluate(group, policy, [EpisodeSpec("", seed) for seed in range(6)])
         Collector(group, policy, num_transitions=24).collect()
-    assert min(sizes) >= 1
-    assert {*sizes} == {6, 3}
+        assert {*sizes} == {6, 3}
+        del sizes[:]
+        Collector(group, policy, num_transitions=24, min_results=2).collect()
+    assert {*sizes} == {6, 2}

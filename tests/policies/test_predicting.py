@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from policies.counting import QUEUE, check, evaluated
-from run_python import output_of
+from run_python import blocks, output_of
 
 from rlightning_aio import sync
 from rlightning_aio.evaluation import evaluate
@@ -84,8 +83,7 @@ def test_the_program_of_the_page_runs(tmp_path: Path) -> None:
     """It evaluates a model of Stable-Baselines3."""
     pytest.importorskip("stable_baselines3")
     page = Path(__file__).parents[2] / "docs" / "evaluating.md"
-    programs = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
-    (program,) = (one for one in programs if "stable_baselines3" in one)
+    (program,) = (one for one in blocks("python", page.read_text()) if "stable_baselines3" in one)
     file = tmp_path / "program.py"
     file.write_text(program)
     assert float(output_of(file, folder=tmp_path, asyncio_debug=False)) > 0
