@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from kit.scripted import GO, HANG, Scripted
+from patience import HANG as LONG
 
 from rlightning_aio import BatchedData, PolicyResponse, build_env_group, sync
 from rlightning_aio.errors import GroupClosed
@@ -48,6 +50,23 @@ def test_leftovers_of_a_collect_come_first(group: Any) -> None:
         assert len(batch) == len(flags) == size
         came += batch.ids()
     assert came == ["e-1", "e-3", "e-0"]
+
+
+class Slow(Scripted):
+    """Takes longer than a trainer that has nothing to do stays awake."""
+
+    def does(self, action: Any) -> None:
+        time.sleep(0.1)
+        super().does(action)
+
+
+def test_a_result_is_returned_at_once_though_its_worker_goes_on() -> None:
+    """In a step of another env, which may take any time."""
+    with sync.build_env_group({**ENTRY, "task": Slow, "envs_per_process": 4}) as group:
+        group.reset()
+        group.step_async(steps(e0=GO, e1=HANG))
+        assert group.collect_async(deadline=LONG)[0].ids() == ["e-0"]
+        group.abort()
 
 
 def test_workers_are_described_with_what_they_are_doing(group: Any) -> None:
