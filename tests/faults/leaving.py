@@ -9,7 +9,7 @@ import tempfile
 import time
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
+from kit.scripted import Counts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,15 +18,12 @@ if TYPE_CHECKING:
 ABORT, HANG, SLEEP = 0, 1, 2
 
 
-class Leaving(gym.Env[int, int]):
+class Leaving(Counts):
     """It never closes what it has opened, and refers to itself.
 
     Args:
         folder: where its files are.
     """
-
-    observation_space: Any = gym.spaces.Discrete(2)
-    action_space: Any = gym.spaces.Discrete(3)
 
     def __init__(self, folder: Path) -> None:
         self.itself = self
@@ -36,25 +33,17 @@ class Leaving(gym.Env[int, int]):
         self.daemon = multiprocessing.Process(target=time.sleep, args=(1e6,), daemon=True)
         self.daemon.start()
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        del seed, options
-        return 0, {"started": [self.daemon.pid]}
-
-    def step(self, action: int) -> Any:
-        del action
-        return 0, 0.0, False, False, {}
+    def told(self) -> dict[str, Any]:
+        return {"started": [self.daemon.pid]}
 
 
-class Starting(gym.Env[int, int]):
+class Starting(Counts):
     """It has started a browser, so to speak: in a session of its own, with a process below it, and
     in the background of a shell that has ended.
 
     Args:
         environment: of what it has started, in addition.
     """
-
-    observation_space: Any = gym.spaces.Discrete(2)
-    action_space: Any = gym.spaces.Discrete(3)
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         script = "sleep 1000000 & echo $! $$; wait"
@@ -69,13 +58,11 @@ class Starting(gym.Env[int, int]):
         shell = subprocess.run(["sh", "-c", script], stdout=subprocess.PIPE, check=True)
         self.started = [int(pid) for pid in (browser.stdout.readline() + shell.stdout).split()]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        del seed, options
-        return 0, {"started": self.started}
+    def told(self) -> dict[str, Any]:
+        return {"started": self.started}
 
-    def step(self, action: int) -> Any:
+    def does(self, action: Any) -> None:
         if action == ABORT:
             os.abort()
         while action == HANG:
             time.sleep(1)
-        return 0, 0.0, False, False, {}

@@ -6,17 +6,15 @@ import asyncio
 import logging
 import os
 import signal
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import pytest
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
 from kit.processes import kill, pid_of
 from kit.tokens import Tokens, entry, marked, two_workers
-from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio._core.hosts import times
 from rlightning_aio.errors import EpisodeLost
 
 if TYPE_CHECKING:
@@ -84,43 +82,6 @@ def test_a_drain_returns_what_comes_by_the_deadline_and_ends_the_rest(start: Sta
     assert (batch.ids(), group.group.pending) == (ids[:1], [])
     batch, _ = group.step(tokens.steps(ids))
     assert batch.restarted[1]
-
-
-@on_one_driver
-@pytest.mark.parametrize("fields", [{"on_worker_death": "raise"}, {"max_restarts": 0}], ids=str)
-def test_an_abort_counts_for_no_limit(start: Start, fields: dict[str, Any]) -> None:
-    """The worker is replaced as often as its caller wishes; its own deaths count."""
-    group, tokens = start(entry(2, **fields)), Tokens()
-    ids = group.group.env_ids
-    for _ in range(3):
-        group.step_async(tokens.steps(ids[:1], {ids[0]: "sleep"}))
-        group.abort()
-        batch, _ = group.step(tokens.steps(ids))
-        assert all(marked(ret) for ret in batch.values())
-        tokens.check(group.step(tokens.steps(ids))[0])
-    with pytest.raises(rl.WorkerDied, match="SIGSEGV"):
-        group.step(tokens.steps(ids[:1], {ids[0]: "segfault"}))
-
-
-@on_one_driver
-def test_a_step_that_ends_soon_costs_no_worker(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its result is dropped, and its episode is over."""
-    monkeypatch.setattr(times, "ABORT", HANG)
-    group, tokens = start(two_workers()), Tokens()
-    ids = group.group.env_ids
-    before = [pid_of(group, env_id) for env_id in ids]
-    group.call(ids[0], "step_takes", 0.3)
-    group.step_async(tokens.steps(ids))
-    group.abort(ids[:2])
-    batch, _ = group.collect_async(wait_all=True)
-    tokens.check(batch)
-    assert sorted(batch.ids()) == ids[2:]
-    batch, _ = group.step(tokens.steps(ids))
-    assert batch.restarted.tolist() == [True, True, False, False]
-    assert [pid_of(group, env_id) for env_id in ids] == before
-    tokens.check(group.step(tokens.steps(ids))[0])
 
 
 def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_path: Path) -> None:

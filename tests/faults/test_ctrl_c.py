@@ -1,7 +1,8 @@
-"""Ctrl-C at any moment of a call of a synchronous group: the group goes on afterwards."""
+"""Ctrl-C at any moment of a call: it reaches the program, and a synchronous group goes on."""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import re
 import signal
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import pytest
 from faults.striking import press, struck
-from kit.scripted import Counts
+from kit.scripted import Awaitable, Counts
 from patience import HANG
 
 import rlightning_aio.sync
@@ -253,3 +254,42 @@ def test_an_interrupted_close_does_all_that_a_close_does(tmp_path: Path) -> None
         group.close()
     assert (tmp_path / "timeline.json").exists()
     group.close()
+
+
+class Struck(Awaitable):
+    """Is interrupted in a step, or hangs there; the second one, in its making or its reset.
+
+    Attributes:
+        where: it is interrupted.
+    """
+
+    built: ClassVar[int] = 0
+    where: ClassVar[str]
+
+    def __init__(self) -> None:
+        super().__init__(Counts)
+        Struck.built += 1
+        if Struck.built > 1 and self.where == "making":
+            raise KeyboardInterrupt
+
+    async def pause(self, action: Any = None) -> None:
+        place = "reset" if action is None else "step"
+        if place == self.where and (place == "step" or Struck.built > 1):
+            raise KeyboardInterrupt
+        if place == "step":
+            await asyncio.Event().wait()
+
+
+@pytest.mark.parametrize("where", ["step", "reset", "making"])
+def test_an_interrupt_on_the_trainers_event_loop_reaches_the_program(where: str) -> None:
+    """It may be the user's Ctrl-C, whatever an awaitable env executes then."""
+    Struck.built, Struck.where = 0, where
+
+    async def use() -> None:
+        fields = {"name": "s", "task": Struck, "placement": "loop", "step_timeout": 0.1}
+        async with rlightning_aio.build_env_group(fields) as group:
+            batch, _ = await group.reset()
+            await group.step(batch.respond(action=np.zeros(1, int)))
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(use())

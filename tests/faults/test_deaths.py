@@ -176,33 +176,16 @@ def test_others_continue_while_a_worker_is_replaced(start: Start, tmp_path: Path
 
 
 @on_one_driver
-@pytest.mark.parametrize(
-    ("size", "most", "steps", "is_raised"),
-    [(1, 2, "0! 0!", True), (1, 1, "0! 0 0! 0 0! 0", False), (2, 2, "0 1! 0 1! 0", True)],
-    ids=["in a row", "with steps in between", "with steps of a neighbour in between"],
-)
-def test_restarts_in_a_row_are_counted_for_each_env(
-    start: Start, size: int, most: int, steps: str, is_raised: bool
-) -> None:
-    """The error of an env that always kills its worker has the count and the cause.
-
-    The next request tries again, and a step that is completed ends the row.
-    """
-    group, tokens = start(entry(size, max_restarts=most)), Tokens()
-    last = f"faulty-{size - 1}"
-    for step in steps.split():
-        env_id, dies = f"faulty-{step[0]}", step.endswith("!")
-        batch, _ = group.step(tokens.steps([env_id], {env_id: "exit 3"} if dies else {}))
-        assert marked(batch.values()[0]) or not dies
-    if not is_raised:
-        tokens.check(batch)
-        assert marked(group.step(tokens.steps([last], {last: "exit 3"}))[0].values()[0])
-        return
-    with pytest.raises(WorkerDied, match=rf"env '{last}'.*exited with code 3.*{most} restarts"):
-        group.step(tokens.steps([last], {last: "exit 3"}))
-    assert marked(group.step(tokens.steps([last]))[0].values()[0])
-    group.step(tokens.steps([last]))
-    assert marked(group.step(tokens.steps([last], {last: "exit 3"}))[0].values()[0])
+def test_steps_of_a_neighbour_end_no_row_of_restarts(start: Start) -> None:
+    """The error of an env that always kills its worker has the count and the cause."""
+    group, tokens = start(entry(2, max_restarts=2)), Tokens()
+    dies = tokens.steps(["faulty-1"], {"faulty-1": "exit 3"})
+    for _ in range(2):
+        assert marked(group.step(dies)[0].values()[0])
+        for _ in range(2):  # The first is answered by a reset.
+            group.step(tokens.steps(["faulty-0"]))
+    with pytest.raises(WorkerDied, match=r"env 'faulty-1'.*exited with code 3.*2 restarts"):
+        group.step(dies)
 
 
 @on_one_driver

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import gc
 import os
 import select
@@ -17,14 +16,12 @@ from faults.closing import closed_in
 from faults.leaving import ABORT, HANG, SLEEP, Leaving, Starting
 from faults.test_shutdown import processes_of, trainer, watched
 from kit.processes import fork_server_pid, stop
-from kit.scripted import DIE, RAISE, Awaitable, Scripted
+from kit.scripted import Awaitable
 from patience import HANG as PATIENCE
 
-import rlightning_aio
 import rlightning_aio.sync as rl
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
 
@@ -63,44 +60,6 @@ def test_an_inline_env_is_freed_when_its_group_closes() -> None:
     group.close()
     gc.collect()
     assert made[0]() is None
-
-
-class Noting(Scripted):
-    """Writes down whether it takes the place of another."""
-
-    def __init__(self, log: Path) -> None:
-        with log.open("a") as file:
-            file.write("again " if "RLIGHTNING_AIO_RESTARTS" in os.environ else "new ")
-
-
-@pytest.mark.parametrize("kind", ["worker", "shared", "inline", "awaitable", "loop"])
-def test_a_callable_can_know_that_it_was_called_before(kind: str, tmp_path: Path) -> None:
-    """After exceptions and deaths: so a file of the env before is continued, not overwritten."""
-    dies = kind in ("worker", "shared", "awaitable")
-    fields: dict[str, Any] = {"placement": kind} if not dies else {}
-    if kind == "shared":
-        fields = {"envs_per_process": 2}
-
-    def made(k: int) -> Any:
-        env = Noting(tmp_path / str(k))
-        return Awaitable(lambda: env) if kind in ("awaitable", "loop") else env
-
-    tasks = [partial(made, k) for k in range(2)]
-    config = entry(tasks, num_workers=2, on_env_error="restart", max_restarts=9, **fields)
-
-    async def play() -> None:
-        async with rlightning_aio.build_env_group(config) as group:
-            batch, _ = await group.reset()
-            for action in (RAISE, DIE, RAISE, RAISE, DIE):
-                if action != DIE or dies:
-                    await group.step(batch.respond(action=[action, 0]))
-                    await group.step(batch.respond(action=[0, 0]))
-
-    asyncio.run(play())
-    assert "RLIGHTNING_AIO_RESTARTS" not in os.environ
-    assert (tmp_path / "0").read_text() == "new " + "again " * (5 if dies else 3)
-    deaths = 2 if kind == "shared" else 0
-    assert (tmp_path / "1").read_text() == "new " + "again " * deaths
 
 
 KILLS = {"crash": ABORT, "hang": HANG, "abort": HANG, "destroyed": SLEEP}
@@ -198,54 +157,3 @@ def test_an_env_that_does_not_close_in_time_is_killed_when_the_trainer_is_gone(
         assert process.stdout is not None
         assert process.stdout.read() == "ready\n"
     assert not closed_in(tmp_path)
-
-
-class Port:
-    """An awaitable env that has a port, so to speak, from its making until it has closed."""
-
-    is_open = False
-    when_made: Callable[[], object] = staticmethod(lambda: None)
-
-    def __init__(self) -> None:
-        self.observation_space: Any = gym.spaces.Discrete(2)
-        self.action_space: Any = gym.spaces.Discrete(3)
-        Port.when_made()
-        if Port.is_open:
-            raise OSError("port in use")
-        Port.is_open = True
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        del seed, options
-        return 0, {}
-
-    async def step(self, action: int) -> Any:
-        if action == HANG:
-            await asyncio.Event().wait()
-        return 0, 0.0, False, False, {}
-
-    async def close(self) -> None:
-        await asyncio.sleep(1.6)
-        Port.is_open = False
-
-
-async def test_an_env_that_is_aborted_as_it_is_made_closes_before_the_next(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    aborting: list[asyncio.Task[None]] = []
-    made = asyncio.Event()
-
-    def abort() -> None:
-        made.set()
-        aborting.append(asyncio.ensure_future(group.abort()))
-
-    async with rlightning_aio.build_env_group(entry(Port, placement="loop")) as group:
-        batch, _ = await group.reset()
-        group.step_async(batch.respond(action=[HANG]))
-        await group.abort()
-        with monkeypatch.context() as patch:
-            patch.setattr(Port, "when_made", abort)
-            group.reset_async()
-            await made.wait()
-        await asyncio.wait(aborting)
-        batch, _ = await group.reset()
-        assert batch.is_reset.tolist() == [True]

@@ -11,10 +11,10 @@ import threading
 import types
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from kit.driven import Driven, on_one_driver
+from kit.scripted import Counts
 from kit.tokens import Tokens, entry, two_workers
 from patience import HANG
 
@@ -222,16 +222,6 @@ def test_value_that_cannot_be_pickled_is_an_error_of_its_call(start: Start) -> N
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@on_one_driver
-def test_info_that_cannot_be_pickled_is_an_error_of_its_step(start: Start) -> None:
-    """The env has stepped, but the result can't be sent."""
-    group, tokens = start(two_workers()), Tokens()
-    group.call("faulty-1", "answer_with", info=lambda: {"lock": threading.Lock()})
-    with pytest.raises(EnvRaised, match="the result can't be pickled"):
-        group.step(tokens.steps(["faulty-1"]))
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-
-
 MISFITS: dict[str, tuple[dict[str, Any], str]] = {
     "shape": (
         {"observation": lambda: np.zeros((2, 3))},
@@ -291,23 +281,15 @@ def test_megabytes_on_stdout_and_stderr_change_nothing(
     assert not written.out.count("e")
 
 
-def local_env(reward: Callable[[Any], float]) -> Callable[[], gym.Env[Any, Any]]:
+def local_env(reward: Callable[[Any], float]) -> Callable[[], Counts]:
     """Return a maker of an env of a class that no worker can import."""
 
-    class Local(gym.Env[Any, Any]):
-        observation_space = action_space = gym.spaces.Discrete(2)
-
+    class Local(Counts):
         def __init__(self) -> None:
-            self.reward = reward
-
-        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-            return 0, {}
-
-        def step(self, action: Any) -> Any:
-            return 0, self.reward(action), False, False, {}
+            self.does = reward
 
         def replace(self, new_reward: Callable[[Any], float]) -> None:
-            self.reward = new_reward
+            self.does = new_reward
 
     return Local
 

@@ -18,7 +18,7 @@ from patience import HANG
 import rlightning_aio
 from rlightning_aio import registry
 from rlightning_aio._core.hosts import times
-from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
+from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -97,18 +97,6 @@ def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
     assert marked(batch["faulty-3"])
     assert batch["faulty-3"].info["worker_restarted"] == "hung in a reset and was killed"
     tokens.check(group.collect_async()[0])
-
-
-@on_one_driver
-def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> None:
-    """The worker was checked while it executed a request without a limit."""
-    group, tokens = start(entry(2, reset_timeout=LIMIT)), Tokens()
-    group.call("faulty-1", "arm", "resetting", "sleep")
-    group.call("faulty-0", "step_takes", 2 * LIMIT)
-    with group.group.auto_reset(max_episode_steps=1):
-        group.step(tokens.steps(["faulty-1"]))
-        batch, _ = group.step(tokens.steps(["faulty-0", "faulty-1"]))
-    assert marked(batch["faulty-1"])
 
 
 def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
@@ -247,47 +235,6 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
         group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
     assert "in __init__" in caught.value.stderr_tail
     tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
-
-
-@on_one_driver
-def test_a_replacement_that_hangs_is_found_without_any_wait(start: Start, tmp_path: Path) -> None:
-    """The worker died idle, so the first request was a plain reset."""
-    broken = tmp_path / "broken"
-    kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
-    tokens = Tokens()
-    for member in group.group._core.supervisor.records:
-        member.config = member.config.model_copy(update={"start_timeout": LIMIT})
-    broken.touch()
-    os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)
-    while not group.group._core.supervisor.any_deaths:
-        group.step(tokens.steps(["faulty-2"]))
-    with pytest.raises(WorkerDied, match="did not start again"):
-        group.reset()
-
-
-def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> None:
-    """Nothing is lost, doubled, or mixed up with another request."""
-    group, tokens = start(two_workers(step_timeout=60)), Tokens()
-    pid = pid_of(group, "faulty-0")
-    waits: list[dict[str, Any]] = [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}]
-    for waiting in waits:
-        stop(pid)
-        group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
-        for _ in range(3):
-            with pytest.raises(TimeoutError, match="nothing is lost"):
-                group.collect_async(deadline=0.05, **waiting)
-        os.kill(pid, signal.SIGCONT)
-        ids: list[str] = []
-        while len(ids) < 2:
-            batch, _ = group.collect_async(**waiting)
-            tokens.check(batch)
-            ids += batch.ids()
-        assert sorted(ids) == ["faulty-0", "faulty-1"]
-        with pytest.raises(NothingPending):
-            group.collect_async()
-        for _ in range(3):
-            tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 @on_one_driver

@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from kit.counting import ClientThread
+from kit.scripted import Counts
 from patience import HANG
 
 from rlightning_aio import (
@@ -406,7 +407,7 @@ def test_an_arm_on_its_way_to_the_reset_position_stops(
         assert lines(log) == ["reset", "stop"]
 
 
-class GymnasiumArm(gym.Env[Any, Any]):
+class GymnasiumArm(Counts):
     """One that no backend knows."""
 
     hardware = True
@@ -415,11 +416,8 @@ class GymnasiumArm(gym.Env[Any, Any]):
     def __init__(self, log: Path) -> None:
         self.log = log
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action: Any) -> Any:
-        return action, 0.0, False, False, {}
+    def observed(self) -> Any:
+        return np.zeros(1, np.float32)
 
     def stop(self) -> None:
         with self.log.open("a") as file:

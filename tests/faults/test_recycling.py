@@ -2,48 +2,40 @@
 
 from __future__ import annotations
 
-import os
 import random
 import time
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from kit.scripted import Counts
 
 import rlightning_aio.sync as rl
 from rlightning_aio import ConfigError, EnvConfig
 from rlightning_aio.vector import VectorEnv
 
 
-class Walk(gym.Env[Any, Any]):
+class Walk(Counts):
     """Episodes of random lengths, of several generators, each of which may leave memory behind."""
 
     observation_space = spaces.Box(-10, 10, (4,), np.float64)
-    action_space = spaces.Discrete(3)
 
     def __init__(self, leaks_mb: float = 0.0) -> None:
         self.leaks_mb, self.kept = leaks_mb, list[Any]()
         self.draws, self.more = random.Random(3), {"dice": [np.random.default_rng(5)]}
-        self.steps = self.length = 0
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
-        super().reset(seed=seed)
-        if self.leaks_mb:
-            self.kept.append(np.ones(int(self.leaks_mb * 1e6), np.uint8))
-        self.steps, self.length = 0, int(self.np_random.integers(2, 9))
-        return self.observed(), {"pid": os.getpid()}
+    def does(self, action: Any) -> float:
+        return float(action)
 
     def observed(self) -> Any:
+        if not self.steps:
+            self.kept.append(np.ones(int(self.leaks_mb * 1e6), np.uint8))
+            self.length = int(self.np_random.integers(2, 9))
         dice = self.more["dice"][0].random()
         return np.array([self.np_random.random(), self.draws.random(), dice, self.steps])
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.steps += 1
-        return self.observed(), float(action), self.steps >= self.length, False, {}
 
 
 def played(make: Any, num_steps: int = 120, **fields: Any) -> tuple[list[Any], dict[str, float]]:

@@ -318,6 +318,33 @@ def test_program_without_standard_streams_trains_like_any_other(
     assert said.read_text() == "was killed by SIGSEGV\nclosed\n"
 
 
+def test_an_unread_stderr_delays_nobody() -> None:
+    """Neither an env that prints to it nor the news of deaths; what it can't take is dropped."""
+    script = """
+        import logging
+        logging.disable()
+        group = build(); group.init(); group.reset()
+        group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "print"}))
+        for _ in range(3):
+            batch, _ = group.step(tokens.steps(["faulty-3"], {"faulty-3": "exit 3"}))
+            say(batch["faulty-3"].info["worker_restarted"])
+            tokens.check(group.step(tokens.steps(["faulty-3"]))[0])
+        batch, _ = group.collect_async()
+        tokens.check(batch)
+        say("printed by " + batch.ids()[0])
+        group.close()
+        say("closed")
+    """
+    with trainer(script) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        lines = read_until(process.stdout, "closed")
+        assert sum("exited with code 3" in line for line in lines) == 3
+        assert any("printed by faulty-0" in line for line in lines)
+        written = process.stderr.read()
+    assert 0 < written.count("e" * 1023 + "\n") < 3000
+
+
 def test_child_of_the_trainer_does_not_end_its_group() -> None:
     """A forked child that drops its copy of the group doesn't affect the parent's."""
     script = """

@@ -5,16 +5,14 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from kit.scripted import Counts
 
 import rlightning_aio
 from rlightning_aio import Collector, evaluate, sync
 from rlightning_aio.attempts import EpisodeSpec, Rules, play
 from rlightning_aio.errors import EnvRaised
-
-EPISODE = 3
 
 
 class HttpError(Exception):
@@ -25,33 +23,19 @@ class HttpError(Exception):
         self.response = response
 
 
-class Failing(gym.Env[int, int]):
+class Failing(Counts):
     """Reports such an error in a reset, or in the second step, of its first episodes."""
 
-    observation_space: Any = gym.spaces.Discrete(9)
-    action_space: Any = gym.spaces.Discrete(2)
     switches_task = True
+    length = 3
 
     def __init__(self, where: str, last: int) -> None:
         self.where, self.last = where, last
-        self.step_number = self.episode = 0
 
-    def _info(self, where: str) -> dict[str, Any]:
-        fails = where == self.where and self.episode <= self.last
+    def told(self) -> dict[str, Any]:
+        where = {0: "reset", 2: "step"}.get(self.steps)
+        fails = where == self.where and self.resets <= self.last
         return {"error": HttpError("not found", response=404)} if fails else {"text": "fine"}
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        super().reset(seed=seed)
-        del options
-        self.step_number = 0
-        self.episode += 1
-        return 0, self._info("reset")
-
-    def step(self, action: int) -> Any:
-        del action
-        self.step_number += 1
-        info = self._info("step" if self.step_number == 2 else "")
-        return self.step_number, 1.0, self.step_number == EPISODE, False, info
 
 
 def entries(where: str, last: int = 1) -> list[dict[str, Any]]:
