@@ -55,10 +55,6 @@ class TestHalfCheetah(GymnasiumContract):
     )
 
 
-class TestHopper(GymnasiumContract):
-    config = EnvConfig(name="hopper", backend="mujoco", task="Hopper-v5")
-
-
 def cartpole(**fields: Any) -> GymnasiumEnv:
     config = EnvConfig(name="cartpole", backend="gymnasium", task="CartPole-v1", **fields)
     return GymnasiumEnv(config)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import json
 import logging
 import math
@@ -22,7 +21,6 @@ from gymnasium import spaces
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.plugins.openenv.session import OpenEnvSession, ServerGone
 
@@ -328,35 +326,3 @@ async def test_an_episode_without_any_reward_has_none(
     async with one_env() as (_, group):
         found = [(await group.step(steps_of("o-0")))[0].reward.item() for _ in rewards]
     assert np.array_equal(found, expected, equal_nan=True)
-
-
-@pytest.mark.parametrize("placement", ["loop", "process"])
-@pytest.mark.parametrize("wait_all", [True, False])
-@on_asyncio
-async def test_a_collector_has_no_row_of_a_step_whose_session_was_lost(
-    placement: str, wait_all: bool
-) -> None:
-    """Each row is one step further than the one before, and no lost episode counts."""
-    async with Misbehaving(capacity=2) as server:
-        calls = itertools.count()
-
-        def policy(batch: rl.BatchedData) -> Any:
-            if next(calls) == 3:
-                server.fates.append("restart")
-            return {"action": [{"number": next(numbers)} for _ in batch.ids()]}
-
-        fields = {"num_workers": 2, "placement": placement}
-        async with rl.build_env_group(entry(server.url, **fields)) as group:
-            with group.auto_reset(math.inf):
-                collector = Collector(group, policy, num_transitions=20, wait_all=wait_all)
-                rollout = await collector.collect()
-    assert rollout.reward.tolist() == np.ones(rollout.shape).tolist()
-    assert not len(rollout.episodes["length"])
-    seen = rollout.observation
-    seen = [one for row in seen for one in row] if wait_all else seen
-    ends = dict(zip(rollout.ends.tolist(), rollout.end_observation, strict=True))
-    after = 2 if wait_all else 1
-    for row, one in enumerate(seen):
-        then = ends.get(row) or seen[row + after]
-        assert (then["episode"], then["count"]) == (one["episode"], one["count"] + 1)
-    assert len({one["episode"] for one in seen}) == 4

@@ -273,20 +273,6 @@ def test_a_hold_holds_the_gripper(arm: WatchedArm, make: Any) -> None:
     assert arm.wait_for(lambda: abs(arm.gripper_target - arm.gripper) < 1e-4)
 
 
-def test_a_hold_keeps_a_gripped_object(arm: WatchedArm, make: Any) -> None:
-    """It gets no command, because holding the opening would release the object."""
-    arm.in_the_grip = 0.03
-    env = make(reset_gripper=0.05)
-    env.reset()
-    for _ in range(60):
-        env.step(respond([*READY, 0.0]))
-    assert arm.gripper == 0.03
-    arm.commands.clear()
-    env.on_disconnect()
-    assert sent_joints(arm.commands)
-    assert arm.gripper_target == 0.0
-
-
 def test_a_reset_waits_for_the_gripper(arm: WatchedArm, make: Any) -> None:
     """It is at its position when the reset returns, or the error has its position."""
     env = make(reset_gripper=0.06, move_timeout=5.0)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from kit.counting import ClientThread, CountingEnv, look, served
+from kit.counting import ClientThread, look, served
 from patience import HANG
 from remote.proxy import Proxy
 
@@ -167,55 +167,6 @@ def mixed(**env_kwargs: Any) -> Any:
         "num_workers": 4,
     }
     return sync.build_env_group([local, served(**env_kwargs)], mixed_actions=True)
-
-
-@pytest.mark.parametrize("when", ["idle", "in flight", "uncollected"])
-def test_a_place_changes_hands_in_mid_run(when: str) -> None:
-    """A response to a lost client never reaches the next one."""
-    with mixed(clients=2) as group:
-        address = group["robots-0"].address
-        ids = ["robots-0/0", "robots-0/1"]
-        env = CountingEnv(1)
-        gone = ClientThread(address, "gone", env)
-
-        def leave() -> None:
-            env.finished = True
-            if when == "in flight":
-                gone.client._close_connection()
-
-        env.on_step, env.finished = leave, when == "idle"
-        wait_for(group, lambda: len(group["robots-0"].clients) == 1)
-        stays = ClientThread(address, "stays", CountingEnv(2))
-        batch, _ = group.reset(seed=5)
-        assert batch.ids()[4:] == ids
-        assert batch.take([4, 5]).observation.tolist() == [[1, 9, 0], [2, 10, 0]]
-        index = batch.index.tolist()
-        rows = batch.take([4, 5])
-        if when != "idle":
-            group.step_async(actions(rows))
-        wait_for(group, lambda: len(group["robots-0"].clients) == 1)
-        comes = ClientThread(address, "comes", CountingEnv(3))
-        if when == "idle":
-            group.step_async(actions(rows))
-        results: dict[str, Any] = {}
-        while len(results) < 2:
-            found, _ = group.collect_async(deadline=HANG)
-            for k, env_id in enumerate(found.ids()):
-                results[env_id] = found.take([k])
-        if when == "uncollected":
-            assert results[ids[0]].observation.tolist() == [[1, 9, 1]]
-            group.step_async(actions(results[ids[0]]))
-            results[ids[0]], _ = group.collect_async(deadline=HANG)
-        marked = results[ids[0]]
-        assert marked.restarted.tolist() == marked.is_reset.tolist() == [True]
-        assert marked.observation.tolist() == [[3, -1, 0]]
-        assert "client_lost" in marked.infos
-        assert comes.env.steps == 0
-        assert comes.env.resets == 1
-        assert marked.index.tolist() == index[4:5]
-        group.close()
-        for client in (stays, comes, gone):
-            client.join()
 
 
 def test_an_empty_place_delays_nobody() -> None:

@@ -96,7 +96,7 @@ def test_a_listed_name_has_its_own_place() -> None:
 
 
 def test_a_key_is_for_the_names_that_it_was_made_for(world: World) -> None:
-    client = Client("c", 3)
+    client = Client("c")
     client.session.connected()
     world.server.receive(b"c:9", client.session.outbox.popleft(), {"arm"})
     assert world.server.refused == {"c": "its key was made for 'arm', not for 'c'"}
@@ -104,7 +104,7 @@ def test_a_key_is_for_the_names_that_it_was_made_for(world: World) -> None:
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:
     """The present client keeps its session."""
-    second = Client("a", 9)
+    second = Client("a")
     second.routes = iter(range(50, 60))
     first, world.clients["a"] = world.clients["a"], second
     second.connect()
@@ -229,7 +229,7 @@ def test_info_that_cannot_be_sent_is_left_out_and_named_once(
     client = world.clients["a"]
     info: dict[Any, Any] = {"fine": {1: 2}, "camera": object(), 0: "cup"}
     for _ in range(2):
-        outcome = ResultFields(client.observation(), 1.0, False, False)
+        outcome = ResultFields(np.zeros(3), 1.0, False, False)
         client.session.answer(asked(world, "a"), outcome, info, {}, 0, 0)
         client.flush()
         world.settle()

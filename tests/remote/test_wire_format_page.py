@@ -11,6 +11,7 @@ import gymnasium as gym
 import msgspec
 import numpy as np
 import pytest
+from run_python import blocks
 
 from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.payload import Packed, SpaceLayout
@@ -55,7 +56,7 @@ EXAMPLES = [
 def examples_of_the_page() -> list[list[bytes]]:
     """Return the parts of each message that the page shows byte by byte."""
     messages: list[list[bytes]] = []
-    for block in re.findall(r"^```hex\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL):
+    for block in blocks("hex", PAGE):
         parts = re.split(r"^# part \d+, (\d+) bytes\n", block, flags=re.MULTILINE)[1:]
         message: list[bytes] = []
         for length, lines in zip(parts[::2], parts[1::2], strict=True):
@@ -98,7 +99,7 @@ def test_the_limits_are_those_of_the_code() -> None:
 
 def test_the_hello_is_read() -> None:
     """It is that of the client whose messages follow, with the defaults left out."""
-    (text,) = re.findall(r"^```js\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    (text,) = blocks("js", PAGE)
     hello = msgspec.convert(json.loads(text), ClientHello)
     assert hello.version == wire.VERSION
     spaces = (hello.observation_space, hello.action_space)

@@ -27,23 +27,18 @@ if TYPE_CHECKING:
 
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
 ACTION = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-EXTRAS: dict[str, Any] = {}
 
 
 class Client:
-    """A client process: its session, its env (which only counts), and its connection.
-
-    The observation is (which client, which life, steps since the last reset).
+    """A client process: its session, its env, and its connection.
 
     Attributes:
         outbox: routes and messages on the way to the server; None for the end of a connection.
         inbox: messages on the way to the client.
     """
 
-    def __init__(self, name: str, identity: int) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
-        self.identity = identity
-        self.lives = 0
         self.executed: set[tuple[Any, int]] = set()
         self.ended: list[str] = []
         self.refused: list[str] = []
@@ -55,8 +50,6 @@ class Client:
 
     def begin(self) -> None:
         """Start the process, or restart it."""
-        self.lives += 1
-        self.steps = 0
         self.todo: Step | Reset | None = None
         meta = EnvMeta(env_id="env", observation_space=OBSERVATION, action_space=ACTION)
         self.session = ClientSession(meta, self.name)
@@ -119,15 +112,11 @@ class Client:
         key = (self.route, request.number)
         assert key not in self.executed, "a request was executed twice"
         self.executed.add(key)
-        self.steps = 0 if isinstance(request, Reset) else self.steps + 1
         self.session.finish(request.number, self.ret())
         self.flush()
 
-    def observation(self) -> np.ndarray[Any, Any]:
-        return np.array([self.identity, self.lives, self.steps], float)
-
     def ret(self) -> EnvRet:
-        return EnvRet(env_id="env", observation=self.observation(), last_reward=float(self.steps))
+        return EnvRet(env_id="env", observation=np.zeros(3))
 
 
 class Recorder:
@@ -173,7 +162,7 @@ class World:
             ClientPlace(f"srv/{name or k}", self.seen[k], name) for k, name in enumerate(listed)
         ]
         self.server = ServerSessions("srv", self.places)
-        self.clients = {name: Client(name, k + 1) for k, name in enumerate(names)}
+        self.clients = {name: Client(name) for name in names}
         self.delivered: dict[tuple[str, bool], list[list[bytes]]] = {}
 
     def flush(self) -> None:
@@ -228,16 +217,16 @@ class World:
                 return place
         return None
 
-    def reset(self, name: str, seed: int | None = None, options: Any = None) -> None:
+    def reset(self, name: str) -> None:
         place = self.place_of(name)
         assert place is not None
-        self.server.reset(place, seed, options)
+        self.server.reset(place, None, None)
         self.flush()
 
     def step(self, name: str) -> None:
         place = self.place_of(name)
         assert place is not None
-        self.server.step(place, ACTION.sample(), EXTRAS)
+        self.server.step(place, ACTION.sample(), {})
         self.flush()
 
     def take(self) -> list[Any]:
