@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
+
+from run_python import output_of
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "attempts.py"
 
 
 def reported(*words: str) -> dict[str, Any]:
-    command = [sys.executable, str(SCRIPT), *words]
-    ended = subprocess.run(command, capture_output=True, check=True, text=True)
-    return json.loads(ended.stdout)
+    return json.loads(output_of(SCRIPT, *words))
 
 
 def test_no_reward_differs_from_the_ledger_while_much_fails() -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from run_python import output_of
 
 from rlightning_aio.protocol import kernel
 
@@ -28,11 +26,8 @@ MOST = {
 @pytest.mark.parametrize("limits", [[], ["--step-timeout", "10"]])
 def test_a_step_makes_few_calls(limits: list[str]) -> None:
     """With a time limit and without; the counts are exact, so one more object is noticed here."""
-    command = [sys.executable, str(SCRIPT), "--json", *limits]
     # The debug mode of asyncio, in which tests run, makes calls of its own.
-    surroundings = {name: value for name, value in os.environ.items() if "DEBUG" not in name}
-    ended = subprocess.run(command, capture_output=True, check=True, text=True, env=surroundings)
-    found = json.loads(ended.stdout)
+    found = json.loads(output_of(SCRIPT, "--json", *limits, asyncio_debug=False))
     for name, agreed in MOST.items():
         for what, most in agreed.items():
             assert found[name][what] <= most, (name, what, found[name])
