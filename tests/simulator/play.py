@@ -559,9 +559,10 @@ class Play(Session):
         envs = list(self.model.envs.values())
         for env in envs:
             if env.limbo or env.request is not None:
+                env.put_away &= env.request is None or env.request.kind == "call"
                 self.model.abort(env)
                 env.kept.clear()
-                env.lost = False  # What has come may have said so.
+                env.lost = False  # What has come may have said so, and that it was rebuilt.
                 self.unseen.add(env.env_id)
         self.counts["dropped by a reset"] += 1
         await self.reset(envs, rng, drops=True)
