@@ -46,9 +46,8 @@ class Rewarded(Judged):
     def __init__(self, reward: str) -> None:
         self.reward = float(reward)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        observation, _, *ends_and_info = super().step(action)
-        return observation, self.reward, *ends_and_info
+    def does(self, action: Any) -> float:
+        return self.reward
 
 
 class Switching(Judged):

@@ -15,6 +15,7 @@ import numpy as np
 from kit.scripted import Awaitable, Counts
 
 import rlightning_aio as rl
+from rlightning_aio.spaces import Anything
 
 
 @rl.ENVS.register("stub")
@@ -176,6 +177,18 @@ class Finishing(Stub):
 
     def close(self) -> None:
         Path(self.options["closed_file"]).touch()
+
+
+class Talk:
+    """Its actions are anything, so that only a policy can choose them."""
+
+    observation_space = action_space = Anything()
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return "hello", {}
+
+    async def step(self, action: Any) -> Any:
+        raise AssertionError
 
 
 class Plays(Counts):

@@ -174,6 +174,25 @@ def test_numbers_of_workers_to_try(fields: dict[str, Any], workers: list[int]) -
     assert [where for where, count in tried if count == 0] == ["inline"] * workers.count(0)
 
 
+@pytest.mark.parametrize(
+    ("fields", "tried"),
+    [
+        ([{}], [("loop", 0), ("process", 1), ("process", 2), ("process", 4)]),
+        # Workers have no such limit.
+        ([{"max_concurrency": 2}], [("loop", 0)]),
+        # Envs that are not awaitable need workers.
+        ([{}, {"placement": "process"}], [("process", 2), ("process", 4), ("process", 8)]),
+    ],
+    ids=["alone", "limited", "beside others"],
+)
+def test_awaitable_envs_are_tried_on_the_event_loop_and_in_workers(
+    fields: list[dict[str, Any]], tried: list[tuple[str, int]]
+) -> None:
+    talk = {"task": "cli.stub_envs:Talk", "placement": "loop", "num_workers": 4}
+    entries = [EnvConfig(**{"name": f"t{k}", **talk, **own}) for k, own in enumerate(fields)]
+    assert [(where, count) for where, count, _ in found(*entries)] == tried
+
+
 def test_simulations_that_can_share_an_env_are_also_tried_that_way() -> None:
     """CartPole-v1 can, because it has a vector entry point."""
     tried = found(entry(num_workers=8))

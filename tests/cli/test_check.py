@@ -115,6 +115,15 @@ def test_a_sound_env_is_code_0(tmp_path: Path) -> None:
     assert invoke_json("check", write_config(tmp_path, INLINE))["entries"][0]["step_us"] is None
 
 
+def test_no_env_is_stepped_whose_actions_only_a_policy_can_choose(tmp_path: Path) -> None:
+    talk = {"name": "t", "task": "cli.stub_envs:Talk", "placement": "loop"}
+    config = write_config(tmp_path, talk)
+    lines = invoke("check", config).stdout.splitlines()
+    assert lines[-1] == "  reset; not stepped: only a policy can choose its actions"
+    (entry,) = invoke_json("check", config)["entries"]
+    assert (entry["action_space"], entry["steps"]) == ("Anything()", 0)
+
+
 @pytest.mark.parametrize(
     ("env", "placement"),
     [("Casting", "inline"), ("Casting", "process"), ("AwaitedCasting", "loop")],

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from cli.command import TESTS, invoke, run
+from run_python import blocks
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -17,10 +18,6 @@ PAGE = (ROOT / "docs" / "command-line.md").read_text()
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def blocks(language: str, page: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-
-
 COMMANDS = [
     line.partition(" > ")[0]
     for page in PAGES
@@ -28,7 +25,7 @@ COMMANDS = [
     for line in block.splitlines()
 ]
 LINES = sorted({line for line in COMMANDS if line.startswith("rlightning-aio")})
-# Run by test_readme.py and test_docs.py.
+# Looked at by test_documents.py, and run by test_docs.py.
 ELSEWHERE = ("make ", "python -m rlightning_aio.legacy ")
 
 

@@ -157,20 +157,16 @@ def test_a_config_that_a_client_cannot_use_is_refused(
     assert [words for words in named if words not in done.stderr] == []
 
 
-def test_unreadable_keys_close_the_env(tmp_path: Path) -> None:
-    """The message names their directory."""
-    config, missing = finishing(tmp_path, 1), tmp_path / "missing"
-    done = invoke("client", config, "--connect", NOBODY, "--keys", missing)
+@pytest.mark.parametrize(
+    ("words", "said"), [(("--keys", "/missing"), "/missing"), (("--name", 129 * "n"), "128")]
+)
+def test_what_a_server_could_not_accept_is_refused_at_once(
+    words: tuple[str, str], said: str, tmp_path: Path
+) -> None:
+    """Keys that can't be read, and a name that is too long; the env is closed."""
+    done = invoke("client", finishing(tmp_path, 1), "--connect", NOBODY, *words)
     assert done.exit_code == 2
-    assert str(missing) in done.stderr
-    assert (tmp_path / "closed").exists()
-
-
-def test_a_name_that_a_server_would_refuse_is_refused_at_once(tmp_path: Path) -> None:
-    """The env is closed."""
-    done = invoke("client", finishing(tmp_path, 1), "--connect", NOBODY, "--name", 129 * "n")
-    assert done.exit_code == 2
-    assert "128" in done.stderr
+    assert said in done.stderr
     assert (tmp_path / "closed").exists()
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import shutil
 from typing import TYPE_CHECKING
 
 import pytest
 from cli.command import TESTS, run
-from run_python import output_of
+from run_python import blocks, output_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,16 +19,15 @@ PAGE = (TESTS.parent / "docs" / "simulators.md").read_text()
 EXAMPLES = TESTS.parent / "examples"
 
 
-def blocks(language: str, section: str) -> list[str]:
-    part = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
-    return re.findall(rf"^```{language}\n(.*?)^```", part, re.MULTILINE | re.DOTALL)
+def blocks_of(language: str, section: str) -> list[str]:
+    return blocks(language, PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0])
 
 
 def test_pusht_and_aloha_run(tmp_path: Path) -> None:
     """The program runs unchanged."""
     pytest.importorskip("gym_pusht")
     pytest.importorskip("gym_aloha")
-    (tmp_path / "program.py").write_text(*blocks("python", "PushT and ALOHA"))
+    (tmp_path / "program.py").write_text(*blocks_of("python", "PushT and ALOHA"))
     output_of(tmp_path / "program.py", folder=tmp_path, asyncio_debug=False)
 
 
@@ -43,8 +41,8 @@ def test_metaworld_ends_in_a_table_of_success(tmp_path: Path) -> None:
     """With the example's env and the page's command, on fewer seeds, and without the plot."""
     pytest.importorskip("metaworld")
     shutil.copy(EXAMPLES / "metaworld_env.py", tmp_path)
-    (tmp_path / "arm.yaml").write_text(*blocks("yaml", "MetaWorld"))
-    (command,) = blocks("console", "MetaWorld")
+    (tmp_path / "arm.yaml").write_text(*blocks_of("yaml", "MetaWorld"))
+    (command,) = blocks_of("console", "MetaWorld")
     line = command.replace("\\\n", "").strip().replace(" --plot success.png", "")
     words = shlex.split(line.removeprefix("$ rlightning-aio "))
     done = run(*words, "--seeds", "0:2", cwd=tmp_path)
