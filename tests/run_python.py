@@ -1,8 +1,9 @@
-"""Runs a program in a new interpreter, as a reader of the documents does."""
+"""Runs programs in a new interpreter, as a reader of the documents does."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from typing import TYPE_CHECKING
@@ -12,7 +13,12 @@ from patience import HANG
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["output_of"]
+__all__ = ["blocks", "output_of"]
+
+
+def blocks(language: str, page: str) -> list[str]:
+    """Return the blocks of code in this language, in the text of a page."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
 
 def output_of(

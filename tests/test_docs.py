@@ -11,7 +11,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from run_python import output_of
+from run_python import blocks, output_of
 
 from rlightning_aio import EnvGroup, build_env_group
 from rlightning_aio._core.hosts.env_server.settings import ServerSettings
@@ -33,11 +33,6 @@ def test_every_argument_and_setting_has_its_item() -> None:
     assert items("remote.md") == set(ServerSettings.model_fields)
 
 
-def blocks(language: str, page: str) -> list[str]:
-    text = (DOCS / page).read_text()
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-
-
 def run_programs(programs: list[str], folder: Path) -> str:
     files = [folder / f"{number}.py" for number in range(len(programs))]
     for file, program in zip(files, programs, strict=True):
@@ -47,8 +42,9 @@ def run_programs(programs: list[str], folder: Path) -> str:
 
 def test_the_programs_for_rlightning_run(tmp_path: Path) -> None:
     """The script runs by the page's command, and the program that calls `install` by itself."""
-    script, *programs = blocks("python", "rlightning.md")
-    (command,) = blocks("sh", "rlightning.md")
+    page = (DOCS / "rlightning.md").read_text()
+    script, *programs = blocks("python", page)
+    (command,) = blocks("sh", page)
     (tmp_path / "steps.py").write_text(script)
     assert "4 envs have made 200 steps" in output_of(
         *shlex.split(command)[1:], folder=tmp_path, asyncio_debug=False
@@ -59,7 +55,7 @@ def test_the_programs_for_rlightning_run(tmp_path: Path) -> None:
 def test_the_programs_about_the_numbers_of_a_group_run(tmp_path: Path) -> None:
     """Means and percentiles are made, and a timeline is written, with the real libraries."""
     pytest.importorskip("prometheus_client")
-    first, means, _, prometheus, traced = blocks("python", "metrics.md")
+    first, means, _, prometheus, traced = blocks("python", (DOCS / "metrics.md").read_text())
     printed = run_programs([first, means, prometheus, traced], tmp_path)
     assert re.search(r"mean return: [1-9]", printed)
     assert re.search(r"p99 of a step: \[\d\S* \d\S*\]", printed)

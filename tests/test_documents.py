@@ -1,20 +1,27 @@
-"""All documents: links, configurations, parts of the site, and completeness of the examples."""
+"""All documents: links, configurations, parts of the site, and completeness of the examples.
+
+Commands are run by cli/test_documentation.py, programs by test_examples.py.
+"""
 
 from __future__ import annotations
 
 import ast
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from omegaconf import OmegaConf
+from run_python import blocks
 
 import rlightning_aio
-from rlightning_aio import load_config
+from rlightning_aio import EnvConfig, load_config
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
+README = (ROOT / "README.md").read_text()
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
@@ -113,7 +120,7 @@ def test_the_table_of_packages_is_complete() -> None:
 def test_every_configuration_loads(tmp_path: Path) -> None:
     """A block of YAML with `envs` is a configuration; its backends don't have to be installed."""
     text = "\n".join(page.read_text() for page in PAGES)
-    for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+    for block in blocks("yaml", text):
         if "envs:" not in block:
             continue
         file = tmp_path / "file.yaml"
@@ -175,7 +182,7 @@ def examples() -> str:
     """Return all code that is shown: in pages, docstrings, examples and the notebook."""
     shown = [path.read_text() for path in (ROOT / "examples").glob("*.py")]
     for page in PAGES:
-        shown += re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+        shown += blocks("python", page.read_text())
     notebook = json.loads((ROOT / "examples" / "notebook.ipynb").read_text())
     shown += ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
     return "\n".join(shown)
@@ -187,10 +194,14 @@ def test_every_public_name_has_an_example() -> None:
     assert {name for names in public_names().values() for name in names} - words == set()
 
 
+def described_names() -> set[str]:
+    pages = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
+    return set(re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE))
+
+
 def test_every_public_name_is_in_the_reference() -> None:
     """By itself or with its module; names of the top level with those of their own module."""
-    pages = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
-    described = set(re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE))
+    described = described_names()
     names = public_names()
     assert "rlightning_aio.errors" in described
     for module in ("errors", "collecting", "evaluation", "spaces"):
@@ -202,8 +213,7 @@ def test_every_public_name_is_in_the_reference() -> None:
 
 def test_plug_ins_use_only_names_of_the_reference() -> None:
     """By themselves or with their module."""
-    pages = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
-    described = set(re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE))
+    described = described_names()
     described |= {f"rlightning_aio.{name}" for name in public_names()["rlightning_aio"]}
     used: set[str] = set()
     for path in (PACKAGE / "plugins").rglob("*.py"):
@@ -224,11 +234,12 @@ def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
-def test_workflows_run_existing_make_targets() -> None:
+def test_workflows_and_the_readme_run_existing_make_targets() -> None:
     """Each `make` in them has a target."""
-    workflows = list((ROOT / ".github" / "workflows").glob("*.yml"))
-    used = re.findall(r"run: make ([a-z-]+)", "\n".join(file.read_text() for file in workflows))
-    assert set(used) >= {"check", "test", "docs", "test-pythons"}
+    texts = [file.read_text() for file in (ROOT / ".github" / "workflows").glob("*.yml")]
+    texts += blocks("sh", README)
+    used = re.findall(r"^(?:.*run: )?make ([a-z-]+)", "\n".join(texts), re.MULTILINE)
+    assert set(used) >= {"check", "test", "docs", "test-pythons", "run"}
     assert set(used) <= make_targets()
 
 
@@ -238,3 +249,37 @@ def test_every_make_target_is_described() -> None:
     assert {
         target for target in make_targets() - {"help"} if f"`make {target}`" not in text
     } == set()
+
+
+def test_the_page_on_configuration_names_every_field() -> None:
+    """Each field of `EnvConfig` has its item, and no item names another."""
+    page = (DOCS / "configuration.md").read_text()
+    items = re.findall(r"^- (.*?): ", page, re.MULTILINE)
+    named = {
+        name for item in items for name in re.findall(r"`(\w+)`", re.sub(r"\(.*?\)", "", item))
+    }
+    assert named == set(EnvConfig.model_fields)
+
+
+def test_the_readme_is_short() -> None:
+    """A reader reads the whole README before going on."""
+    assert len(README.split()) <= 700
+
+
+# Names that differ on conda-forge, and what an extra of Gymnasium's brings.
+CONDA_NAMES = {"mujoco": "mujoco-python"}
+OF_EXTRAS = {"imageio", "packaging"}
+
+
+def test_the_recipe_asks_for_what_the_project_asks_for() -> None:
+    """The same version, and the same requirements with the same bounds."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == rlightning_aio.__version__
+    assert f">={recipe['context']['python_min']}" == project["requires-python"]
+    wanted = set()
+    for requirement in project["dependencies"]:
+        name, bound = re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", requirement).groups()
+        wanted.add(f"{CONDA_NAMES.get(name, name)} >={bound}")
+    run = {entry for entry in recipe["requirements"]["run"] if not re.match(r"python |__", entry)}
+    assert {entry for entry in run if entry.split()[0] not in OF_EXTRAS} == wanted

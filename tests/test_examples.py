@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from patience import HANG
-from run_python import output_of
+from run_python import blocks, output_of
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -31,10 +31,6 @@ ELSEWHERE = {
     "stable_baselines3": "vector/test_pages.py",
     "tutorial": "examples/test_tutorial.py",
 }
-
-
-def blocks_of_python(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
 
 
 def printed_on(page: Path) -> dict[str, str]:
@@ -64,7 +60,7 @@ def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
     shown: dict[str, str] = {}
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     for page in pages:
-        for number, block in enumerate(blocks_of_python(page)):
+        for number, block in enumerate(blocks("python", page.read_text())):
             if re.search(NEEDS_MORE, block, re.MULTILINE):
                 continue
             program = tmp_path / f"{page.stem}_{number}.py"
@@ -105,7 +101,7 @@ def test_wrong_calls_raise_their_errors(tmp_path: Path) -> None:
 def test_omitted_pages_are_run_by_other_tests() -> None:
     """Each page exists, has a program, and is named by the test that runs it."""
     for page, test in ELSEWHERE.items():
-        assert blocks_of_python(DOCS / f"{page}.md")
+        assert blocks("python", (DOCS / f"{page}.md").read_text())
         assert page in (ROOT / "tests" / test).read_text()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_python import output_of
+from run_python import blocks, output_of
 from timelines import Seen
 
 torch = pytest.importorskip("torch")
@@ -105,9 +105,7 @@ def test_the_program_of_the_training_page_learns(tmp_path: Path) -> None:
     """It is complete, runs as it stands (with fewer updates), and is short."""
     text = (ROOT / "docs" / "training.md").read_text()
     section = text.partition("## A complete asynchronous PPO")[2]
-    (block,) = re.findall(
-        r"^```python\n(.*?)^```", section.partition("\n## ")[0], re.MULTILINE | re.DOTALL
-    )
+    (block,) = blocks("python", section.partition("\n## ")[0])
     assert len(block.splitlines()) <= 75
     program = tmp_path / "program.py"
     program.write_text(

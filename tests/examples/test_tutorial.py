@@ -6,17 +6,16 @@ import re
 import runpy
 from pathlib import Path
 
-from run_python import output_of
+from run_python import blocks, output_of
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_programs_of_the_tutorial_run(tmp_path: Path) -> None:
     """Training is killed and resumed; the policy that results is better than chance."""
-    text = (ROOT / "docs" / "tutorial.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    page = (ROOT / "docs" / "tutorial.md").read_text()
     outputs = []
-    for number, block in enumerate(blocks):
+    for number, block in enumerate(blocks("python", page)):
         named = re.match(r"# (\w+\.py)\n", block)
         program = tmp_path / (named[1] if named else f"program_{number}.py")
         program.write_text(block)
