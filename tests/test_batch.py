@@ -26,7 +26,6 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
 from rlightning_aio.protocol.info import INFO_BYTES, PICKLED, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
-from rlightning_aio.trees import index
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 PENDULUMS, GRIDS = (
@@ -327,93 +326,30 @@ def test_values_of_different_structure_do_not_stack(one: Any, other: Any) -> Non
 # -- flags of rows
 
 
-HEADS = st.sampled_from([((), ()), ((2,), ()), ((3,), ("a", "b", "c")), ((2, 3), ("a", "b"))])
-
-
-@st.composite
-def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
-    """Return a batch of several parts with rows of the same shape, and the expected flags of each
-    row.
-
-    Envs 0 to 4 in any order, the first three of one entry; a part without positions is alone.
-    """
-    inner, agents = draw(HEADS)
-    sub_envs = inner[1:] if agents else inner
-    slots = draw(st.permutations(range(5)))[: draw(st.integers(1, 5))]
-    n = len(slots)
-    names = replace(NAMES, index_offset=np.arange(5) * (sub_envs or (1,))[0])
-
-    def bits(shape: tuple[int, ...]) -> Any:
-        size = int(np.prod(shape))
-        drawn = draw(st.lists(st.booleans(), min_size=size, max_size=size))
-        return np.array(drawn, bool).reshape(shape)
-
-    # A sub-environment resets itself for all of its agents.
-    all_flags = bits((n, *inner, 4))
-    resets = bits((n, *sub_envs))
-    all_flags[..., IS_RESET] = resets[:, None] if agents else resets
-    limits = draw(st.none() | st.just(bits((n,))))
-    if limits is not None:
-        all_flags[limits, ..., TRUNCATED] = True
-    restarted = draw(st.none() | st.just(bits((n,))))
-    part_of = draw(st.lists(st.integers(0, 2), min_size=n, max_size=n))
-    parts: list[ResultColumns] = []
-    for number in sorted(set(part_of)):
-        chosen = [k for k in range(n) if part_of[k] == number]
-        parts.append(
-            columns(
-                [slots[k] for k in chosen],
-                dict.fromkeys(agents, np.zeros(len(chosen))) if agents else np.zeros(len(chosen)),
-                None if len(chosen) == n else chosen,
-                names=names,
-                agents=agents,
-                reward=np.zeros((len(chosen), *inner)),
-                flags=all_flags[chosen],
-                limit_reached=None if limits is None else limits[chosen],
-                restarted=None if restarted is None else restarted[chosen],
-            )
+def test_agents_with_sub_environments_have_their_flags() -> None:
+    """What is of an env is of each of its sub-environments, and ends are of each agent."""
+    names = replace(NAMES, index_offset=np.arange(5) * 3)
+    ends = np.random.default_rng(0).random((3, 2, 3)) < 0.5
+    resets = np.array([[True, False, False], [False, True, True], [False, False, False]])
+    parts = [
+        columns(
+            slots,
+            dict.fromkeys("ab", np.zeros(len(rows))),
+            rows,
+            names=names,
+            agents=("a", "b"),
+            reward=np.zeros((len(rows), 2, 3)),
+            flags=flags((len(rows), 2, 3), terminated=ends[rows], is_reset=resets[rows][:, None]),
+            restarted=np.array(rows) == 2,
         )
-    no = np.zeros(n, bool)
-    count = (sub_envs or (1,))[0]
-
-    def spread(value: Any) -> Any:
-        return np.full(sub_envs, value).tolist()
-
-    rows = [
-        {
-            "is_reset": resets[k].tolist(),
-            "limit_reached": spread((no if limits is None else limits)[k]),
-            "restarted": spread((no if restarted is None else restarted)[k]),
-            "index": (slots[k] * count + np.arange(count)).reshape(sub_envs).tolist(),
-            "done": (all_flags[k, ..., TERMINATED] | all_flags[k, ..., TRUNCATED]).tolist(),
-            "place": k,
-        }
-        for k in range(n)
+        for slots, rows in (([4, 0], [0, 2]), ([3], [1]))
     ]
-    sources = np.empty(n, object), np.arange(n)
-    sources[0][:] = [{"place": np.arange(n)}] * n
-    return results(*parts, sources=sources), rows
-
-
-def by_rows(batch: BatchedData, name: str) -> list[Any]:
-    """Return a column by rows, agents on the first axis."""
-    column = batch.sent.place if name == "place" else getattr(batch, name)
-    if isinstance(column, dict):
-        return np.stack(list(column.values()), axis=1).tolist()
-    return column.tolist()
-
-
-@given(drawn=any_results())
-def test_each_row_has_its_flags(drawn: tuple[BatchedData, list[dict[str, Any]]]) -> None:
-    """In the order of the batch, for any parts, and in the batches of its entries."""
-    batch, rows = drawn
-    for name in rows[0]:
-        assert by_rows(batch, name) == [row[name] for row in rows], name
-    ids = batch.ids()
-    for entry, part in batch.by_entry().items():
-        mine = [row for row, id_ in zip(rows, ids, strict=True) if id_.startswith(entry)]
-        for name in rows[0]:
-            assert by_rows(part, name) == [row[name] for row in mine], name
+    batch = results(*parts)
+    assert batch.index.tolist() == [[12, 13, 14], [9, 10, 11], [0, 1, 2]]
+    assert batch.is_reset.tolist() == resets.tolist()
+    assert batch.restarted.tolist() == [[False] * 3] * 2 + [[True] * 3]
+    assert np.stack([*batch.done.values()], axis=1).tolist() == ends.tolist()
+    assert batch.by_entry()["grid-world"].is_reset.tolist() == resets[:2].tolist()
 
 
 def test_columns_of_flags_belong_to_the_reader() -> None:
@@ -443,26 +379,6 @@ def test_plain_values_have_no_columns_of_a_group(name: str) -> None:
             getattr(batch, name)
 
 
-def test_the_last_result_of_an_episode_has_its_sums() -> None:
-    """Return and length are in the info of that result only, also if the step limit has cut it."""
-    batch = results(
-        columns(
-            [0, 1, 2, 3],
-            np.zeros((4, 1)),
-            flags=flags(
-                (4,), terminated=[True, False, False, False], truncated=[False, True, True, False]
-            ),
-            limit_reached=np.array([False, False, True, False]),
-            episode_return=np.array([4.5, 1.0, 2.0, 3.0]),
-            episode_length=np.array([3, 4, 5, 6]),
-        )
-    )
-    assert batch.done.tolist() == [True, True, True, False]
-    sums = [{"r": 4.5, "l": 3}, {"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
-    assert batch.info("episode", None) == sums
-    assert [value.info.get("episode") for value in batch.values()] == sums
-
-
 # -- sent columns
 
 
@@ -471,23 +387,6 @@ def sent_for(n: int, *requests: Any, of_rows: list[int], rows: list[int]) -> Any
     of_each = np.empty(n, object)
     of_each[:] = [requests[k] for k in of_rows]
     return results(columns(list(range(n)), None), sources=(of_each, np.array(rows))).sent
-
-
-PUSHES = np.array([[1.5, 2.5], [3.5, 4.5]])
-FORMS: list[Any] = [
-    {"push": PUSHES, "jump": np.array([0, 1])},
-    [{"push": PUSHES[0], "jump": 0}, {"jump": 1}],
-    (PUSHES, ["a", "b"]),
-    [6, "six"],
-    ["seven", "eight"],
-    np.array([9, 10]),
-    np.array([True, False]),
-    np.array([0.25, 0.5]),
-    np.array(["nine", "ten"]),
-    np.array([None, {"eleven": 11}]),
-    PUSHES,
-    np.array([[1], [2]]),
-]
 
 
 def plain(value: Any) -> Any:
@@ -499,23 +398,11 @@ def plain(value: Any) -> Any:
     return np.array(value, object).tolist()
 
 
-@given(data=st.data())
-def test_columns_sent_in_several_forms_keep_their_values(data: st.DataObject) -> None:
-    """Numbers stay numbers and texts stay texts, whichever comes first; other rows have None."""
-    chosen = data.draw(st.lists(st.sampled_from(FORMS), min_size=1, max_size=4))
-    requests: list[Any] = [{"action": column} for column in chosen]
-    n = data.draw(st.integers(1, 6))
-    of_rows = data.draw(st.lists(st.integers(0, len(chosen) - 1), min_size=n, max_size=n))
-    rows = data.draw(st.lists(st.sampled_from([0, 1]), min_size=n, max_size=n))
-    found = sent_for(n, *requests, of_rows=of_rows, rows=rows).action
-    expected = [plain(index(chosen[k], row)) for k, row in zip(of_rows, rows, strict=True)]
-    assert [plain(index(found, k)) for k in range(n)] == expected
-
-
 def test_rows_without_a_request_have_none_among_several_forms() -> None:
     """In a list, which holds None for them, and in an array of objects."""
     of_rows, rows = [0, 1, 2], [0, 0, 1]
-    requests = [None, {"action": FORMS[0]}, {"action": FORMS[4]}]
+    pushes = {"push": np.array([[1.5, 2.5], [3.5, 4.5]]), "jump": np.array([0, 1])}
+    requests = [None, {"action": pushes}, {"action": ["seven", "eight"]}]
     found = sent_for(3, *requests, of_rows=of_rows, rows=rows).action
     assert plain(tuple(found)) == (None, {"push": [1.5, 2.5], "jump": 0}, "eight")
     objects = {"action": np.array([{}, []], object)}

@@ -17,7 +17,7 @@ import pytest
 from group import sample_envs
 from gymnasium.vector.utils import batch_space, iterate
 
-from rlightning_aio import BatchedData, PolicyResponse, build_env_group, sync
+from rlightning_aio import BatchedData, PolicyResponse, build_env_group
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -172,20 +172,6 @@ def seeds(env_ids: list[str]) -> dict[str, int]:
     return {env_id: SEED + int(env_id.rpartition("-")[2]) for env_id in env_ids}
 
 
-def run_sync(task: Task, placements: Iterable[str]) -> None:
-    entries = [task.entry(name, PLACEMENTS[name]) for name in placements]
-    with sync.build_env_group(entries) as group:
-        recorder = Recorder(task, group.env_ids)
-        batch, flags = group.reset(seed=seeds(group.env_ids))
-        recorder.check(batch, flags)
-        with group.auto_reset():
-            for _ in range(NUM_STEPS):
-                batch, flags = group.step(recorder.answer(batch))
-                assert flags is not None
-                recorder.check(batch, flags)
-        recorder.assert_complete()
-
-
 async def run_async(task: Task, placements: Iterable[str]) -> None:
     entries = [task.entry(name, PLACEMENTS[name]) for name in placements]
     draw = Random(0)
@@ -208,14 +194,6 @@ async def run_async(task: Task, placements: Iterable[str]) -> None:
 
 def shown(value: Any) -> str:
     return value.name if isinstance(value, Task) else " ".join(value)
-
-
-@pytest.mark.parametrize(
-    ("task", "placements"), [(HOPPER, TOGETHER), (TREE, TOGETHER), *EACH], ids=shown
-)
-def test_trajectories_stepped_together(task: Task, placements: tuple[str, ...]) -> None:
-    """In a synchronous group."""
-    run_sync(task, placements)
 
 
 @pytest.mark.parametrize(("task", "placements"), EACH, ids=shown)
