@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import time
 from collections import Counter
 from concurrent.futures import Executor, Future
@@ -14,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from kit.scripted import DIE, DIE_LATER, GO, HANG, RAISE, Awaitable, Awaited, Scripted
+from test_video import STEP, brightness
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -364,25 +363,13 @@ def test_a_subject_is_compared_as_it_is_read(tmp_path: Path) -> None:
 # -- films --------------------------------------------------------------------------------
 
 
-def films(folder: Path) -> list[Path]:
-    return sorted(folder.iterdir())
-
-
-def frames(path: Path) -> list[int]:
-    """Return the brightness of each frame."""
-    program = imageio_ffmpeg.get_ffmpeg_exe()
-    form = ("-vf", "scale=1:1:flags=area", "-pix_fmt", "gray", "-f", "rawvideo", "-")
-    done = subprocess.run([program, "-i", str(path), *form], capture_output=True, check=True)
-    return [*done.stdout]
-
-
 class Brighter(Tasks):
     """Its frames say how many steps were made, in a size that most players don't support."""
 
     metadata: ClassVar[Any] = {"render_fps": 5}
 
     def render(self) -> Any:
-        return np.full((15, 17, 3), 20 * self.steps, np.uint8)
+        return np.full((15, 17, 3), STEP * self.steps, np.uint8)
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
@@ -394,8 +381,7 @@ def test_the_first_episode_of_each_task_is_filmed(tmp_path: Path, placement: str
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["env-1-seed-2.mp4", "env-2-seed-2.mp4"]
     for name in names:
-        seen = frames(tmp_path / name)
-        assert [round(value / 20) for value in seen] == [0, 1, 2, 3]
+        assert brightness(tmp_path / name) == [0, 1, 2, 3]
 
 
 async def test_films_of_a_number_of_episodes_name_their_env(tmp_path: Path) -> None:
@@ -404,9 +390,9 @@ async def test_films_of_a_number_of_episodes_name_their_env(tmp_path: Path) -> N
     async with rl.build_env_group({**entry, "num_workers": 2}) as group:
         with group.auto_reset(100):
             await evaluate(group, nothing, 2, seed=4, video=tmp_path)
-    (path,) = films(tmp_path)
+    (path,) = tmp_path.iterdir()  # noqa: ASYNC240
     assert path.name.endswith("seed-4-env-0-episode-0.mp4")
-    assert len(frames(path)) == 6
+    assert len(brightness(path)) == 6
 
 
 class Stumbling(Brighter):
@@ -431,7 +417,7 @@ def test_a_lost_episode_leaves_no_film_and_is_filmed_again(tmp_path: Path, fault
     found = evaluated(group, [EpisodeSpec("1", 3)], video=films)
     assert found.failures.total() == 1
     (path,) = films.iterdir()
-    assert [round(value / 20) for value in frames(path)] == [0, 1, 2, 3, 4]
+    assert brightness(path) == [0, 1, 2, 3, 4]
 
 
 def test_an_evaluation_that_ends_early_leaves_no_part_of_a_film(tmp_path: Path) -> None:
