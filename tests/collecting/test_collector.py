@@ -71,14 +71,6 @@ def test_each_kind_of_env_has_its_own_policy_and_rollout() -> None:
                     assert rollouts[name].action.shape[:2] == shape
 
 
-def test_an_entry_without_a_policy_raises_each_time() -> None:
-    with poles(1) as group, group.auto_reset():
-        collector = Collector(group, {"cart": zeros}, num_transitions=4)
-        for _ in range(2):
-            with pytest.raises(ValueError, match=r"no policy was given for .* 'pole'.* cart"):
-                collector.collect()
-
-
 def test_envs_of_several_kinds_need_several_policies() -> None:
     entries = [{**POLE}, {**POLE, "name": "car", "task": "MountainCar-v0"}]
     with sync.build_env_group(entries, mixed_actions=True) as group, group.auto_reset():
