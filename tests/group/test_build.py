@@ -118,30 +118,3 @@ def test_init_logs_what_it_has_started(caplog: pytest.LogCaptureFixture) -> None
     (text,) = [record.getMessage() for record in caplog.records]
     assert text.startswith("started within ")
     assert text.endswith(envs)
-
-
-class Asked:
-    """A callable that counts how often it is asked whether its envs move something real."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self) -> gym.Env[Any, Any]:
-        """Make an env."""
-        return gym.make("CartPole-v1")
-
-    @property
-    def hardware(self) -> bool:
-        """They don't."""
-        self.count += 1
-        return False
-
-
-def test_callables_are_asked_as_often_however_many_workers_there_are() -> None:
-    """Whether their envs move something real: not once more for each worker."""
-    counts: list[int] = []
-    for number in (2, 40):
-        makers = [Asked() for _ in range(number)]
-        sync.build_env_group(makers, envs_per_process=1).close()
-        counts.append(max(maker.count for maker in makers))
-    assert counts[0] == counts[1]

@@ -108,20 +108,14 @@ LIMITS: dict[str, Any] = {"step_timeout": 5}
     [
         # Turns of a worker for each env on two quiet cores; a wake-up takes 25 µs of one of them.
         (1, 2, 100, {}, "placement: inline"),
-        (1, 20, 100, {}, "placement: inline"),
         (1, 2, 100, LIMITS, None),
         (1, 100, 90, {}, None),
-        (1, 500, 100, {}, None),
         (4, 2, 160, {}, "placement: inline"),
         (4, 20, 180, {}, "envs_per_process: 2"),
-        (4, 100, 260, {}, None),
         (16, 2, 400, {}, "placement: inline"),
         (16, 20, 500, {}, "envs_per_process: 8"),
-        (16, 20, 500, LIMITS, "envs_per_process: 8"),
         (16, 20, 500, {"envs_per_process": 1}, None),
-        (16, 100, 1000, {}, None),
         (32, 2, 700, {}, "envs_per_process: 16"),
-        (32, 20, 1000, {}, "envs_per_process: 16"),
         (32, 100, 2200, {}, None),
         (32, 2000, 33000, {}, None),
     ],
@@ -137,13 +131,6 @@ def test_the_fastest_setting_is_advised_where_it_gains_half(
     assert found is None or found[1] >= 1.5
 
 
-def test_a_slow_trainer_makes_no_setting_worth_it() -> None:
-    """Its time is part of a turn, whatever the setting."""
-    numbers = {"step": 2 * US, "exchange": 100 * US, "times": 1000}
-    assert said(workers(1, 1), **numbers) is not None
-    assert said(workers(1, 1), **numbers, trainer=MS) is None
-
-
 def test_the_first_ready_are_answered_more_often_in_this_process() -> None:
     """Where four of eight are enough, a policy of 100 µs is asked twice for a turn of all."""
     records = workers(8, 1)
@@ -152,16 +139,6 @@ def test_the_first_ready_are_answered_more_often_in_this_process() -> None:
     half = advice(records, {**numbers, "batches": 2000}, 8)
     assert all_of_them is not None
     assert half is None
-
-
-def test_few_results_are_no_reason() -> None:
-    records = workers(1, 1)
-    assert said(records, step=2 * US, exchange=100 * US, times=250) is not None
-    assert said(records, step=2 * US, exchange=100 * US, times=249) is None
-    records = workers(1, 2)
-    numbers = spent(records, 10 * MS, MS)
-    assert advice(records, numbers, 2) is not None
-    assert advice(records, {**numbers, "results": 15}, 2) is None
 
 
 def test_one_look_is_no_reason(caplog: pytest.LogCaptureFixture) -> None:

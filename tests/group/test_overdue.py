@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 import threading
 import time
@@ -137,43 +136,3 @@ def test_nothing_is_said_of_envs_with_a_limit_or_that_reply(
         for _ in range(10):
             batch, _ = group.step(batch.respond([0, 0, 0]))
     assert said(caplog) == []
-
-
-def test_a_loop_keeps_no_timer_of_a_closed_group(gate: Any) -> None:
-    """Nor of one that has nothing left to say."""
-
-    async def main() -> None:
-        async with rl.build_env_group(entry(gate)) as group:
-            batch, _ = await group.reset()
-            await group.step(batch.respond([0, 0, 0]))
-            driver = group._driver
-        assert driver._nudge is None
-
-    asyncio.run(main())
-
-
-@pytest.mark.parametrize("limit", [None, 100 * HANG])
-def test_calls_that_wait_share_one_timer(
-    gate: Any, monkeypatch: pytest.MonkeyPatch, limit: float | None
-) -> None:
-    """With a time limit and without: a step makes no timer of its own."""
-    timers: list[float] = []
-
-    async def main() -> None:
-        async with rl.build_env_group(entry(gate, step_timeout=limit)) as group:
-            batch, _ = await group.reset()
-            await group.step(batch.respond([0, 0, 0]))
-            loop = asyncio.get_running_loop()
-            call_later = loop.call_later
-
-            def counted(seconds: float, *arguments: Any, **others: Any) -> asyncio.TimerHandle:
-                timers.append(seconds)
-                return call_later(seconds, *arguments, **others)
-
-            monkeypatch.setattr(loop, "call_later", counted)
-            for _ in range(20):
-                batch, _ = await group.step(batch.respond([0, 0, 0]))
-            monkeypatch.undo()
-
-    asyncio.run(main())
-    assert len(timers) <= 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from rlightning_aio import (
     ENVS,
     BaseEnv,
     BatchedData,
+    EnvConfig,
     EnvRaised,
     EnvRet,
     MultiAgentEnvRet,
@@ -230,31 +232,18 @@ def test_envs_of_a_cpu_bound_class_share_workers() -> None:
 
 def test_memory_is_cleared_without_importing_anything(monkeypatch: pytest.MonkeyPatch) -> None:
     """Torch's cache is emptied if torch is imported and has a device."""
-    emptied: list[str] = []
-
-    class Cuda:
-        available = False
-
-        def is_available(self) -> bool:
-            return self.available
-
-        def empty_cache(self) -> None:
-            emptied.append("cuda")
-
-    class Torch:
-        cuda = Cuda()
-
-    config = sync.build_env_group(entry("tacit"))._core.supervisor.hosts[0]._order.config
-    env = Tacit(config)
+    available, emptied = [False], list[bool]()
+    cuda = SimpleNamespace(
+        is_available=lambda: available[0], empty_cache=lambda: emptied.append(True)
+    )
+    env = Tacit(EnvConfig.model_validate(entry("tacit")))
     monkeypatch.delitem(sys.modules, "torch", raising=False)
     env.clear_memory()
     assert "torch" not in sys.modules
-    monkeypatch.setitem(sys.modules, "torch", Torch())  # type: ignore[arg-type]
-    env.clear_memory()
-    assert not emptied
-    Torch.cuda.available = True
-    env.clear_memory()
-    assert emptied == ["cuda"]
+    monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(cuda=cuda))  # type: ignore[arg-type]
+    for available[0] in (False, True):
+        env.clear_memory()
+    assert emptied == [True]
 
 
 def test_only_a_function_that_is_given_to_an_env_server_is_warned_of() -> None:

@@ -80,19 +80,6 @@ def test_a_result_that_nobody_has_collected_is_shown(group: Any, tmp_path: Path)
     group.collect_async()
 
 
-def test_nothing_is_left_behind(group: Any, tmp_path: Path) -> None:
-    """After a trace, nothing observes the core, and spans do nothing."""
-    core = group._core
-    trace = group.trace(tmp_path / "run.json")
-    trace.start()
-    assert core.observed.observer is trace
-    trace.stop()
-    trace.stop()
-    assert core.observed.observer is None
-    assert group.span("policy") is group.span("learner")
-    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
-
-
 def test_an_interrupted_run_leaves_a_whole_file(group: Any, tmp_path: Path) -> None:
     """With all events until the interrupt; another trace may follow."""
     for _ in range(2):
