@@ -257,20 +257,6 @@ def test_a_policy_must_give_the_same_columns_each_time() -> None:
 # -- the collector itself
 
 
-def test_a_rollouts_memory_is_valid_until_the_second_collect_after_it() -> None:
-    with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=6, min_results=2, seed=0)
-        first = collector.collect()
-        kept = first.observation.copy()
-        for name in ("observation", "action", "reward", "index", "done"):
-            assert first[name].flags.c_contiguous
-            assert first[name].flags.writeable
-        second = collector.collect()
-        assert not np.shares_memory(first.observation, second.observation)
-        np.testing.assert_array_equal(first.observation, kept)
-        assert np.shares_memory(collector.collect().observation, first.observation)
-
-
 def test_lag_is_counted_in_versions() -> None:
     with poles(2) as group, group.auto_reset():
         collector = Collector(group, zeros, num_transitions=3, min_results=2, seed=0)
