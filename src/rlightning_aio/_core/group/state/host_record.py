@@ -163,7 +163,7 @@ class HostRecord:
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
     dying: bool = False
-    die_by: float | None = None
+    die_by: float = 0.0
     halves_left: int = 0
     is_hung: bool = False
     abort_by: dict[int, float] = field(default_factory=dict[int, float])

@@ -77,7 +77,7 @@ class HangDetector:
 
     def expiries(self) -> list[float | None]:
         """Return the times, besides `due`, when `check` must be called."""
-        dying: list[float | None] = [r.die_by or self._now for r in self._records if r.dying]
+        dying: list[float | None] = [record.die_by for record in self._records if record.dying]
         return dying + [by for r in self._records for by in r.abort_by.values()]
 
     def check(self, now: float) -> None:
@@ -112,7 +112,7 @@ class HangDetector:
         record.kill(dump=dump)
         if record.killable is not None:
             record.dying = self.any_ending = True
-            record.halves_left = 2
+            record.die_by, record.halves_left = 0.0, 2  # Its time begins with the next look.
 
     def _in_flight(self, record: HostRecord) -> int:
         return self._requests.in_flight[record.host.host_id]
@@ -164,14 +164,14 @@ class HangDetector:
         the report of the exit, may have waited for it to make room, and arrives in the other.
         """
         for record in self._records:
-            if not record.dying or self._now < (record.die_by or 0.0) or self.read_news(record):
+            if not record.dying or self._now < record.die_by or self.read_news(record):
                 continue
             if record.halves_left:
                 record.die_by = self._tables.clock() + times.OBEY / 2
                 record.halves_left -= 1
             else:
                 assert record.killable is not None
-                record.die_by, record.halves_left = None, 2
+                record.die_by, record.halves_left = 0.0, 2
                 record.killable.destroy()
 
     def read_news(self, record: HostRecord) -> bool:

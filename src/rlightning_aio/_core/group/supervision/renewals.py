@@ -104,7 +104,7 @@ class Renewals:
         record.stage, record.start_by, record.restart_at = Stage.CLOSED, None, None
         record.deaths, record.peer.is_next = {}, False
         # It may have ended before it was killed, and nothing of that concerns the next one here.
-        record.dying, record.die_by, record.is_hung = False, None, False
+        record.dying, record.is_hung = False, False
         record.abort_by, record.aborted_slot = {}, None
         self._note_change()
 

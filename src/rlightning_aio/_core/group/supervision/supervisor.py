@@ -388,7 +388,7 @@ class Supervisor:
         is started here.
         """
         record, death = self.records[exited.host_id], exited.death
-        record.dying, record.die_by, record.abort_by = False, None, {}
+        record.dying, record.abort_by = False, {}
         if not self._lifetime.open:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
