@@ -250,6 +250,19 @@ async def test_an_iterator_that_is_left_open_logs_no_error(
     assert not [text for text in caplog.messages if "raised" in text or "retrieved" in text]
 
 
+async def test_deaths_that_are_raised_are_failures_of_their_attempts() -> None:
+    """The worker is replaced for the next attempt."""
+
+    async def agent(episode: AttemptEpisode) -> None:
+        await episode.step("die" if episode.spec.seed == 1 else "finish")
+
+    async with rooms(PLACES["workers"], num_workers=1, on_worker_death="raise") as group:
+        found = await played(group, tasks(3), agent, 1, Rules(retries=0))
+    kinds = {attempts[0].spec.seed: attempts[0].outcome.kind for attempts in found}
+    assert kinds[1] == "env_died"
+    assert "env_died" not in (kinds[0], kinds[2])
+
+
 async def test_tasks_of_other_entries_are_played_while_some_wait_for_a_client() -> None:
     """However many wait; all are played when it comes."""
 

@@ -160,6 +160,35 @@ async def test_all_agents_learn_that_the_group_is_closed() -> None:
     await closing
 
 
+async def test_agents_and_batches_and_calls_take_turns() -> None:
+    """Whoever waits for the hosts, each gets the results of its own envs."""
+    async with rl.build_env_group(Counter, num_workers=6, envs_per_process=2) as group:
+        playing = [await group.episode(env_id).__aenter__() for env_id in group.env_ids[:2]]
+        batch, _ = await group.reset(env_ids=group.env_ids[2:4])
+
+        async def agent(one: Any) -> int:
+            for _ in range(30):
+                found = await one.step(GO)
+            return found.info["count"]
+
+        async def called(env_id: str) -> None:
+            await group[env_id].set_attr("mark", env_id)
+            for _ in range(20):
+                assert await group[env_id].get_attr("mark") == env_id
+
+        async def collected() -> int:
+            found = batch
+            for _ in range(30):
+                group.step_async(found.respond(action=np.zeros(2, np.int64)))
+                found, _ = await group.collect_async(wait_all=True)
+                assert found.ids() == group.env_ids[2:4]
+            return int(found.observation.sum())
+
+        calls = map(called, group.env_ids[4:])
+        counts = await asyncio.gather(*map(agent, playing), collected(), *calls)
+        assert counts == [30, 30, 60, None, None]
+
+
 def pause(monkeypatch: pytest.MonkeyPatch, *, share: float, longest: float, many: int) -> None:
     """Have results wait for others, as hundreds of long steps do."""
     for name, value in (("_SHARE", share), ("_LONGEST_PAUSE", longest), ("_MANY", many)):
