@@ -77,9 +77,6 @@ class Core:
 
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
         """Start the hosts."""
-        for record in self.supervisor.records:
-            slots: list[int] = self.tables.slots_of(record).tolist()
-            self.results.begin_schemas(record.host.host_id, slots)
         with self.observed.call("init", now):
             metas = yield from self.supervisor.start(now)
         self.steps.begin()

@@ -63,6 +63,7 @@ class Intake:
         self._envs = tables.envs
         self._requests = tables.requests
         self._record_of = tables.record_of
+        self._slots_of = tables.slots_of
         self._layout = tables.layout
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
@@ -79,7 +80,8 @@ class Intake:
             NewSchema: self._on_new_schema,
             Taken: self._on_taken,
             Died: self._on_died,
-            **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
+            Built: self._on_built,
+            **dict.fromkeys((NotBuilt, Attached, Closed), supervisor.handle),
         }
 
     def apply_completions(self) -> None:
@@ -88,6 +90,12 @@ class Intake:
         while completions:
             completion = completions.popleft()
             handlers[type(completion)](completion)
+
+    def _on_built(self, completion: Built) -> None:
+        """Pass it on: from now on a worker announces its own ways of holding infos."""
+        slots: list[int] = self._slots_of(self._supervisor.records[completion.host_id]).tolist()
+        self._results.begin_schemas(completion.host_id, slots)
+        self._supervisor.handle(completion)
 
     def _on_reported(self, completion: Reported) -> None:
         reports = [completion]
@@ -275,7 +283,7 @@ class Intake:
         requests.in_flight[loss.host_id] = 0  # It answers none of them.
         unwanted = requests.unwanted & {*loss.owed.tolist()}
         owed = requests.drop_unwanted(loss.owed)
-        self._keep_ready(loss.host_id, loss.slots)
+        self._keep_ready(loss.slots)
         record = self._supervisor.records[loss.host_id]
         if record.place is None or record.was_shown:  # Else it has no episode yet.
             # The episodes of aborted requests were lost before.
@@ -290,11 +298,10 @@ class Intake:
         host_id = self._supervisor.replace(loss.host_id)
         self._send_again(host_id, owed[again])
 
-    def _keep_ready(self, host_id: int, slots: Sequence[int]) -> None:
+    def _keep_ready(self, slots: Sequence[int]) -> None:
         """Decode infos of results that are ready, as a replacement announces other schemas."""
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
             self._results.detach_info(slot)
-        self._results.begin_schemas(host_id, slots)
 
     def _send_again(self, host_id: int, slots: NDArray[np.intp]) -> None:
         """Send the steps and resets that a dead worker owed, as resets."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections import defaultdict
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
@@ -50,7 +51,7 @@ class Results:
         self._out_of_band: dict[int, Any] = {}
         # Of each slot's host; a host's slots share one dict.
         self._schemas: list[dict[int, InfoSchema]] = [{} for _ in range(len(envs))]
-        self._schemas_of: dict[int, dict[int, InfoSchema]] = {}
+        self._schemas_of = defaultdict[int, dict[int, "InfoSchema"]](dict)
         # Bytes of a row's info that any schema uses; 0 if there is none.
         self._info_width = 0
         self._restarted = np.zeros(len(envs), np.bool_)
@@ -101,7 +102,7 @@ class Results:
             self._conditions.note(BESIDE_ROWS, True)
 
     def begin_schemas(self, host_id: int, slots: Sequence[int]) -> None:
-        """A host, of `slots`, announces its ways of holding infos (again, after a restart)."""
+        """A new worker of a host, of `slots`, announces its ways of holding infos."""
         self._schemas_of[host_id] = {}
         self.use_schemas(host_id, slots)
 
