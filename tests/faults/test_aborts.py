@@ -6,12 +6,14 @@ import asyncio
 import logging
 import os
 import signal
-from typing import TYPE_CHECKING, TypeAlias
+import time
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
 from kit.processes import kill, pid_of
+from kit.scripted import Counts
 from kit.tokens import Tokens, entry, marked, two_workers
 
 import rlightning_aio as rl
@@ -126,3 +128,26 @@ async def test_a_wait_for_an_aborted_step_ends_though_nothing_else_happens() -> 
         assert aborted.value.results.ids() == ids[1:]
         assert np.asarray(aborted.value.results.restarted).tolist() == [True, False, False]
         await asyncio.wait({aborting})
+
+
+class Rests(Counts):
+    def does(self, action: Any) -> None:
+        self.rest(0.05 * action)
+
+    def rest(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+
+async def test_a_call_that_was_cancelled_is_not_ended_for_a_step_that_was_aborted() -> None:
+    """Its env was free again by then, and the worker is not killed."""
+    async with rl.build_env_group(rl.EnvConfig(task=Rests, num_workers=2)) as group:
+        batch, _ = await group.reset()
+        aborted = group.env_ids[0]
+        group.step_async(batch.respond([1, 1]))
+        await group.abort([aborted])
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(group[aborted].call("rest", 0.5), 0.01)
+        batch, _ = await group.collect_async()
+        while group.get_workers()[0]["owed"]:
+            batch, _ = await group.step(batch.respond([1]))
+        assert group.get_workers()[0]["restarts"] == 0

@@ -130,7 +130,7 @@ class HostRecord:
         dying: it was killed, and its exit was not reported yet; die_by: the end of the present half
             of its time for that; halves_left: those that have not begun.
         is_hung: its worker hung and is being killed.
-        abort_by: by slot, when its worker is killed unless an aborted request has ended before;
+        abort_by: by entry, when its worker is killed unless an aborted request has ended before;
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.

@@ -64,14 +64,13 @@ class HangDetector:
         no_longer_held: list[tuple[int, int]] = []
         found: list[int] = sorted({*hosts.tolist()})
         for host_id in found:
-            record, is_own = self._records[host_id], hosts == host_id
-            own = entries[is_own]
+            record, own = self._records[host_id], entries[hosts == host_id]
             if record.is_down:
                 no_longer_held += [(host_id, entry) for entry in record.drop_held(own)]
                 continue
             record.host.abort(own)
             if record.killable is not None:
-                record.abort_by |= dict.fromkeys(slots[is_own].tolist(), now + times.ABORT)
+                record.abort_by |= dict.fromkeys(own.tolist(), now + times.ABORT)
                 self.any_ending = True
         return no_longer_held
 
@@ -90,21 +89,21 @@ class HangDetector:
                     self.due = min(self.due, self._check_hung(record))
         if self.any_ending:
             for record in self._records:
-                if record.abort_by:
+                if record.abort_by and not record.dying:
                     self._check_aborted(record)
             self._check_dying()
             self.any_ending = any(r.dying or r.abort_by for r in self._records)
 
     def _check_aborted(self, record: HostRecord) -> None:
         """Kill a worker whose aborted requests go on."""
-        outstanding = set[int]() if record.dying else self._requests.unwanted
-        record.abort_by = {k: by for k, by in record.abort_by.items() if k in outstanding}
-        slot = min(record.abort_by, key=record.abort_by.__getitem__, default=None)
-        if slot is not None and self._now >= record.abort_by[slot] and not self.read_news(record):
-            self._kill_aborted(record, slot)
+        goes_on = self._requests.is_current
+        record.abort_by = {entry: by for entry, by in record.abort_by.items() if goes_on(entry)}
+        entry = min(record.abort_by, key=record.abort_by.__getitem__, default=0)
+        if entry and self._now >= record.abort_by[entry] and not self.read_news(record):
+            self._kill_aborted(record, entry)
 
-    def _kill_aborted(self, record: HostRecord, slot: int) -> None:
-        record.abort_by, record.aborted_slot = {}, slot
+    def _kill_aborted(self, record: HostRecord, entry: int) -> None:
+        record.abort_by, record.aborted_slot = {}, slot_of(entry)
         self.kill(record, dump=False)
 
     def kill(self, record: HostRecord, *, dump: bool) -> None:
@@ -126,8 +125,8 @@ class HangDetector:
         expiry = self._expiry(record, current)
         if self._now < expiry or self.read_news(record):
             return max(expiry, self._now)
-        if entry and slot_of(entry) in record.abort_by:  # It counts as aborted.
-            self._kill_aborted(record, slot_of(entry))
+        if entry in record.abort_by:  # It counts as aborted.
+            self._kill_aborted(record, entry)
             return math.inf
         record.is_hung = True
         busy = self._requests.owed(self._tables.slots_of(record))
