@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import threading
 import time
@@ -23,9 +24,13 @@ class Stuck(Counts):
         self._gate = gate
 
     def step(self, action: Any) -> Any:
-        while action == 1 and not self._gate.exists():
-            threading.Event().wait(0.05)
+        if action == 1:
+            self.wait()
         return super().step(0)
+
+    def wait(self) -> None:
+        while not self._gate.exists():
+            threading.Event().wait(0.05)
 
 
 @pytest.fixture
@@ -118,6 +123,25 @@ async def test_an_asynchronous_call_that_waits_says_for_whom(
         gate.touch()
         await group.collect_async(wait_all=True)
     check(caplog)
+
+
+def test_a_method_is_named_and_a_place_without_a_client_is_not(
+    gate: Any, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit of steps ends no method, and one would not bring a client."""
+    arm = {"name": "arm", "backend": "env_server", "env_kwargs": {"connect_timeout": math.inf}}
+    with sync.build_env_group([entry(gate, step_timeout=HANG), arm]) as group:
+        group.reset_async()
+        group.collect_async(min_results=3)
+        watch(group, monkeypatch)
+        with pytest.raises(TimeoutError):
+            group.collect_async(deadline=1)
+        thread = opened_by_warning(gate, caplog)
+        group.call("wait", env_ids=["env-1"])
+        thread.join()
+    (record,) = said(caplog)
+    assert record.getMessage().startswith("env 'env-1' (entry 'env'")
+    assert "nothing ends what it does but abort()" in record.getMessage()
 
 
 def test_nothing_is_said_of_envs_with_a_limit_or_that_reply(

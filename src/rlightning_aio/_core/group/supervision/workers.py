@@ -21,12 +21,11 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio.config import EnvConfig
 
 OWED_SECONDS = 60.0
 
 _log = logging.getLogger("rlightning_aio")
-_RESETS: Final = (Operation.RESET, Operation.RESTORE)
+_SETTINGS: Final = {int(Operation.STEP): "step_timeout", int(Operation.RESET): "reset_timeout"}
 _MOST_LISTED: Final = 8
 _STATES: Final = {
     Stage.NEW: "new",
@@ -118,21 +117,21 @@ class Overdue:
         due = now + OWED_SECONDS
         owed: list[int] = requests.owed(np.arange(len(envs))).tolist()
         for slot in owed:
-            config: EnvConfig = envs.configs[slot]
-            is_reset = requests.numbering.op(slot) in _RESETS
-            setting = "reset_timeout" if is_reset else "step_timeout"
-            seconds = now - requests.sent_ns.item(slot) / 1e9
-            if getattr(config, setting) is not None:
+            record, op = self._tables.record_of(slot), requests.numbering.op(slot)
+            if record.is_down or op in record.limits:  # Something else ends the wait.
                 continue
+            seconds = now - requests.sent_ns.item(slot) / 1e9
             if seconds < OWED_SECONDS:
                 due = min(due, now - seconds + OWED_SECONDS)
                 continue
             _log.warning(
-                "%s has owed a result for %.0f s, and nothing ends what it does: set %s of its "
-                "entry, in seconds, to have it replaced; group.get_workers() tells who owes what",
+                "%s has owed a result for %.0f s, and nothing ends what it does%s; "
+                "group.get_workers() tells who owes what",
                 envs.describe(slot),
                 seconds,
-                setting,
+                f": set {_SETTINGS[op]} of its entry, in seconds, to have it replaced"
+                if op in _SETTINGS
+                else " but abort(), as no time limit holds for it",
             )
             due = math.inf
             break
