@@ -14,11 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+import zmq
 from kit.counting import ClientThread, look, served
+from kit.scripted import Counts
 from patience import HANG
 from remote.proxy import Proxy
+from remote.test_hostile_hellos import hello
 
 from rlightning_aio import BatchedData, EnvAway, PolicyResponse, ResetNeeded, sync
+from rlightning_aio._core.hosts.process.host import ProcessHost
 from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
@@ -167,6 +171,31 @@ def mixed(**env_kwargs: Any) -> Any:
         "num_workers": 4,
     }
     return sync.build_env_group([local, served(**env_kwargs)], mixed_actions=True)
+
+
+def test_a_client_that_leaves_while_workers_start_fails_no_start(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is not welcomed before the group is open, when a loss is one of a client."""
+    attach = ProcessHost.attach
+
+    def visit() -> None:
+        with zmq.Context() as context, context.socket(zmq.DEALER) as client:
+            client.connect(group._core.supervisor.places.servers[0].address())
+            client.send_multipart(hello())
+            client.recv_multipart()
+
+    def stop_while_somebody_visits(host: Any, order: Any) -> None:
+        os.kill(host.pid, signal.SIGSTOP)
+        threading.Timer(1.0, os.kill, (host.pid, signal.SIGCONT)).start()
+        visitor.start()
+        attach(host, order)
+
+    visitor = threading.Thread(target=visit)
+    monkeypatch.setattr(ProcessHost, "attach", stop_while_somebody_visits)
+    group = sync.build_env_group([{"task": Counts}, served()])
+    with group:
+        wait_for(group, lambda: not visitor.is_alive())
 
 
 def test_an_empty_place_delays_nobody() -> None:

@@ -35,7 +35,7 @@ class Stage(Enum):
     NEW = auto()
     BUILDING = auto()
     BUILT = auto()
-    ATTACHING = auto()
+    """Its envs are to get their rows."""
     UP = auto()
     DOWN = auto()
     """Dead, and to be restarted: at a given time, or for the next request."""

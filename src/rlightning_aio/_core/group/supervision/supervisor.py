@@ -150,15 +150,14 @@ class Supervisor:
             for record in first:
                 if record.place is not None:
                     self.places.leave(record)
-                    record.host.attach(
-                        AttachOrder((), (), record.close_seconds)
-                    )  # From now on somebody may dial in.
                     continue
                 assert record.order is not None
-                record.stage = Stage.ATTACHING
                 record.host.attach(record.order)
                 record.give_time(self.clock())
             yield from self._until(Stage.UP)
+            for record in first:
+                if record.place is not None:  # From now on somebody may dial in, and leave.
+                    record.host.attach(AttachOrder((), (), record.close_seconds))
         except BaseException:
             yield from self.shutdown.close(self._now)
             # Its traceback refers to the group, which would then never be garbage-collected.
