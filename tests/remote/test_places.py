@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -21,7 +23,14 @@ from patience import HANG
 from remote.proxy import Proxy
 from remote.test_hostile_hellos import hello
 
-from rlightning_aio import BatchedData, EnvAway, PolicyResponse, ResetNeeded, sync
+from rlightning_aio import (
+    BatchedData,
+    EnvAway,
+    PolicyResponse,
+    ResetNeeded,
+    build_env_group,
+    sync,
+)
 from rlightning_aio._core.hosts.process.host import ProcessHost
 from rlightning_aio.errors import BadAction
 
@@ -213,9 +222,9 @@ def test_an_empty_place_delays_nobody() -> None:
             assert sorted(done.ids()) == sorted(local)
             batch = done
         assert group.pending == ["robots-0/0"]
+        with pytest.raises(TimeoutError):
+            group.collect_async(deadline=0.1)
         time.sleep(1.0)  # A learner's pause costs nothing.
-        group.step_async(batch.respond(action=np.zeros((4, 1), np.float32)))
-        done, _ = group.collect_async(min_results=4)
         began = time.monotonic()
         with pytest.raises(EnvAway):
             group.collect_async(wait_all=True)
@@ -224,6 +233,27 @@ def test_an_empty_place_delays_nobody() -> None:
         step = PolicyResponse("robots-0/0", action=np.zeros(2, np.float32))
         with pytest.raises(ResetNeeded):
             group.step_async(BatchedData([step.env_id], [step]))
+
+
+async def test_each_place_has_the_time_of_its_own_call_and_entry() -> None:
+    servers = [served(clients=2, connect_timeout=0.5), served(connect_timeout=math.inf)]
+    servers[1]["name"] = "spares"
+    async with build_env_group(servers) as group:
+        group.reset_async(env_ids=["robots-0/0", "spares-0/0"])
+        with pytest.raises(EnvAway, match=r"for robots-0/0 within 0.5 s"):
+            await group.collect_async(wait_all=True)
+        assert group.pending == ["spares-0/0"]
+
+        async def reset(env_id: str) -> float:
+            began = time.monotonic()
+            with pytest.raises(EnvAway, match=f"for {env_id} within 0.5 s"):
+                await group[env_id].reset()
+            return time.monotonic() - began
+
+        first = asyncio.ensure_future(reset("robots-0/0"))
+        await asyncio.sleep(0.3)
+        assert await reset("robots-0/1") >= 0.5
+        await first
 
 
 @pytest.mark.parametrize("operation", ["step", "reset"])

@@ -161,7 +161,7 @@ class Core:
         self.steps.check_collectable()
         collector, unwanted = self.requests.collector, self.requests.unwanted
         end = None if deadline is None else now + deadline
-        self.waiting.collecting = True
+        self.waiting.collecting = now
         try:
             now = yield from self.waiting.until(
                 now, lambda: collector.num_awaited + len(unwanted), end
@@ -169,7 +169,7 @@ class Core:
             if deadline is not None:
                 yield from self._aborts.end(self.envs.all, now)
         finally:
-            self.waiting.collecting = False
+            self.waiting.collecting = 0.0
         results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
             slots = collector.pop_ready(collector.num_ready)

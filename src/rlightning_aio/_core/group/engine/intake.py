@@ -238,7 +238,8 @@ class Intake:
     def end_held(self, records: Sequence[HostRecord]) -> None:
         """End requests that have waited for clients for too long, with one error for each call."""
         slots = self._supervisor.places.drop(records)
-        self._fail(slots, lambda _: self._supervisor.places.away(records))
+        away = self._supervisor.places.away
+        self._fail(slots, lambda mine: away([self._record_of(slot) for slot in mine.tolist()]))
 
     def _end_by_loss(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]

@@ -96,9 +96,11 @@ class Resets:
         """Wait until every place has a client."""
         began = now
         while empty := self._places.empty():
-            due = began + min(r.place.server.connect_timeout for r in empty if r.place is not None)
-            if now >= due:
-                raise self._places.away(empty)
+            seconds = [r.place.server.connect_timeout for r in empty if r.place is not None]
+            late = [r for r, most in zip(empty, seconds, strict=True) if now >= began + most]
+            if late:
+                raise self._places.away(late)
+            due = began + min(seconds)
             now = yield Wait(self._supervisor.next_check(due if due < math.inf else None))
             self._waiting.check(now)
         return now

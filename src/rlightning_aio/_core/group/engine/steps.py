@@ -165,7 +165,7 @@ class Steps:
             if self._waiting.collecting or self._conditions.unusual:
                 self.check_collectable()
             limits = None if rules.timeout is rules.deadline is None else _Limits(rules, now)
-            self._waiting.collecting = True
+            self._waiting.collecting = now
             try:
                 if now >= self._supervisor.look_by:
                     now = yield from waiting.check_now()
@@ -184,7 +184,7 @@ class Steps:
                         break
                     now = yield from waiting.turn(wanted, until)
             finally:
-                self._waiting.collecting = False
+                self._waiting.collecting = 0.0
             slots, local = collector.pop_ready(most), self._envs.local
             if len(slots) == len(local) > slots.item(-1):
                 slots = local  # The same slots, which lie side by side.

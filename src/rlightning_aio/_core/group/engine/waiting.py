@@ -47,7 +47,7 @@ class Waiting:
 
     Attributes:
         wanted: the numbers of results that calls wait for, and how many calls for each.
-        collecting: a call waits for the collector's results.
+        collecting: when the call began that waits for the collector's results; 0.0 if none does.
         intake: as given.
     """
 
@@ -69,9 +69,9 @@ class Waiting:
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None
         self.wanted: dict[int, int] = {}
-        self.collecting = False
-        # By owner, since when a call waits for empty places alone.
-        self._alone_since: dict[int, float] = {}
+        self.collecting = 0.0
+        # By call, since when it waits for empty places alone.
+        self._alone_since: dict[tuple[int, int], float] = {}
 
     def poll(self) -> None:
         """Read and apply the replies that are ready.
@@ -214,37 +214,33 @@ class Waiting:
         Returns when to look again; that is now, if a call has learned something.
         """
         now, due = self._supervisor.clock(), None
-        found = self._supervisor.places.held()
-        for owner in self._alone_since.keys() - found.keys():
-            del self._alone_since[owner]
-        for owner, records in found.items():
-            since = self._since_alone(owner, records, now)
-            if since is None:
-                continue
-            seconds = [r.place.server.connect_timeout for r in records if r.place is not None]
-            expires = since + min(seconds)
-            if now >= expires:
-                self._alone_since.pop(owner, None)
-                self.intake.end_held(records)
-                due = now
-            if expires < math.inf:
-                due = earliest(due, expires)
+        before, self._alone_since = self._alone_since, {}
+        for owner, records in self._supervisor.places.held().items():
+            for call, own in self._alone(owner, records):
+                since = before.get(call, now)
+                if owner == COLLECTOR:
+                    since = max(since, self.collecting)
+                self._alone_since[call] = since
+                ends = [since + r.place.server.connect_timeout for r in own if r.place is not None]
+                late = [record for record, end in zip(own, ends, strict=True) if now >= end]
+                if late:  # What is left for the collector may wait on.
+                    self.intake.end_held(late if owner == COLLECTOR else own)
+                    due = now
+                due = earliest(due, *(end for end in ends if now < end < math.inf))
         return due
 
-    def _since_alone(self, owner: int, records: Sequence[HostRecord], now: float) -> float | None:
-        """Return since when a call waits for nothing but held requests; None if it doesn't."""
+    def _alone(
+        self, owner: int, records: Sequence[HostRecord]
+    ) -> list[tuple[tuple[int, int], Sequence[HostRecord]]]:
+        """Return the calls of an owner that wait for nothing but held requests, by a key."""
         if owner > 0:
             ticket = self._requests.tickets.waiting[owner]
             if ticket.apart:  # Each request is a call of its own.
-                sent: list[int] = [self._requests.sent_ns.item(r.slots.start) for r in records]
-                return min(sent) / 1e9
+                return [((owner, record.slots.start), [record]) for record in records]
             num_left = ticket.remaining
         else:
             num_left = self._requests.collector.num_awaited if self.collecting else -1
-        if num_left != len(records):
-            self._alone_since.pop(owner, None)
-            return None
-        return self._alone_since.setdefault(owner, now)
+        return [((owner, -1), records)] if num_left == len(records) else []
 
     def until(
         self, now: float, num_left: Callable[[], int], end: float | None = None

@@ -104,7 +104,7 @@ class Places:
             texts.append(f"{server.address()} has {', '.join(here) or 'no client'}")
             texts += [f"refused {name!r}: {why}" for name, why in server.sessions.refused.items()]
         texts += [one.last_loss.what for one in empty if one.last_loss is not None]
-        seconds = max(server.connect_timeout for server in servers)
+        seconds = min(server.connect_timeout for server in servers)
         away = EnvAway(
             f"no client has dialled in for {', '.join(names)} within {seconds:g} s "
             f"(env_kwargs.connect_timeout); {'; '.join(texts)}",
