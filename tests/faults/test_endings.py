@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import pytest
 from faults.closing import closed_in
-from faults.leaving import ABORT, HANG, SLEEP, Leaving, Starting
+from faults.leaving import ABORT, EXIT, HANG, SLEEP, Leaving, Starting
 from faults.test_shutdown import processes_of, trainer, watched
 from kit.processes import fork_server_pid, stop
 from kit.scripted import Awaitable
@@ -62,7 +62,7 @@ def test_an_inline_env_is_freed_when_its_group_closes() -> None:
     assert made[0]() is None
 
 
-KILLS = {"crash": ABORT, "hang": HANG, "abort": HANG, "destroyed": SLEEP}
+KILLS = {"crash": ABORT, "exit 0": EXIT, "hang": HANG, "abort": HANG, "destroyed": SLEEP}
 
 
 @pytest.mark.parametrize("kill", KILLS)

@@ -86,6 +86,8 @@ DUMP_SIGNAL: Final = getattr(signal, "SIGRTMIN", 0) + 7  # `bench` imports this 
 _TAIL_BYTES: Final = 8192
 _CHUNK_BYTES: Final = 1 << 16
 _ERROR_CHARACTERS: Final = 60_000
+_IN_ORDER: Final = 86
+"""The exit code of a worker that has closed its envs; an env may end its process with 0."""
 _STDOUT: Final = 1
 _STDERR: Final = 2
 
@@ -320,8 +322,8 @@ class _ForkServer:
             if child is not None:  # Others are what workers have left.
                 exited.append((child, os.waitstatus_to_exitcode(status)))
         for child, code in exited:  # First, as it frees descriptors.
-            self._report(child, code)
-        if any(code for _, code in exited):
+            self._report(child, 0 if code == _IN_ORDER else code)
+        if any(code != _IN_ORDER for _, code in exited):
             kill_below(os.getpid(), but={*self._children, *self._left})
         elif exited:
             # They ended as Python ends, which leaves alone what goes on in the background.
@@ -397,7 +399,7 @@ def _run_worker(
         trainer = socket.socket(fileno=channel)
         worker.main(trainer, arena, order.place)
         _run_finalisers()
-        code = 0
+        code = _IN_ORDER
     except BaseException:
         traceback.print_exc()
     finally:
