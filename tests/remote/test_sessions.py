@@ -209,10 +209,13 @@ def test_a_message_that_is_malformed_ends_the_session(spoil: str) -> None:
     assert world.serving("a")
 
 
-def test_a_client_hangs_up_at_a_malformed_message(world: World) -> None:
-    """It ends its session with the reason, and comes back."""
+@pytest.mark.parametrize("parts", [[b"\xc1"], Writer().write(Step(number=2))])
+def test_a_client_hangs_up_at_a_malformed_message(world: World, parts: list[bytes]) -> None:
+    """Such as a step without its action. It ends its session with the reason, and comes back."""
     client = world.clients["a"]
-    client.receive([b"\xc1"])
+    world.reset("a")
+    world.settle()
+    client.receive(parts)
     assert "a message of the server is malformed" in client.ended[0]
     world.settle()
     assert "it left: a message of the server is malformed" in world.seen[0].lost[0][0]

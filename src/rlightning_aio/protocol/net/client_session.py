@@ -107,7 +107,6 @@ class ClientSession:
         self.phase = Phase.AWAY
         self.outbox: deque[list[bytes]] = deque()
         self._name = name
-        self._free_actions = free_actions
         self._hello = ClientHello(
             version=VERSION,
             name=name,
@@ -155,7 +154,7 @@ class ClientSession:
 
     # Messages
 
-    def receive(self, parts: Sequence[Part]) -> Event | None:
+    def receive(self, parts: Sequence[Part]) -> Event:
         """Read one message. No content makes it raise.
 
         Returns:
@@ -185,18 +184,14 @@ class ClientSession:
         self._last_number = 0
         return message
 
-    def _on_request(self, message: Step | Reset, frames: Sequence[Part]) -> Event | None:
+    def _on_request(self, message: Step | Reset, frames: Sequence[Part]) -> Event:
         if self.phase is not Phase.SERVING:
             raise WireError("a request without a session")
         if not self._last_number and not isinstance(message, Reset):
             raise WireError("the first request of a session is not a reset")
         self._last_number = message.number
-        if isinstance(message, Step) and not self._free_actions:
-            try:
-                message.action = self._actions.unpack(frames, message.texts)
-            except WireError as error:
-                self.fail(message.number, ErrorText(type(error).__name__, str(error), ""))
-                return None
+        if isinstance(message, Step) and not self._hello.free_actions:
+            message.action = self._actions.unpack(frames, message.texts)
         return message
 
     # Answers
