@@ -29,6 +29,14 @@ def dial(address: str, count: int) -> list[socket.socket]:
     return made
 
 
+def welcomed(client: Any, server: Any, *then: Any) -> None:
+    """Let a client in at a socket, and send it further messages."""
+    while b"hello" not in (parts := server.recv_multipart() if server.poll(0) else [b"", b""])[1]:
+        client._wait(0.0)
+    for message in (Welcome(env_id="robots-0/arm", heartbeat=HANG), *then):
+        server.send_multipart([parts[0], *Writer().write(message)])
+
+
 def test_a_result_that_comes_with_the_end_of_its_connection_is_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -105,18 +113,36 @@ def test_all_that_came_before_the_end_of_a_connection_is_read(
         port = server.bind_to_random_port("tcp://127.0.0.1")
         env: Any = CountingEnv()
         with RemoteEnvClient(env, "127.0.0.1", port, name="arm", hardware=False) as client:
-            while not server.poll(0):
-                client._wait(0.0)
-            route = server.recv_multipart()[0]
-            welcome = Welcome(env_id="robots-0/arm", heartbeat=HANG)
-            for message in (welcome, Reset(number=1), Bye(reason="enough")):
-                server.send_multipart([route, *Writer().write(message)])
+            welcomed(client, server, Reset(number=1), Bye(reason="enough"))
             server.close(linger=int(1000 * HANG))
             assert client._monitor.poll(1000 * HANG)
             client.run()
             assert caplog.messages[-1] == "arm: session over: the server ended the session: enough"
             assert client._dealer is None
             assert (env.disconnects, env.resets, client.num_sessions) == (1, 0, 1)
+
+
+def test_a_client_that_runs_again_executes_nothing_of_the_session_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as the request that it had read when Ctrl-C ended the first run."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+        env: Any = CountingEnv()
+        with RemoteEnvClient(env, "127.0.0.1", port, name="arm", hardware=False) as client:
+
+            def struck() -> None:
+                if client._request is not None:
+                    raise KeyboardInterrupt
+
+            welcomed(client, server, Reset(number=1))
+            monkeypatch.setattr(client, "_log_state", struck)
+            with pytest.raises(KeyboardInterrupt):
+                client.run()
+            monkeypatch.undo()
+            welcomed(client, server, Bye(reason="enough"))
+            client.run()
+        assert env.resets == 0
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,20 @@ def test_a_signal_while_a_socket_is_made_comes_after_that(monkeypatch: pytest.Mo
     assert env.closed
 
 
+def test_an_interrupt_while_a_client_leaves_closes_its_env(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its hardware is stopped before that."""
+
+    def interrupted(reason: str) -> None:
+        raise KeyboardInterrupt
+
+    env = CountingEnv()
+    client = RemoteEnvClient(env, "127.0.0.1", 9)
+    monkeypatch.setattr(client, "_leave", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        client.close()
+    assert env.closed
+
+
 def test_between_two_attempts_a_client_takes_no_time_of_a_core() -> None:
     """It sleeps. A server that is away may stay away for hours."""
     with RemoteEnvClient(CountingEnv(), "127.0.0.1", 1) as client:

@@ -240,11 +240,12 @@ class RemoteEnvClient:
         if self._closed:
             return
         self._closed = True
-        self._leave("the client was closed")
-        if self._end_watch is not None:
-            self._end_watch()
-        self._context.destroy(linger=0)
-        _close(self._env, is_hardware=self._is_hardware)
+        with contextlib.ExitStack() as last:  # Also after a Ctrl-C.
+            last.callback(_close, self._env, is_hardware=self._is_hardware)
+            last.callback(self._context.destroy, linger=0)
+            self._leave("the client was closed")
+            if self._end_watch is not None:
+                self._end_watch()
 
     def __enter__(self) -> Self:
         return self
@@ -375,6 +376,7 @@ class RemoteEnvClient:
 
     def _leave(self, reason: str) -> None:
         self._session.leave(reason)
+        self._request, self._late_events = None, []  # They are of this session.
         self._flush()
         self._close_connection()
 
