@@ -220,9 +220,8 @@ class Intake:
         record = self._supervisor.records[completion.host_id]
         for entries, arguments in self._supervisor.take(completion):
             if record.is_hardware and arguments is None:
-                slots = np.array(record.slots, np.intp)
                 self._requests.in_flight[completion.host_id] -= len(entries)
-                self._end_by_loss(slots, self._away)
+                self._fail(self._supervisor.places.drop([record]), self._away)
             else:
                 record.host.submit(entries, arguments)
         self._requests.anything_ended = True
@@ -240,14 +239,6 @@ class Intake:
         slots = self._supervisor.places.drop(records)
         away = self._supervisor.places.away
         self._fail(slots, lambda mine: away([self._record_of(slot) for slot in mine.tolist()]))
-
-    def _end_by_loss(
-        self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
-    ) -> None:
-        """End requests that report a loss, and are no longer in flight, in an error."""
-        for slot in slots.tolist():
-            self._episodes.ended_without_result(slot)
-        self._fail(slots, error_for)
 
     def _on_new_schema(self, completion: NewSchema) -> None:
         self._results.note_schema(completion.host_id, completion.number, completion.schema)
@@ -293,6 +284,8 @@ class Intake:
         # A replacement answers steps and resets only.
         again = np.isin(requests.numbering.ops(owed), _ASKED_AGAIN)
         again &= loss.resets and loss.replaced
+        if record.place is not None and not again.any():
+            record.place.drop_reset()  # Nobody waits for what the client owed.
         self._fail(owed[~again], loss.error)
         if not (loss.replaced or len(owed)):
             self._supervisor.losses.raise_later(loss.slots, loss.refusal())
