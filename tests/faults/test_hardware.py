@@ -13,6 +13,7 @@ import time
 from functools import partial
 from pathlib import Path
 from threading import Event, Semaphore
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -34,6 +35,7 @@ from rlightning_aio import (
 )
 from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.attempts import EpisodeSpec, play
+from rlightning_aio.envs import hardware
 from rlightning_aio.envs.hardware import watched
 from rlightning_aio.errors import (
     BadAction,
@@ -523,6 +525,28 @@ def test_a_program_that_sends_no_action_in_time_stops_the_arm(
         while len(lines(log)) == before:
             time.sleep(0.01)
     assert lines(log)[:5] == ["reset", "stop", "reset", "step [0.0, 0.0]", "stop"]
+
+
+def test_a_step_that_comes_as_its_time_ends_does_not_move_the_arm_after_the_stop(
+    arm: Any, log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing would stop that motion. The time is over when somebody looks at the clock."""
+    looks, reset_at = Event(), float("inf")
+
+    def looked_at() -> float:
+        now = time.monotonic()
+        if threading.current_thread() is not threading.main_thread() and now > reset_at + 0.1:
+            looks.set()
+            time.sleep(0.05)
+        return now
+
+    env = build_env(EnvConfig(**arm("inline", action_timeout=0.1)), is_hardware=True)
+    monkeypatch.setattr(hardware, "time", SimpleNamespace(monotonic=looked_at))
+    env.reset()
+    reset_at = time.monotonic()
+    assert looks.wait(HANG)
+    with contextlib.closing(env), pytest.raises(RuntimeError, match="no action came"):
+        env.step(PolicyResponse("arm-0", np.zeros(2)))
 
 
 class Slow:

@@ -10,7 +10,7 @@ import logging
 import math
 import signal
 import time
-from threading import Event, Thread, current_thread, main_thread
+from threading import Event, Lock, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.envs.fast_path import FastPath
@@ -180,29 +180,33 @@ def limit_actions(env: BaseEnv, seconds: Any) -> None:
     step_name = "step_async" if is_async_first(env) else "step"
     reset, step, close = env.reset, getattr(env, step_name), env.close
     due, expired = math.inf, False
+    deciding = Lock()  # Whether a step came in time: one that moves after the stop isn't stopped.
 
     def timed_reset(**arguments: Any) -> Any:
         nonlocal due, expired
-        due, expired = math.inf, False
+        with deciding:
+            due, expired = math.inf, False
         result = reset(**arguments)
         due = time.monotonic() + seconds
         return result
 
     def timed_step(policy_resp: PolicyResponse) -> Any:
         nonlocal due
-        due = time.monotonic() + seconds
-        if expired:
-            raise RuntimeError(
-                f"{env.env_id}: stopped, as no action came for {seconds:g} s (action_timeout); "
-                "reset() starts it again"
-            )
+        with deciding:
+            if expired:
+                raise RuntimeError(
+                    f"{env.env_id}: stopped, as no action came for {seconds:g} s (action_timeout); "
+                    "reset() starts it again"
+                )
+            due = time.monotonic() + seconds
         return step(policy_resp)
 
     def late() -> list[BaseEnv]:
         nonlocal due, expired
-        if time.monotonic() < due:
-            return []
-        due, expired = math.inf, True
+        with deciding:
+            if time.monotonic() < due:
+                return []
+            due, expired = math.inf, True
         return [env]
 
     def timed_close() -> Any:
