@@ -30,6 +30,7 @@ pytest.importorskip("serial")
 from envs.watched_arm import WatchedArm
 
 from rlightning_aio.plugins.piper.arm import CanFrame
+from rlightning_aio.plugins.piper.cameras import Cameras
 from rlightning_aio.plugins.piper.env import PiperEnv
 from rlightning_aio.plugins.piper.sim import SlcanPort, running
 
@@ -558,6 +559,24 @@ def test_a_camera_that_hangs_stops_the_arm_after_its_time_limit(arm: WatchedArm,
     assert arm.emergency_stopped
     _hang.set()
     assert env.reset(options={"resume": True}).observation["wrist"][0, 0, 0] == 7
+
+
+def test_a_picture_of_a_call_that_was_interrupted_is_not_that_of_the_next() -> None:
+    """Whenever Ctrl-C came: each picture would be one too old from then on."""
+    numbers = iter(range(9))
+    cameras = Cameras(lambda: {"wrist": next(numbers)}, HANG)
+    asked = cameras._asked
+
+    def struck(number: int) -> None:
+        asked.put(number)
+        raise KeyboardInterrupt
+
+    cameras._asked = mock.Mock(get=asked.get, put=struck)
+    with pytest.raises(KeyboardInterrupt):
+        cameras.read()
+    cameras._asked = asked
+    assert cameras.read() == {"wrist": 1}
+    cameras.close()
 
 
 def test_an_arm_can_be_stopped_on_its_way_to_the_reset_position(arm: WatchedArm, make: Any) -> None:

@@ -1,15 +1,19 @@
-"""The guard's filter and stops, frame by frame, without a bus or a clock."""
+"""The guard's filter and stops, frame by frame, without a bus or a clock; and a bus that fails."""
 
 from __future__ import annotations
 
+import socket
 import struct
 from typing import Any
+from unittest import mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rlightning_aio.plugins.piper import watchdog
 from rlightning_aio.plugins.piper.guard import ArmGuard, CanFrame
+from rlightning_aio.plugins.piper.watchdog import Kind
 
 ANY_COMMAND = CanFrame(0x155, struct.pack(">ii", 1000, 2000))
 EMERGENCY_STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
@@ -174,3 +178,20 @@ def test_a_hard_stop_includes_the_gripper() -> None:
     frames = stopped(made, 1.0)
     assert grips(frames)[-1] == (5000, 1500, 1, 0)
     assert EMERGENCY_STOP in frames
+
+
+def test_a_watchdog_whose_bus_takes_no_stop_does_not_say_that_the_arm_has_stopped(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Neither on stderr nor to its program, which learns of the fault."""
+    monkeypatch.setattr(watchdog, "_GIVE_UP", 0.1)
+    orders = {"stop": "disable", "timeout": 0.1, "speed": 50, "gripper_effort": None, "armed": True}
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    silent, other = socket.socketpair()
+    with ours, silent, other:
+        bus = mock.Mock(fileno=silent.fileno, send=mock.Mock(side_effect=OSError("bus off")))
+        watchdog.serve(theirs, bus, orders)
+        assert [ours.recv(100) for _ in range(3)] == [Kind.OPEN, Kind.FAULT + b"bus off", b""]
+    said = capfd.readouterr().err
+    assert "could not stop it, switch it off: its bus failed: bus off" in said
+    assert "has stopped it" not in said

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    _Answer = tuple[int, dict[str, Any] | BaseException]
+
 
 class Cameras:
     """Calls a function of the user in a thread, always the same one.
@@ -24,17 +26,17 @@ class Cameras:
 
     def __init__(self, read: Callable[[], dict[str, Any]], timeout: float) -> None:
         self._read, self._timeout = read, timeout
-        self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[dict[str, Any] | BaseException] = queue.SimpleQueue()
-        self._num_owed = 0
+        self._asked: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._answers: queue.SimpleQueue[_Answer] = queue.SimpleQueue()
+        self._last_number = 0
         Thread(target=self._serve, name="cameras", daemon=True).start()
 
     def _serve(self) -> None:
-        while self._asked.get():
+        while number := self._asked.get():
             try:
-                self._answers.put(self._read())
+                self._answers.put((number, self._read()))
             except BaseException as error:  # noqa: BLE001 - it goes to the caller
-                self._answers.put(error)
+                self._answers.put((number, error))
 
     def read(self) -> dict[str, Any]:
         """Return new images by name.
@@ -44,17 +46,16 @@ class Cameras:
             BaseException: what the function raised.
         """
         due = time.monotonic() + self._timeout
-        self._asked.put(True)
-        self._num_owed += 1
+        self._last_number += 1
+        self._asked.put(self._last_number)
         while True:
             try:
-                answer = self._answers.get(timeout=max(0.0, due - time.monotonic()))
+                number, answer = self._answers.get(timeout=max(0.0, due - time.monotonic()))
             except queue.Empty:
                 raise TimeoutError(
                     f"cameras.read returned no images within {self._timeout:g} s (camera_timeout)"
                 ) from None
-            self._num_owed -= 1
-            if not self._num_owed:  # Others are of calls that have given up.
+            if number == self._last_number:  # Others are of calls that have given up.
                 break
         if isinstance(answer, BaseException):
             raise answer
@@ -62,4 +63,4 @@ class Cameras:
 
     def close(self) -> None:
         """End the thread, once its present call has returned."""
-        self._asked.put(False)
+        self._asked.put(0)

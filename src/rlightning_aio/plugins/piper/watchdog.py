@@ -288,7 +288,8 @@ class Watchdog:
             self._failing_since = self._failing_since or now
             if now > self._failing_since + _GIVE_UP:
                 self._fail(error)
-                self._guard.stopping = False
+                self._guard.stopping = was_stopping = self._stop_requested = False
+                _say(f"an arm's watchdog could not stop it, switch it off: its bus failed: {error}")
         else:
             if frames:
                 self._failing_since = None
