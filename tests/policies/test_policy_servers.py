@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from patience import HANG
-from policies.counting import QUEUE, check, evaluated
+from policies.counting import QUEUE, check, evaluated, group_of
 from policies.servers import OpenPiServer, packed, send_chunk, serving
 from websockets.sync.client import connect
 
 import rlightning_aio as rl
+from rlightning_aio.collecting import Collector
 from rlightning_aio.errors import PolicyServerError
 from rlightning_aio.plugins import openpi
 from rlightning_aio.plugins.openpi import OpenPiPolicy
@@ -78,6 +79,17 @@ def test_what_is_sent_can_be_chosen(caplog: pytest.LogCaptureFixture) -> None:
     assert server.seen[0]["image"].shape == (4, 3, 3)
     assert (server.seen[0]["image"] == 7).all()
     assert [server.seen[0][key] for key in ("gripper", "n", "ok")] == [0.5, 3, True]
+
+
+def test_an_end_does_not_hide_what_the_reset_has_said() -> None:
+    """A collector asks for the action of such a result, too, which its env ignores."""
+
+    def observe(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
+        return {"observation/state": observation, "prompt": info["task_description"]}
+
+    server = OpenPiServer(lambda connection, _: connection.send(packed({"actions": [[0, 0, 0]]})))
+    with serving(server) as url, OpenPiPolicy(url, observe) as policy, group_of() as group:
+        Collector(group, ActionChunks(policy), num_transitions=9, seed=0).collect()
 
 
 # -- servers that are wrong ---------------------------------------------------------------

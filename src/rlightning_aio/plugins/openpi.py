@@ -110,7 +110,9 @@ class OpenPiPolicy:
         """
         env_ids, rows = batch.env_ids(), np.flatnonzero(begins_of_envs(batch)).tolist()
         for row, info in zip(rows, batch.take(rows).info() if rows else (), strict=True):
-            self._infos[env_ids[row]] = info
+            # An end that is no reset, too, may not say again what the reset has said.
+            known = {} if batch.is_reset[row] else self._infos.get(env_ids[row], {})
+            self._infos[env_ids[row]] = {**known, **info}
         frames = [
             _encoded(self._observe(index(batch.observation, row), self._infos.get(env_id, {})))
             for row, env_id in enumerate(env_ids)
