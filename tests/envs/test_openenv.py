@@ -137,6 +137,18 @@ async def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
         assert batch.observation[0]["count"] == 1
 
 
+@pytest.mark.parametrize("action", [3, {"number": object()}])
+@on_asyncio
+async def test_an_action_that_can_not_be_sent_is_refused_and_the_session_goes_on(
+    action: Any,
+) -> None:
+    async with one_env() as (_, group):
+        with pytest.raises(rl.BadAction, match="an action of env 'o-0' is"):
+            await group.step(rl.BatchedData(["o-0"], [rl.PolicyResponse("o-0", action)]))
+        batch, _ = await group.step(steps_of("o-0"))
+        assert not batch.restarted.any()
+
+
 @on_asyncio
 async def test_sessions_that_are_lost_too_often_raise_and_the_next_step_tries_again() -> None:
     """As workers that die do."""

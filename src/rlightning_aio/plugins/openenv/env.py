@@ -148,7 +148,7 @@ class OpenEnv(BaseEnv):
         """Send an action, and wait for its observation.
 
         Raises:
-            BadAction: the action is no dict.
+            BadAction: the action is no dict, or has no form in JSON.
             EnvAway: the session is lost.
             ServerRefused: the server's environment has raised, or does not know the action.
         """
@@ -163,6 +163,8 @@ class OpenEnv(BaseEnv):
             data = await self._session.ask({"type": "step", "data": _plain(action)})
         except ServerGone as gone:
             raise EnvAway(f"lost its session: {gone}", env_id=self.env_id) from gone
+        except (TypeError, ValueError) as error:
+            raise BadAction(f"an action of env {self.env_id!r} is no JSON: {error}") from error
         observation, info = self._read(data)
         done = bool(data.get("done"))
         cut = done and self._is_cut(data, info)

@@ -80,12 +80,13 @@ class OpenEnvSession:
         Raises:
             ServerRefused: the reply is an error, after which the session continues.
             ServerGone: the socket is lost.
+            TypeError, ValueError: the message has no form in JSON, and was not sent.
         """
-        socket = self._socket
+        frame, socket = json.dumps(message), self._socket
         if socket is None:
             raise ServerGone(f"{self.url}: no session is open")
         try:
-            reply = await _exchange(socket, json.dumps(message), _REPLIES[message["type"]])
+            reply = await _exchange(socket, frame, _REPLIES[message["type"]])
         except (OSError, ConnectionClosed, ValueError) as error:
             self._abandon()
             raise ServerGone(f"{self.url} was lost: {error}") from error
