@@ -95,11 +95,13 @@ def test_a_listed_name_has_its_own_place() -> None:
     assert world.server.refused == {"x": why}
 
 
-def test_a_key_is_for_the_names_that_it_was_made_for(world: World) -> None:
-    client = Client("c")
-    client.session.connected()
-    world.server.receive(b"c:9", client.session.outbox.popleft(), {"arm"})
-    assert world.server.refused == {"c": "its key was made for 'arm', not for 'c'"}
+def test_a_key_is_for_the_names_that_it_was_made_for() -> None:
+    """A client that was refused, and let in since, is no longer among the refused."""
+    world, client = World(""), Client("c")
+    for allowed, why in ("arm", "its key was made for 'arm', not for 'c'"), ("c", None):
+        client.session.connected()
+        world.server.receive(b"c:9", client.session.outbox.popleft(), {allowed})
+        assert world.server.refused.get("c") == why
 
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:

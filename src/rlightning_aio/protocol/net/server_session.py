@@ -139,7 +139,8 @@ class ServerSessions:
 
     Attributes:
         outbox: messages that wait to be sent, oldest first; the sender removes them.
-        refused: why clients were refused for good, by name; only the last ones.
+        refused: why clients were refused for good, by name; only the last ones, and none that has
+            been let in since.
     """
 
     def __init__(
@@ -320,6 +321,7 @@ class ServerSessions:
             taken = "the only place is taken" if count == 1 else f"all {count} places are taken"
             raise Rejection(f"{taken}; for more, set env_kwargs.clients of the entry", retry=True)
         self._kind = found.kind
+        self.refused.pop(hello.name, None)
         place.last = hello.name
         place.session = self._by_route[route] = ServerSession(hello.name, route, found, place)
         heartbeat = self._heartbeat
