@@ -27,6 +27,7 @@ from rlightning_aio.protocol.net.wire import (
     Untransferable,
     WireError,
     Writer,
+    ping_ms,
     portable,
 )
 
@@ -324,3 +325,8 @@ def test_a_pickle_does_nothing(where: str) -> None:
     pickle.loads(bomb)
     assert Bomb.exploded, "the bomb must be a real one"
     Bomb.exploded = False
+
+
+def test_an_impatient_end_is_missed_soon() -> None:
+    """ZeroMQ counts its peer's patience in tenths of a second, and takes less than one for none."""
+    assert [ping_ms(seconds)[2] for seconds in (0.1, 1.0)] == [100, 750]

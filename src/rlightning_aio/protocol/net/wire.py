@@ -36,8 +36,8 @@ HARDWARE_HEARTBEAT: Final = 1.0
 MIN_HEARTBEAT: Final = 0.4
 MAX_HEARTBEAT: Final = 86400
 """Seconds within which an end that is gone is found."""
-_MAX_TTL_MS: Final = 6553599
-"""The longest that ZMQ accepts."""
+_TTL_MS: Final = (100, 6553599)
+"""The shortest that ZMQ doesn't take for none, and the longest that it accepts."""
 HANDSHAKE_SECONDS: Final = 2.0
 """Time for the handshake of a connection."""
 
@@ -74,7 +74,9 @@ def ping_ms(heartbeat: float) -> tuple[int, int, int]:
     """Return how often ZMQ pings a peer that may be silent for `heartbeat` seconds, how long it
     waits for a sign of life then, and after which silence the peer is to give up, in milliseconds.
     """
-    return int(250 * heartbeat), int(500 * heartbeat), min(int(750 * heartbeat), _MAX_TTL_MS)
+    least, most = _TTL_MS
+    ttl = min(max(least, int(750 * heartbeat)), most)
+    return int(250 * heartbeat), int(500 * heartbeat), ttl
 
 
 class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
