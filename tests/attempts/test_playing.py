@@ -136,6 +136,7 @@ async def test_an_agent_that_raises(error: Exception, blame: str) -> None:
         (1, "think", "fail", "timed_out", "either", None),
         (1, "think", "end", "truncated", "policy", 1.0),
         (0, "think", "end", "timed_out", "either", None),
+        (5, "think", "end", "terminated", "policy", 5.0),
         (2, "hang", "end", "env_hung", "either", None),
         (2, "raise", "fail", "env_raised", "either", None),
         (2, "raise", "end", "env_raised", "either", None),

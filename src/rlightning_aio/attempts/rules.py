@@ -50,9 +50,9 @@ class Rules:
         attempt_timeout: seconds that an attempt may run, with its reset; None for no limit. It does
             not run while something blocks the event loop, and while a step waits in the queue of
             the entry's `max_concurrency`.
-        on_timeout: then the attempt has failed (``fail``), or it ends as truncated, with what it
-            has earned (``end``). Without a completed step it has failed all the same, and if a step
-            has taken more than half of the time, it is ``env_hung``.
+        on_timeout: then the attempt has failed (``fail``), or it ends with what it has earned, as
+            truncated unless its env has ended it (``end``). Without a completed step it has failed
+            all the same, and if a step has taken more than half of the time, it is ``env_hung``.
         retries: how often an attempt that has failed is tried again, on another env than before. A
             failure for which another env of the worker is to blame isn't counted, and neither are
             those with which an outage begins: most attempts fail, after one has succeeded. What the

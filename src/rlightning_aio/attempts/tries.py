@@ -237,6 +237,8 @@ class Try:
         if not has_begun:
             return Outcome("timed_out", "env", f"{cause} before its reset was done", self.env_id)
         if self._rules.on_timeout == "end":
+            if self._view.has_ended:
+                return self._own_end()
             if self._view.in_step > self._rules.attempt_timeout / 2:
                 cause += ", most of them in a step"
                 return Outcome("env_hung", "either", cause, self.env_id)
