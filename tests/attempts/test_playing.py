@@ -770,7 +770,9 @@ async def test_what_was_not_handed_out_comes_first_after_a_resume(tmp_path: Path
 async def test_lines_are_written_beside_the_event_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Attempts go on while the disk is slow; no group comes before it is in the file."""
+    """Attempts go on while the disk is slow; no group comes before it is in the file, and who waits
+    for that and is cancelled costs no line.
+    """
     disk, to_json = threading.Event(), Attempt.to_json
     ended, most_have_ended = Counter[int](), asyncio.Event()
 
@@ -789,6 +791,9 @@ async def test_lines_are_written_beside_the_event_loop(
         with ResultsFile(tmp_path / "results") as results:
             playing = asyncio.ensure_future(played(group, tasks(6), agent, 2, results=results))
             await most_have_ended.wait()
+            await asyncio.sleep(0.05)  # For lines of these.
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(results.written(), 0.05)
             assert not playing.done()
             disk.set()
             assert len(await playing) == 6

@@ -149,7 +149,8 @@ class ResultsFile:
     async def written(self) -> None:
         """Wait as `flush` does, beside an event loop."""
         if self._last is not None and not self._last.done():
-            await asyncio.wrap_future(self._last)
+            # Cancelled, this goes on without it: the line is still to be written.
+            await asyncio.wait([asyncio.wrap_future(self._last)])
         self._check()
 
     def close(self) -> None:
