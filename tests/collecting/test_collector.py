@@ -131,7 +131,10 @@ def test_infos_with_the_name_of_a_rollouts_column_raise() -> None:
                 collector_of_infos(1.0, [name])
 
 
-def test_each_agent_has_its_own_rewards_and_ends() -> None:
+@pytest.mark.parametrize("on_done", [True, False])
+def test_each_agent_has_its_own_rewards_and_ends(on_done: bool) -> None:
+    """An env whose episode is over is reset, also where the open context leaves that out."""
+
     def policy(batch: BatchedData) -> dict[str, Any]:
         count = len(batch)
         action = {"tall": np.ones((count, 1), np.float32), "small": np.ones(count, int)}
@@ -139,7 +142,7 @@ def test_each_agent_has_its_own_rewards_and_ends() -> None:
 
     crowd = {"name": "crowd", "backend": "crowd", "task": "-", "num_workers": 2}
     group = sync.build_env_group({**crowd, "placement": "inline"})
-    with group, group.auto_reset(9):
+    with group, group.auto_reset(9, on_done):
         rollout = Collector(group, policy, num_transitions=9, min_results=2).collect()
         assert rollout.index.tolist() == [0] * 5 + [1] * 4
         assert rollout.observation["small"].tolist() == [0, 1, 2, 0, 1, 0, 1, 2, 0]
@@ -149,6 +152,7 @@ def test_each_agent_has_its_own_rewards_and_ends() -> None:
         assert rollout.episodes["index"].tolist() == [0, 1]
         assert rollout.episodes["total_reward"].tolist() == [5.0, 5.0]
         assert rollout.episodes["length"].tolist() == [3, 3]
+        assert group.metrics()["envs/results"] == 14
         values = {agent: np.zeros(4) for agent in ("tall", "small")}
         found = rollout.advantages(rollout.value, values, 1.0, 1.0)
         assert found["small"].tolist() == [3, 2, 1, 2, 1, 3, 2, 1, 1]

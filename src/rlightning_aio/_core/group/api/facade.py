@@ -7,7 +7,6 @@ import os
 import time
 import warnings
 import weakref
-from contextlib import nullcontext
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -92,13 +91,13 @@ class AutoResetContext(Scope):
 def ensure_auto_reset(group: Any) -> AbstractContextManager[Any]:
     """The context in which an `EnvGroup`, or one that is wrapped, resets envs at their ends.
 
-    If the caller has one open, nothing is added to that. Otherwise each env's own step limit
-    applies, if it has one, and the next context continues what this one leaves: a `Collector` opens
-    one for each rollout.
+    If the caller has one open, its limits apply. Otherwise each env's own step limit applies, if it
+    has one, and the next context continues what this one leaves: a `Collector` opens one for each
+    rollout.
     """
     core: Core = group._core  # noqa: SLF001
     if core.episodes.auto_reset_is_open:
-        return nullcontext()
+        return core.episodes.resetting_ended()
     return AutoResetContext(core, None, on_done=True, needs_limits=False, forgets=False)
 
 

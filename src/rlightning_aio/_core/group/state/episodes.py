@@ -8,6 +8,7 @@ reset. Left out: hosts, time and I/O; callers say what was sent, answered and re
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
 import warnings
@@ -22,7 +23,7 @@ from rlightning_aio._core.group.state.conditions import LOST_EPISODE, Conditions
 from rlightning_aio.protocol.slab import IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Generator, Iterable
 
     from numpy.typing import NDArray
 
@@ -187,6 +188,18 @@ class Episodes:
         self.due[:] = False
         if forgets:
             self._cut[:] = self._ended[:] = False
+
+    @contextlib.contextmanager
+    def resetting_ended(self) -> Generator[None]:
+        """Reset envs at the ends of their episodes, too, whatever the open context does."""
+        before, self._resets_ended = self._resets_ended, True
+        self._update_due()
+        try:
+            yield
+        finally:
+            self._resets_ended = before
+            if self.auto_reset_is_open:
+                self._update_due()
 
     def _update_due(self) -> None:
         if self._resets_ended:
