@@ -6,7 +6,7 @@ what to retry, replace, mask or score is the caller's choice.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def own_end(
     """
     reported: Any = info.get("outcome")
     if isinstance(reported, Outcome):
-        return reported
+        return replace(reported, env_id=env_id)
     if terminated:
         return Outcome("terminated", "policy", "its env ended it", env_id)
     return Outcome("truncated", "policy", cut, env_id)
