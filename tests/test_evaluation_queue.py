@@ -410,6 +410,15 @@ async def test_films_of_a_number_of_episodes_name_their_env(tmp_path: Path) -> N
     assert len(brightness(path)) == 6
 
 
+def test_what_was_lost_before_costs_no_filmed_episode(tmp_path: Path) -> None:
+    """The first reset is marked, as an abort has ended what the env did, and is used."""
+    with group_of(1) as group:
+        group.reset_async()
+        group.abort()
+        found = evaluate(group, nothing, QUEUE[:1], video=tmp_path)
+    assert not found.failures
+
+
 class Stumbling(Brighter):
     """Its second step does `fault` if `before` is not there, and makes it."""
 

@@ -206,9 +206,11 @@ class PolicyPlay:
         if not len(batch):
             return
         env_ids = batch.env_ids()
+        # Before a frame is asked for, which is another request.
+        as_asked = {env_id for env_id in env_ids if self._is_begun_as_asked(env_id)}
         yield from self._film(env_ids)
         for part in batch.by_entry().values() if self._separate else (batch,):
-            self._record(part)
+            self._record(part, as_asked)
         for env_id in env_ids:
             self._begun.pop(env_id, None)
         self._begin_episodes()
@@ -249,10 +251,10 @@ class PolicyPlay:
 
     # -- results ----------------------------------------------------------------------
 
-    def _record(self, batch: BatchedData) -> None:
-        """Note what results end and begin."""
+    def _record(self, batch: BatchedData, as_asked: set[str]) -> None:
+        """Note what results end and begin; envs that began `as_asked` have lost nothing."""
         env_ids = batch.env_ids()
-        lost = [row for row in lost_rows(batch) if not self._is_begun_as_asked(env_ids[row])]
+        lost = [row for row in lost_rows(batch) if env_ids[row] not in as_asked]
         if lost:
             self._note_losses(batch, lost)
         places, begins = batch.index.reshape(-1), batch.is_reset.reshape(-1)
