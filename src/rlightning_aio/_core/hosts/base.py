@@ -99,7 +99,7 @@ class Host(Protocol):
     def start(self) -> None:
         """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`.
 
-        Called again after `Died`, for a replacement.
+        Called again after `Died`, for a replacement, or after `Closed`, if the entry is recycled.
 
         Raises:
             OSError: the system refuses to start one.
@@ -117,7 +117,7 @@ class Host(Protocol):
         """Return `arguments` in the form that `submit` sends; later changes don't affect it.
 
         Args:
-            arguments: out of band: (action, extras), (seed, options) or (name, args, kwargs).
+            arguments: out of band, as of `submit`.
 
         Raises if they can't be sent. So callers pack all arguments before they send a request.
         """
@@ -129,10 +129,10 @@ class Host(Protocol):
         Args:
             entries: env, number and operation of each request (see `protocol.entries`).
             arguments: packed, one for each: (action, extras) of a step, with None for an action
-                that is in the row; (seed, options) of a reset, (name, args, kwargs) of a call.
-                None: they are in the rows.
+                that is in the row; (seed, options) of a reset, (name, args, kwargs) of a call,
+                (versions, state) of a restore. None: they are in the rows.
 
-        One completion follows for each: `Reported`, `Result`, `Value`, `Raised` or `Lost`,
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Lost` or `Moved`,
         with the same entry; or the host's `Died` for all.
         """
         ...

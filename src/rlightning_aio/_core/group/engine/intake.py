@@ -1,8 +1,8 @@
 """`Intake`: applies completions to requests and results, and carries out what a death means.
 
 Hosts post to one queue, and only this module applies its completions.
-Rule: it sends no requests of its own. After a death it sends outstanding ones again, to the
-replacement.
+Rule: it sends no requests of its own. It sends outstanding ones again after a loss, held ones to a
+client that has come, and to the next worker a reset that a recycled one has handed on.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ class Intake:
         self._results.note_schema(completion.host_id, completion.number, completion.schema)
 
     def _on_moved(self, completion: Moved) -> None:
-        """Send a reset that a worker has handed on to the next one, or back."""
+        """Send a reset that a worker has not executed to the next one, or back to it."""
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None or self._lifetime.closed:  # The next worker has its order to close.
             return
@@ -298,7 +298,7 @@ class Intake:
             self._results.detach_info(slot)
 
     def _send_again(self, host_id: int, slots: NDArray[np.intp]) -> None:
-        """Send the steps and resets that a dead worker owed, as resets."""
+        """Send outstanding steps and resets again, as resets: their worker or env is gone."""
         if not len(slots):
             return
         self._episodes.report_losses(slots)

@@ -24,7 +24,7 @@ UNLIKE_ENVS: Final = 1 << 1
 """The envs are not all in workers of this machine (or in one host in this process), have different
 layouts, or need more than what fits in a row."""
 DEATH: Final = 1 << 2
-"""A worker was replaced, or is to be, and has not shown that it works."""
+"""A worker was replaced, or is to be, and has not shown that it works; or one is recycled now."""
 LOST_EPISODE: Final = 1 << 3
 """An env lost its episode or was restored, and a result has still to show it."""
 BESIDE_ROWS: Final = 1 << 4

@@ -64,7 +64,7 @@ class HostLoss:
         then: what happens to the worker now.
         env_ids: of all envs of the group, by slot.
         env_id: of the env at fault, or else of one that its errors name.
-        why: its envs have lost their episodes.
+        why: what results report of the episodes that its envs have lost.
     """
 
     host_id: int
@@ -126,6 +126,7 @@ class HostRecord:
         held: requests (entries and arguments) since its death, kept until a replacement is up.
         deaths: by slot, deaths of workers that this env is blamed for, and exceptions that it was
             restarted after, since it last completed a step; key None for deaths of unknown cause.
+            A 0 counts none, but sets `Supervisor.any_deaths`, so that its times are looked at.
         culprit: the slot of the env that the last worker was executing when it died.
         dying: it was killed, and its exit was not reported yet; die_by: the end of the present half
             of its time for that; halves_left: those that have not begun.
@@ -226,7 +227,7 @@ class HostRecord:
         return len(self.started) > 1 and any(env.is_awaitable for env in self.started)
 
     def drop_held(self, entries: NDArray[np.int64]) -> list[int]:
-        """Hold some requests no longer; return those that it has held."""
+        """Take requests out of those that it holds; return the ones that it has held."""
         dropped: list[int] = []
         kept: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = []
         for held, arguments in self.held:

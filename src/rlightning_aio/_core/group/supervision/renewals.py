@@ -4,7 +4,8 @@ Each host of such an entry has a peer with the same slots. Some time before its 
 peer starts the next. Each env goes over when its own episode has ended, so that none waits for the
 others, and the worker that has no env left is closed. If the next one can't be started, the worker
 goes on, and it is tried again.
-Left out: when a worker is due (see `hosts.running.renewal`).
+Left out: when a worker is due (see `hosts.running.renewal`), and what a death means: the deaths
+that are set to ``{None: 0}`` here count none (see `HostRecord`).
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class Renewals:
     Args:
         tables: of the group.
         start: starts the worker of a host that is down, at once.
-        note_change: a worker starts or closes, so that somebody has to look at the time.
+        note_change: called when a worker starts or closes, as `Supervisor.check` must now look at
+            the time that it takes.
 
     Attributes:
         on_move: gets a host, and the slots that it has from now on.
@@ -48,11 +50,12 @@ class Renewals:
         self.on_move: Callable[[int, Sequence[int]], None]
 
     def take_over(self, moved: Moved, slot: int) -> int:
-        """Return the host that executes a reset: the next one, or the same."""
+        """Return the host that executes a reset, the next one or the same; start it if need be."""
         record = self._tables.records[moved.host_id]
         record.resident_mb = max(record.resident_mb, moved.resident_mb)
         peer = record.peer
         assert peer is not None
+        # Ahead of time, one new worker of an entry is enough: others come as they are due.
         if peer.stage is Stage.CLOSED and (moved.is_due or not self._has_spare(record)):
             peer.started, peer.order = record.started, record.order
             peer.stage, peer.is_next, peer.restart_at = Stage.DOWN, True, self._tables.clock()
@@ -60,7 +63,7 @@ class Renewals:
             peer.deaths, peer.last_loss = {None: 0}, None
             self._note_change()
             self._start(peer.host.host_id)
-        is_coming = peer.is_down and not any(peer.deaths.values())
+        is_coming = peer.is_down and not any(peer.deaths.values())  # No start of it has failed.
         if not (moved.is_due and peer.is_next and (is_coming or peer.stage is Stage.UP)):
             return moved.host_id
         record.waits += is_coming

@@ -83,7 +83,8 @@ class Supervisor:
             renewals: replaces workers before they fail.
         metas: one for each env; empty before the start.
         any_deaths: a worker died or an env raised, and what came in its place has not completed a
-            step yet.
+            step yet; or a recycled worker closes, or the next one starts. `check` looks at the
+            times of starts and ends only then.
         close_errors: env id and error of each env whose `close` raised.
         look_by: time by which a trainer that never waits must call `check`.
         due: time by which a call that waits must call it, though nothing has happened. It moves
@@ -278,7 +279,7 @@ class Supervisor:
         record.stage = Stage.UP
         record.start_by = None
         record.idle = ()
-        if 0 in record.deaths.values():
+        if 0 in record.deaths.values():  # It has started, and these count none.
             record.deaths = {slot: count for slot, count in record.deaths.items() if count}
             self._update_any_deaths()
         held, record.held = record.held, []
@@ -382,9 +383,9 @@ class Supervisor:
     def handle_exit(self, exited: Died) -> HostLoss | None:
         """Decide what the end of a worker means, which `Intake` carries out.
 
-        Returns None where it means nothing for requests: while the group starts or closes, and if
-        the worker was a replacement that never came up. Requests wait for the next one then, which
-        is started here.
+        Returns None where it means nothing for requests: while the group starts or closes, and
+        where a replacement that never came up is replaced again. That is started here, and requests
+        wait for it.
         """
         record, death = self.records[exited.host_id], exited.death
         record.dying, record.abort_by = False, {}

@@ -2,7 +2,8 @@
 
 It looks before each reset, as the env is between two episodes then. A worker that is due doesn't
 execute the reset: it hands it on, with the env's generators, for the next worker.
-Left out: what the group does then (see `supervision.renewals`).
+Left out: what the group does then (see `supervision.renewals`). An env that is made again in the
+same worker, as after an exception, is another matter (`EnvRunner.is_spent`).
 """
 
 from __future__ import annotations
