@@ -6,9 +6,10 @@ workers. `serve` and `row_step` are the worker's. `arm` and `is_due` are the two
 (`rings`).
 
 Invariant: each shared word has one writer. A writer publishes (entry first, then the counter) and
-fences before it checks whether the other side sleeps (`rings`), or sums all counters: of two
-workers that finish together at least one sees the full sum. What another process wrote is checked
-before it is used as a position, because that process may have failed in the middle of anything.
+fences before it reads what others write: whether the other side sleeps (`rings`), or the counters
+of all workers. So of two workers that finish together, at least one sees the full sum. What another
+process wrote is checked before it is used as a position, because that process may have failed in
+the middle of anything.
 Absent on purpose: decisions. The group checks requests and interprets results.
 """
 
@@ -49,9 +50,9 @@ REQUESTS_SENT: Final = 0 * LINE
 WORKER_ASLEEP: Final = 1 * LINE
 FRAMES_TO_WORKER: Final = 2 * LINE
 FRAMES_TO_TRAINER: Final = 3 * LINE
-# The request that the worker executes, 0 if none, and since when. The time is written first, so who
-# reads it after the request never takes that for older than it is. The request is cleared before it
-# is reported, so one whose reply was read is not executed.
+# The request that the worker executes, 0 if none, and since when. The time is written first: read
+# after the request, it never makes that older than it is. The request is cleared before its report,
+# so one whose reply the trainer has read doesn't look as if it were still executed.
 CURRENT: Final = 4 * LINE
 CURRENT_SINCE_NS: Final = 4 * LINE + 1
 # The trainer's own counts: requests sent, and frames of the worker that were read.

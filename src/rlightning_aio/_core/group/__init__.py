@@ -7,7 +7,8 @@ restarts), `tables` (what all parts share), `state` (the single tables: requests
 Decisions get the time as an argument, or from `Tables.clock`; only drivers, `api` and what measures
 (`sums`, `timeline`) read a clock, and none knows where an env runs.
 
-Five verbs say how something ends. A request *ends* with its answer, and is *dropped* without one; a
-caller that no longer waits *leaves* its requests to others. Envs, hosts and calls are *closed* in
-order, and workers are *killed* by force. (To *release* is to give back memory and descriptors.)
+Six verbs say how something ends. A request *ends* with its answer, and is *dropped* without one; a
+caller that no longer waits *leaves* its requests to others, or has them *aborted*, so that nobody
+gets the answer. Envs, hosts and calls are *closed* in order, and workers are *killed* by force. (To
+*release* is to give back memory and descriptors.)
 """

@@ -158,8 +158,8 @@ class ClientSession:
         """Read one message. No content makes it raise.
 
         Returns:
-            The event to act on. A `Step` or `Reset` must be answered before the next message is
-            received.
+            The event to act on. Until a `Step` or `Reset` is answered, the server sends nothing
+            but a goodbye.
         """
         try:
             message, frames = self._reader.read(parts)

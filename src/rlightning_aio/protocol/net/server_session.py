@@ -332,7 +332,11 @@ class ServerSessions:
         place.events.on_taken(found)
 
     def _place_for(self, name: str) -> ClientPlace | None:
-        """Return the empty place that a client gets; None if there is none."""
+        """Return the empty place that a client gets; None if there is none.
+
+        It is the one that has its name, or that it had last; else where a request has waited
+        longest; else the first.
+        """
         empty = [place for place in self._places if place.session is None]
         empty = [place for place in empty if place.name in {"", name}]
         for place in empty:

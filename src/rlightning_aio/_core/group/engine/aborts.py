@@ -2,7 +2,7 @@
 
 An aborted request belongs to nobody: its call ends in `EpisodeLost`, and its reply is dropped when
 it comes. The env is busy until then, which is soon, whatever it does: its host cancels the request,
-withdraws it, or is replaced (see `HangDetector`). The episode is lost.
+takes it out of its queue, or is replaced (see `HangDetector`). The episode is lost.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Aborts:
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.
 
-        Results that are ready stay. Cancelled, they end all the same.
+        Results that are ready stay. If this is cancelled, the requests end all the same.
         """
         requests, slots = self._requests, self._requests.owed(slots)
         # Another call may be ending the rest; one that was cancelled belongs to nobody already.

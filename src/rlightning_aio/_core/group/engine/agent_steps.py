@@ -304,7 +304,7 @@ class AgentSteps:
                 reply.set_result(StepEnd(ret, is_over, loss))
 
     def _is_begun_as_asked(self, slot: int, step: AgentStep) -> bool:
-        """Return True for a reset that was asked for once: what was lost was lost before it."""
+        """Return True for a reset that was not sent again: what it reports was lost before it."""
         number = self._requests.numbering.number(slot)
         return isinstance(step.what, EpisodeStart) and step.number == number
 

@@ -102,19 +102,19 @@ class Results:
             self._conditions.note(BESIDE_ROWS, True)
 
     def begin_schemas(self, host_id: int, slots: Sequence[int]) -> None:
-        """A new worker of a host, of `slots`, announces its ways of holding infos."""
+        """Forget the schemas of a host, of `slots`: its new worker announces its own."""
         self._schemas_of[host_id] = {}
         self.use_schemas(host_id, slots)
 
     def use_schemas(self, host_id: int, slots: Sequence[int]) -> None:
-        """The infos of `slots` come from a host from now on."""
+        """Decode infos of `slots` by the schemas of a host from now on."""
         # A new list: batches that were handed out still read the old one.
         self._schemas = list(self._schemas)
         for slot in slots:
             self._schemas[slot] = self._schemas_of[host_id]
 
     def note_schema(self, host_id: int, number: int, schema: InfoSchema) -> None:
-        """A host holds infos in one more way."""
+        """Note a schema of infos that a host has announced."""
         self._schemas_of[host_id][number] = schema
         self._info_width = max(self._info_width, schema.size, 1)
 

@@ -64,7 +64,7 @@ class Waiting:
         self.intake = intake
         self._completions = tables.completions
         self._driver = tables.driver
-        # Then each request to an inline env is executed in its own turn.
+        # If True, each request to an inline env is executed in a turn of its own.
         self._shares_thread = tables.shares_thread
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None
@@ -120,8 +120,8 @@ class Waiting:
     def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
         """Apply completions; raise an error if the group is closed, or a slot is busy or gone.
 
-        What was cancelled or aborted and still runs in an env is ended before, inline by executing
-        it.
+        A request that was cancelled or aborted may keep an env busy. So what has ended by now is
+        applied first, and in this process such a request is executed.
         """
         self._lifetime.check_open()
         self.intake.apply_completions()

@@ -1,8 +1,8 @@
 """`Requests`: the current request of each env, its owner, and its state.
 
 A pure table over slots, the positions of envs in their group. It knows hosts by number only, no
-time and no I/O. An env has one request at a time. Each request ends once, in a result, a value, an
-error or a withdrawal, and goes to the call that waits for it, or else to `collect`. `LEGAL` lists
+time and no I/O. An env has one request at a time. Each request ends once, in a result, a value or
+an error for the call that waits for it, or else for `collect`; or it is dropped. `LEGAL` lists
 every transition: tests are generated from it, and the random programs execute it.
 
 The table consists of arrays, so that a batch of thousands costs a few vector operations.
@@ -48,8 +48,8 @@ class Ticket(msgspec.Struct):
     Attributes:
         slots: whose requests; of a ticket that is `apart`, only once its call has left.
         remaining: number of its requests that have not ended.
-        apart: each of its requests is somebody else's, and has an error of its own. It stays open
-            while requests come and go.
+        apart: it serves many callers, as of `AgentSteps`: each of its requests ends by itself, and
+            may end in an error of its own. It stays open while requests come and go.
         ended: slots of an `apart` ticket whose results and errors are to be taken.
         errors: the error that a request ended in, by slot.
         values: returned by method calls, by slot.
@@ -199,7 +199,7 @@ class Requests:
         methods: by slot, the name of the method that was called last.
         in_flight: requests of each host that are not answered; the only count of them.
         rings: of each host, if it is a live worker of this machine; kept up by the hosts.
-        in_rings: all hosts had rings when the group started.
+        in_rings: the hosts of all local envs had rings when the group started.
         unwanted: slots whose requests belong to nobody; the reply of each is dropped.
         anything_ended: something has ended since this was set to False.
     """

@@ -69,12 +69,14 @@ class EnvLosses:
         return True
 
     def count_env(self, slot: int, why: Loss, message: str) -> tuple[bool, WorkerDied | EnvAway]:
-        """Count an env that is gone; True if an episode begins at once, and the error otherwise.
+        """Count an env that is gone.
 
         Args:
             slot: of the env.
-            why: it is gone.
+            why: the cause.
             message: the same for an error.
+
+        Returns whether an episode begins at once, and the error for where none does.
         """
         record = self._tables.record_of(slot)
         is_borne, then = record.restart_policy.count(self._counted(slot), pauses=False)

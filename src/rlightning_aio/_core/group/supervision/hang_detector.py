@@ -7,8 +7,8 @@ that the trainer, late itself, has not read yet. An aborted request has a short 
 
 Time limits cost an ordinary step nothing: a few looks within the shortest limit are enough. A
 request that is seen in one of them is ended when its time is over, because the next look is then.
-The time of a worker that executes nothing begins with the look that finds it so. So it is at most a
-quarter of the limit, the time between two looks, until a hang is found.
+The time of a worker that executes nothing begins with the look that finds it so. So its hang is
+found too late by the pause between two looks at most, which is a quarter of the shortest limit.
 """
 
 from __future__ import annotations

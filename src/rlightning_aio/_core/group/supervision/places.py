@@ -157,7 +157,7 @@ class Places:
         return found
 
     def drop(self, records: Sequence[HostRecord]) -> NDArray[np.intp]:
-        """Hold the requests of some places no longer; return the slots. None is in flight."""
+        """Take away the requests that places hold; return the slots. None of them is in flight."""
         for record in records:
             self.num_held -= sum(len(entries) for entries, _ in record.held)
             record.held = []

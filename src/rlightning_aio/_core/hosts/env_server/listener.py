@@ -288,7 +288,7 @@ class Listener:
                 if error.errno not in {zmq.EHOSTUNREACH, zmq.EAGAIN}:
                     raise
                 self._sessions.disconnected(route)
-                self._call_back()  # The driver is to learn of it.
+                self._call_back()  # So that the driver applies what that has posted.
         # Sending reads ZMQ's signals, so the descriptor may not report waiting messages.
         if is_readable(self._router):
             self._call_back()

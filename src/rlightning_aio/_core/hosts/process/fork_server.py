@@ -165,7 +165,7 @@ class _ForkServer:
         self._trainer = trainer
         self._trainer_process = trainer_process
         self._children: dict[int, _Child] = {}
-        # What workers that have closed in order have left.
+        # Processes that workers have left running when they closed in order.
         self._left: set[int] = set()
         adopt_orphans()
         self._poll = select.poll()

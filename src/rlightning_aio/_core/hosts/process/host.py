@@ -165,7 +165,7 @@ class ForkServerHandle:
             self._send(self._server, Kill(host.host_id, dump))
 
     def note_used(self, host: ProcessHost, close_seconds: float) -> None:
-        """Note that the envs of all workers were built, and how long those of `host` may close."""
+        """Note that the group has started, and how long the envs of `host` may take to close."""
         self._is_used = True
         if self._server is not None:
             self._send(self._server, CloseLimit(host.host_id, close_seconds))

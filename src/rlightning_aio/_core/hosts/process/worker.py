@@ -163,14 +163,14 @@ class Worker:
     def _run(self, request: int) -> bool:
         """Execute one request of the ring; return True if its row holds the whole reply.
 
-        Most steps are executed by `exchange.serve` itself.
+        Most steps are executed by `kernel.serve` itself.
         """
         if self._closing:
             return False
         return self._execute(request, None)
 
     def _execute(self, request: int, arguments: bytes | None) -> bool:
-        """Execute one request; return True if its row holds the whole reply, or reply to it."""
+        """Execute one request; return True if its row holds the whole reply, else send that."""
         index = slot_of(request) - self._first_slot
         runner = self._runners[index]
         completion = execute(SENDER, runner, request, arguments, self._on_end)
@@ -180,7 +180,7 @@ class Worker:
         return completion is None
 
     def _finish(self, request: int, outcome: Any) -> None:
-        """Reply to a step or reset whose outcome is not in its row alone.
+        """Reply to a step whose outcome is not in its row alone.
 
         Args:
             request: the entry.
@@ -194,7 +194,7 @@ class Worker:
             self._post(completion)
 
     def _on_end(self, error: BaseException | None) -> None:
-        """Look at what a request has raised, if it has, before that is sent."""
+        """End a process that an env forked, which must not reply; pass `TrainerGone` on."""
         if self._is_child:
             _end_child(error)
         if isinstance(error, TrainerGone):  # A schema, say, could not be sent.
