@@ -318,6 +318,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("max_episode_steps", 0, "should be greater than or equal to 1, got 0"),
         ("step_timeout", -1, "should be greater than 0, got -1"),
         ("start_timeout", math.nan, "should be greater than 0, got nan"),
+        ("close_timeout", math.inf, "should be less than or equal to 86400, got inf"),
         (
             "placement",
             "inlin",

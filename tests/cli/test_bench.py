@@ -128,7 +128,8 @@ def test_the_plot_is_an_image(tmp_path: Path) -> None:
 def test_a_sweep_measures_all_combinations_and_nothing_else(tmp_path: Path) -> None:
     """A field is that of all entries, or of the one that is named; the rules may be swept, too."""
     config = write_config(tmp_path, STUB, {**CARTPOLE, "num_workers": 2})
-    sweeps = ["placement=process,inline", "envs.0.num_workers=1,3", "min_results=4,2"]
+    sweeps = ["placement=process,inline", "envs.0.num_workers=1", "min_results=4,2"]
+    sweeps += ["envs.0.num_workers=3"]
     words = [word for sweep in sweeps for word in ("--sweep", sweep)]
     contenders = invoke_json("bench", config, *QUICK, *words)["contenders"]
     assert [(c["placement"], c["num_workers"], c["min_results"]) for c in contenders] == [

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any
+import subprocess
+from pathlib import Path
+from typing import Any
 
 import pytest
-from cli.command import CARTPOLE, invoke, run, write_config
+from cli.command import CARTPOLE, COMMAND, invoke, run, write_config
+from patience import HANG
 
 from rlightning_aio.cli import bench
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 STUB = {"name": "stub", "backend": "stub", "task": "any"}
 
@@ -64,7 +64,8 @@ REFUSED: list[tuple[str, dict[str, Any], str, str]] = [
     ("eval", STUB, "--resume absent/file", "can't be written"),
     *(("eval", SWITCHING, words, said) for words, said in QUEUES.items()),
     *(("bench", STUB, f"--sweep {sweep}", said) for sweep, said in SWEEPS.items()),
-    ("bench", STUB, "--plot plot.txt", "should end in"),
+    *((name, STUB, "--plot plot.txt", "should end in") for name in ("bench", "eval")),
+    *((name, STUB, "--plot absent/a.png", "no folder") for name in ("bench", "eval")),
     ("bench", {**STUB, "num_worker": 2}, "", "did you mean 'num_workers'"),
     # Clients choose where their envs live, and a plain loop can't stop hardware.
     ("bench", SERVER, "", "'robots'"),
@@ -109,12 +110,14 @@ FAILED: list[tuple[str, dict[str, Any], str, str, tuple[str, ...]]] = [
         *("rollout", {"backend": "dying", "on_worker_death": "raise"}, "", "2 steps in "),
         ("'robot-0'", "exited with code 7"),
     ),
+    ("check", {"backend": "dying"}, "", "", ("'robot-0'", "exited with code 7")),
+    ("check", {"backend": "raising", "on_env_error": "restart"}, "", "", RAISED),
     ("client", {"backend": "unbuildable"}, "--connect tcp://127.0.0.1:9", "", UNBUILT),
     ("rollout", SERVER, "", "", AWAY),
     ("eval", SERVER, "", "", AWAY),
-    (
-        *("rollout", {**STUB, "placement": "inline", "num_workers": 3}, TOO_FEW, ""),
-        ("2 rows for a batch of 3",),
+    *(
+        (command, {**STUB, "placement": "inline", "num_workers": 3}, TOO_FEW, "", ("rows for a",))
+        for command in ("rollout", "eval")
     ),
 ]
 
@@ -191,3 +194,12 @@ def test_the_largest_seed_is_taken(tmp_path: Path) -> None:
     for command, length in (("rollout", "--steps"), ("eval", "--episodes")):
         done = invoke(command, write_config(tmp_path, STUB), "--seed", 2**61, length, 2)
         assert done.exit_code == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", ["backends", "--version"])
+def test_results_that_can_not_be_written_are_one_message(command: str) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, command], stdout=full, stderr=subprocess.PIPE, timeout=HANG, check=False
+        )
+    assert (done.returncode, done.stderr) == (2, b"error: [Errno 28] No space left on device\n")

@@ -30,15 +30,15 @@ def main() -> None:
 
         sys.stdout = stdout_set_aside()
         app()
-    except ConfigError as error:  # Of the environment variables that imports read.
+    except (ConfigError, OSError) as error:  # Environment variables that imports read; stdout.
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
     finally:
         # The command has finished, so Ctrl-C while the interpreter exits is no interruption, and
         # what envs print then is no result.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with contextlib.suppress(BrokenPipeError):  # Its reader is gone.
-            sys.stdout.flush()
+        with contextlib.suppress(OSError):  # Its reader is gone, or the disk is full.
+            sys.stdout.close()
         sys.stdout = sys.stderr
 
 

@@ -198,7 +198,7 @@ def _contenders(order: _Order, configs: Sequence[EnvConfig]) -> list[Contender]:
         name, equals, values = text.partition("=")
         if not (name and equals and all(values.split(","))):
             raise ConfigError(f"--sweep {text}: should be FIELD=A,B,…, such as num_workers=1,2,4")
-        sweeps[name] = values.split(",")
+        sweeps.setdefault(name, []).extend(values.split(","))
     waits = sweeps.pop("min_results", None)
     settings = (
         swept_settings(order.path, order.overrides, sweeps)

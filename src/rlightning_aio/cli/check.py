@@ -32,7 +32,7 @@ from rlightning_aio.cli.terminal import (
     print_lines,
     run_interruptible,
 )
-from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.config import check_installed, load_config, moved
 from rlightning_aio.config.documents import parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.random_actions import allowed_action, sampler_of
@@ -141,7 +141,10 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
 
 async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
     """Build one env of the entry and step it."""
-    one = config.model_copy(update={"num_workers": 1, "recycle": {}})
+    alone = {"num_workers": 1, "recycle": {}}
+    # A replacement would hide what is wrong.
+    raising = {"on_env_error": "raise", "on_worker_death": "raise"}
+    one = moved(config.model_copy(update=alone | raising), config.placement)
     async with rlightning_aio.build_env_group([one]) as group:
         (meta,) = group.metas
         found.observation_space = str(meta.observation_space)

@@ -35,7 +35,7 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import MADE_BY_GYMNASIUM, load_config
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.evaluation import EpisodeSpec, Evaluation, evaluate
 from rlightning_aio.evaluation.evaluation import parts_of, table_of
 from rlightning_aio.json_text import finite
@@ -268,6 +268,8 @@ async def _evaluate(
             words = f", {count(known)} of them played before" if known else ""
             progress.begin(f"playing {counted(total, 'episode')}{words}", total)
             await played
+        except RLightningError:
+            raise  # Of an action that doesn't fit, for one, which is a ValueError, too.
         except (ValueError, ImportError) as error:
             raise ConfigError(str(error)) from error
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.files import write_file
+from rlightning_aio.files import check_writable, write_file
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ def check_plot(path: Path | None) -> None:
     """Check before the measurement that a plot can be drawn, if there is to be one.
 
     Raises:
-        ConfigError: it can't, with the reason.
+        ConfigError, OSError: it can't, with the reason.
     """
     if path is None:
         return
@@ -34,6 +34,7 @@ def check_plot(path: Path | None) -> None:
         raise ConfigError(f"--plot {path}: should end in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--plot needs matplotlib: pip install matplotlib")
+    check_writable(path)
 
 
 def _pyplot() -> Any:

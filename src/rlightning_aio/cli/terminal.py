@@ -70,7 +70,7 @@ def _prints_on_stderr() -> Generator[None]:
         with contextlib.redirect_stdout(sys.stderr):
             yield
     finally:
-        _results.pop().flush()
+        _results.pop()
 
 
 def named_columns(title: str, *names: str, texts: Sequence[str] = ()) -> Table:

@@ -84,7 +84,7 @@ class EnvConfig(_Fields):
     """Seconds that one reset may take."""
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
-    close_timeout: float | None = Field(default=None, gt=0)
+    close_timeout: float | None = Field(default=None, gt=0, le=86400)
     """Seconds that all envs of the entry may take to close; None gives awaitable envs 10 seconds,
     filmed ones 60 (``record_video``), and others 1.5."""
     on_worker_death: Literal["restart", "raise"] = "restart"
