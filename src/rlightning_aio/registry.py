@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 from dataclasses import dataclass, field
 from functools import cache, partial
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast
 
 from rlightning_aio.errors import ConfigError
@@ -282,7 +283,7 @@ def placement_of(backend: str, placement: str) -> Placement:
 def load(target: str) -> Any:
     """Import and return the object that ``module:name`` names."""
     module_name, _, name = target.partition(":")
-    return getattr(importlib.import_module(module_name), name)
+    return attrgetter(name)(importlib.import_module(module_name))
 
 
 def plugins() -> EntryPoints:

@@ -50,6 +50,15 @@ class Counter(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=np.zeros(4, np.float32), last_reward=action)
 
 
+class Maker:
+    make = staticmethod(wrapped_pendulum)
+
+
+def test_a_callable_may_be_in_a_class() -> None:
+    with inline(task=f"{__name__}:Maker.make") as group:
+        assert group.metas[0].max_episode_steps == 5
+
+
 def test_one_callable_makes_every_env_of_an_entry() -> None:
     """With the ``env_kwargs`` and the step limit of the entry."""
     fields = {"task": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}

@@ -89,11 +89,6 @@ class Setting(Place):
         }
 
 
-def _num_shares(config: EnvConfig) -> int:
-    assert isinstance(config.envs_per_process, int)
-    return -(-config.num_workers // config.envs_per_process)
-
-
 def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
     """Return the settings worth trying.
 
@@ -197,7 +192,7 @@ def _worker_counts(configs: Sequence[EnvConfig], cores: int) -> list[int]:
 
 def _in_workers(configs: Sequence[EnvConfig], count: int) -> Setting:
     placed = tuple(_shared_out(config, count) for config in configs)
-    workers = counted(sum(map(_num_shares, placed)), "worker process")
+    workers = counted(sum(nums_hosts(placed, num_cores())), "worker process")
     return Setting(placed, workers + _sizes(placed))
 
 

@@ -103,10 +103,12 @@ def _check_backend(config: EnvConfig) -> str | None:
 def _check_env_kwargs(config: EnvConfig) -> str | None:
     if config.backend not in MADE_BY_GYMNASIUM:
         return None
-    for name, field in _GIVEN_BY_FIELDS.items():
-        if name in config.env_kwargs:
-            return f"{name}: is the field {field!r} of the entry; give it there"
-    return None
+    said = [
+        f"{name}: is the field {field!r} of the entry; give it there"
+        for name, field in _GIVEN_BY_FIELDS.items()
+        if name in config.env_kwargs
+    ]
+    return "; ".join(said) or None
 
 
 _GIVEN_BY_FIELDS: Final = {
