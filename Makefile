@@ -43,9 +43,9 @@ PROGRAMS := tests/attempts/test_killed.py tests/benchmarks tests/cli tests/examp
     tests/legacy/test_scripts.py tests/peers tests/platforms tests/simulator/test_simulator.py tests/test_docs.py \
     tests/test_examples.py
 
-# Most tests wait for processes that they start, so four at a time keep two cores busy. A process
+# Most tests wait for processes that they start, so six at a time keep two cores busy. A process
 # without tests takes some from another; until then it has whole files, whose tests share fixtures.
-PYTEST = $(PY) -m pytest --numprocesses 4 --dist worksteal
+PYTEST = $(PY) -m pytest --numprocesses 6 --dist worksteal
 
 test: $(VENV)/installed-test ## the tests of the library
 	$(PYTEST) $(PROGRAMS:%=--ignore=%)

@@ -194,11 +194,12 @@ def test_only_the_env_at_fault_is_charged_an_attempt(breaks: int) -> None:
 
 
 def test_an_env_that_is_broken_rests_while_others_play() -> None:
+    """Each rest is twice as long, so even a machine that takes seconds sees few more failures."""
     makers = [partial(Tasks, breaks={"1": RAISE}), Tasks, Tasks]
     group = sync.build_env_group(makers, envs_per_process=1, max_restarts=99)
     found = evaluated(group, [EpisodeSpec("1", 40 + k) for k in range(60)], retries=0)
     assert {one.env_id for one in found.failed} == {group.env_ids[0]}
-    assert 3 <= len(found.failed) <= 6
+    assert 3 <= len(found.failed) <= 12  # Without rests, it takes most episodes.
 
 
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
