@@ -136,11 +136,10 @@ class TrainerRings:
         self._fence()
         return self._words[WORKER_ASLEEP] != 0
 
-    def count_frame(self) -> bool:
-        """Count a frame that was written to the channel; True if the worker must be woken."""
+    def count_frame(self) -> None:
+        """Count a frame that was written to the channel, which wakes a worker that sleeps."""
         self._frames_sent += 1
         self._words[FRAMES_TO_WORKER] = self._frames_sent
-        return self.worker_sleeps()
 
     def stop(self, index: int, number: int) -> None:
         """Tell the worker to stop an env, whatever it does of the requests up to `number`."""

@@ -57,19 +57,17 @@ class RestartPolicy:
     Args:
         config: of the entry.
         field: of the entry, says whether any is borne: ``on_worker_death`` or ``on_env_error``.
-        done: the participle of what follows a loss: "replaced" or "restarted".
 
     Attributes:
         raises: no loss is borne.
     """
 
     def __init__(
-        self, config: EnvConfig, field: Literal["on_worker_death", "on_env_error"], done: str
+        self, config: EnvConfig, field: Literal["on_worker_death", "on_env_error"]
     ) -> None:
         self.raises = getattr(config, field) == "raise"
         self._field = field
         self._most = config.max_restarts
-        self._done = done
 
     def count(self, losses: int, *, pauses: bool = True) -> tuple[bool, str]:
         """Return True if a restart follows a loss, and say in a clause what follows.

@@ -184,8 +184,7 @@ class Facade:
 
     def __len__(self) -> int:
         """The number of envs, each env_server counted once."""
-        envs = self._core.envs
-        return envs.num_local + len(envs.server_ids)
+        return self._core.envs.num_local + len(self._core.supervisor.places.servers)
 
     def size(self) -> int:
         """The number of local envs."""

@@ -117,9 +117,8 @@ def _tables(
         env_ids += [
             f"{name}-0/{places[k]}" if find else f"{name}-{k}" for k in order.worker_indices
         ]
-    servers = [config for config in plan.configs if placement_for(config).places]
     num_local = sum(not placement_for(config).places for config in configs)
-    envs = EnvTable(configs, env_ids, num_local, [f"{config.name}-0" for config in servers])
+    envs = EnvTable(configs, env_ids, num_local)
     conditions = Conditions()
     nums_envs = [len(order.worker_indices) for order in orders]
     hosts = np.repeat(np.arange(len(orders)), nums_envs)

@@ -30,12 +30,11 @@ class EnvTable:
     Args:
         configs, env_ids: of all envs.
         num_local: the number of envs that are built with the group; the others are places.
-        server_ids: ids of the env_servers.
 
     Attributes:
         names: of each slot.
         configs: the entry of each slot.
-        num_local, server_ids: as given.
+        num_local: as given.
         all: all slots; local: those of the local envs, the same array if there are no places.
         step_limits: steps per episode, configured or from the simulator; 0 for no limit.
         actions_beside_rows: True where actions travel in the channel and not in the row;
@@ -51,12 +50,10 @@ class EnvTable:
         configs: Sequence[EnvConfig],
         env_ids: Sequence[str],
         num_local: int | None = None,
-        server_ids: Sequence[str] = (),
     ) -> None:
         self.configs = list(configs)
         size = len(self.configs)
         self.num_local = size if num_local is None else num_local
-        self.server_ids = list(server_ids)
         self._slot_of = {env_id: slot for slot, env_id in enumerate(env_ids)}
         entry_names = list(dict.fromkeys(config.name for config in self.configs))
         number = {name: k for k, name in enumerate(entry_names)}

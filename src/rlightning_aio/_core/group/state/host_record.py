@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from rlightning_aio._core.hosts.base import Killable, SelfStarting
 from rlightning_aio._core.hosts.limits import RestartPolicy, close_seconds, limits_of
-from rlightning_aio.errors import EnvAway, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvHung, WorkerDied
 from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.error_text import ErrorText
+
+
+_FAULTS: Final[dict[str, type[WorkerDied | EnvAway]]] = {"env_hung": EnvHung, "env_away": EnvAway}
+"""By the kind of an outcome; others are `WorkerDied`."""
 
 
 class Stage(Enum):
@@ -59,7 +63,6 @@ class HostLoss:
             next request starts one.
         resets: the replacement may reset envs on its own; False of hardware, which only the user
             sets in motion.
-        kind: of its errors.
         what: the subject and the cause; last: the last request of the env at fault.
         then: what happens to the worker now.
         env_ids: of all envs of the group, by slot.
@@ -73,7 +76,6 @@ class HostLoss:
     death: Death
     replaced: bool
     resets: bool
-    kind: type[WorkerDied | EnvAway]
     what: str
     last: str
     then: str
@@ -100,7 +102,7 @@ class HostLoss:
 
     def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied | EnvAway:
         tail = self.death.stderr_tail
-        error = self.kind(message + last_lines(tail), env_id=self.env_id)
+        error = fault_type(self.why)(message + last_lines(tail), env_id=self.env_id)
         if isinstance(error, WorkerDied):
             error.exit_code, error.stderr_tail = self.death.exit_code, tail
             error.env_ids = tuple(self._ids(slots))
@@ -145,8 +147,7 @@ class HostRecord:
         limits: the time limits of requests, by operation.
         timed: some of its requests have a time limit, which the supervisor watches.
         restart_policy: how many deaths in a row are borne; error_policy: how many exceptions.
-        is_local: its envs use this machine's cores; is_hardware: they move something real
-            (of a place, the client that takes it says so).
+        is_hardware: its envs move something real (of a place, the client that takes it says so).
         slots: of its envs; some may be in the peer's worker (`Tables.slots_of`).
     """
 
@@ -186,7 +187,6 @@ class HostRecord:
     timed: bool = field(init=False)
     restart_policy: RestartPolicy = field(init=False)
     error_policy: RestartPolicy = field(init=False)
-    is_local: bool = field(init=False)
     is_hardware: bool = field(init=False)
     slots: range = field(init=False)
 
@@ -195,9 +195,8 @@ class HostRecord:
         self.place = self.host if isinstance(self.host, SelfStarting) else None
         self.limits = limits_of(self.config)
         self.timed = self.killable is not None and bool(self.limits)
-        self.restart_policy = RestartPolicy(self.config, "on_worker_death", "replaced")
-        self.error_policy = RestartPolicy(self.config, "on_env_error", "restarted")
-        self.is_local = placement_of(self.config.backend, self.config.placement).local
+        self.restart_policy = RestartPolicy(self.config, "on_worker_death")
+        self.error_policy = RestartPolicy(self.config, "on_env_error")
         self.is_hardware = self.config.is_hardware
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
 
@@ -209,7 +208,8 @@ class HostRecord:
     @property
     def is_worker_here(self) -> bool:
         """Its envs are in a worker process of this machine."""
-        return self.killable is not None and self.is_local
+        place = placement_of(self.config.backend, self.config.placement)
+        return self.killable is not None and place.local
 
     @property
     def is_down(self) -> bool:
@@ -240,8 +240,9 @@ class HostRecord:
         return dropped
 
     def give_time(self, now: float) -> None:
-        """Count the time of its start from now on."""
-        self.start_by = now + self.config.start_timeout
+        """Count the time of its start from now on, or that of its end."""
+        is_ending = self.stage is Stage.CLOSING
+        self.start_by = now + (self.close_seconds if is_ending else self.config.start_timeout)
         self.note_traffic()
 
     def note_traffic(self) -> bool:
@@ -254,6 +255,11 @@ class HostRecord:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""
         if self.killable is not None:
             self.killable.kill(dump=dump)
+
+
+def fault_type(why: Loss) -> type[WorkerDied | EnvAway]:
+    """Return the class of the error of an env that was lost."""
+    return _FAULTS.get(why.kind, WorkerDied)
 
 
 def last_lines(stderr_tail: str) -> str:

@@ -23,7 +23,6 @@ from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, S
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.protocol import exchange, kernel
 from rlightning_aio.protocol.entries import (
-    ANSWERS_WITH_VALUE,
     OP_BITS_ARRAY,
     SLOT_MASK_ARRAY,
     Operation,
@@ -539,7 +538,7 @@ class Requests:
         Values of methods are for nobody else.
         """
         slots = ticket.slots = ticket.own_slots(self.owner)
-        calls = ANSWERS_WITH_VALUE[self.numbering.ops(slots)]
+        calls = self.numbering.awaits_value(slots)
         self.close(ticket)
         called = self.owed(slots[calls])
         self.owner[called] = NOBODY

@@ -8,9 +8,10 @@ and `AwaitedEnvs`).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from rlightning_aio.errors import EnvAway, EnvHung, EpisodeLost, WorkerDied
+from rlightning_aio._core.group.state.host_record import fault_type
+from rlightning_aio.errors import EnvAway, EpisodeLost
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -21,12 +22,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.supervision.fault_messages import CrashLog
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio.errors import EnvRaised
+    from rlightning_aio.errors import EnvRaised, WorkerDied
     from rlightning_aio.outcomes import Loss
     from rlightning_aio.protocol.error_text import ErrorText
-
-_ERRORS: Final[dict[str, type[WorkerDied | EnvAway]]] = {"env_hung": EnvHung, "env_away": EnvAway}
-"""By the kind of an outcome; others are `WorkerDied`."""
 
 
 class EnvLosses:
@@ -85,7 +83,7 @@ class EnvLosses:
         if is_borne:
             self._note_restart(slot, f"{message}; {then}")
         env_id = self._tables.envs.env_ids[slot]
-        fault = _ERRORS.get(why.kind, WorkerDied)(f"{message}; {then}", env_id=env_id)
+        fault = fault_type(why)(f"{message}; {then}", env_id=env_id)
         fault.outcome = why.outcome(env_id)
         fault.env_ids = (env_id,)
         return is_borne, fault

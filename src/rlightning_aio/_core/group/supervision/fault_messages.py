@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
 from rlightning_aio._core.hosts.limits import hung
-from rlightning_aio.errors import EnvAway, EnvHung, StartFailed, WorkerDied
+from rlightning_aio.errors import StartFailed
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, slot_of
 
@@ -153,7 +153,6 @@ def host_loss(
         death=death,
         replaced=replaced,
         resets=not record.is_hardware,
-        kind=_kind_of(record),
         what=what,
         last=last,
         then=then,
@@ -161,12 +160,6 @@ def host_loss(
         env_id=envs.env_ids[slot],
         why=_why(envs, requests, record, death),
     )
-
-
-def _kind_of(record: HostRecord) -> type[WorkerDied | EnvAway]:
-    if record.is_hung:
-        return EnvHung
-    return WorkerDied if record.place is None else EnvAway
 
 
 def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -> Loss:

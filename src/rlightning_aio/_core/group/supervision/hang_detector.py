@@ -43,7 +43,6 @@ class HangDetector:
         self._records = tables.records
         self._requests = tables.requests
         self.any_ending = False
-        self._now = 0.0
         self.due = math.inf
         self._pause = math.inf
 
@@ -81,25 +80,24 @@ class HangDetector:
 
     def check(self, now: float) -> None:
         """Kill workers that have exceeded a limit, and destroy those that survive a kill."""
-        self._now = now
         if now >= self.due:
             self.due = now + self._pause
             for record in self._records:
                 if record.timed and self._in_flight(record):
-                    self.due = min(self.due, self._check_hung(record))
+                    self.due = min(self.due, self._check_hung(record, now))
         if self.any_ending:
             for record in self._records:
                 if record.abort_by and not record.dying:
-                    self._check_aborted(record)
-            self._check_dying()
+                    self._check_aborted(record, now)
+            self._check_dying(now)
             self.any_ending = any(r.dying or r.abort_by for r in self._records)
 
-    def _check_aborted(self, record: HostRecord) -> None:
+    def _check_aborted(self, record: HostRecord, now: float) -> None:
         """Kill a worker whose aborted requests go on."""
         goes_on = self._requests.is_current
         record.abort_by = {entry: by for entry, by in record.abort_by.items() if goes_on(entry)}
         entry = min(record.abort_by, key=record.abort_by.__getitem__, default=0)
-        if entry and self._now >= record.abort_by[entry] and not self.read_news(record):
+        if entry and now >= record.abort_by[entry] and not self.read_news(record):
             self._kill_aborted(record, entry)
 
     def _kill_aborted(self, record: HostRecord, entry: int) -> None:
@@ -116,15 +114,15 @@ class HangDetector:
     def _in_flight(self, record: HostRecord) -> int:
         return self._requests.in_flight[record.host.host_id]
 
-    def _check_hung(self, record: HostRecord) -> float:
+    def _check_hung(self, record: HostRecord, now: float) -> float:
         """Kill a worker that has exceeded a limit, or return the time when it will have."""
         if record.stage is not Stage.UP or record.is_hung or record.aborted_slot is not None:
             return math.inf  # It is starting, or being killed.
         assert record.killable is not None
         entry, _ = current = record.killable.current_request()
-        expiry = self._expiry(record, current)
-        if self._now < expiry or self.read_news(record):
-            return max(expiry, self._now)
+        expiry = self._expiry(record, current, now)
+        if now < expiry or self.read_news(record):
+            return max(expiry, now)
         if entry in record.abort_by:  # It counts as aborted.
             self._kill_aborted(record, entry)
             return math.inf
@@ -136,7 +134,7 @@ class HangDetector:
         self.kill(record, dump=True)
         return math.inf
 
-    def _expiry(self, record: HostRecord, current: tuple[int, int]) -> float:
+    def _expiry(self, record: HostRecord, current: tuple[int, int], now: float) -> float:
         """Return the time when the worker exceeds its limit, if it continues like this."""
         entry, since_ns = current
         if entry and since_ns:
@@ -145,7 +143,7 @@ class HangDetector:
         # A stopped process executes none of its requests.
         progress = self._progress(record, current)
         if progress != record.idle:
-            record.idle, record.idle_since = progress, self._now
+            record.idle, record.idle_since = progress, now
         return record.idle_since + min(record.limits.values())
 
     def _progress(self, record: HostRecord, current: tuple[int, int]) -> tuple[int, ...]:
@@ -156,14 +154,14 @@ class HangDetector:
         # Where all envs wait, the worker says now and then that its event loop runs.
         return self._in_flight(record), entries, record.killable.traffic, *current
 
-    def _check_dying(self) -> None:
+    def _check_dying(self, now: float) -> None:
         """Destroy hosts that a kill has not ended, together with their fork server.
 
         They have twice half the time. If the trainer is stopped in one half, the order to kill, or
         the report of the exit, may have waited for it to make room, and arrives in the other.
         """
         for record in self._records:
-            if not record.dying or self._now < record.die_by or self.read_news(record):
+            if not record.dying or now < record.die_by or self.read_news(record):
                 continue
             if record.halves_left:
                 record.die_by = self._tables.clock() + times.OBEY / 2

@@ -95,8 +95,7 @@ class Renewals:
         record.stage, record.late, record.deaths = Stage.CLOSING, False, {None: 0}
         record.recycled += 1
         record.host.close()
-        record.note_traffic()
-        record.start_by = self._tables.clock() + record.close_seconds
+        record.give_time(self._tables.clock())
         self._note_change()
         text = "entry %r: a worker of %.0f MB was replaced by a new one (recycle)"
         _log.info(text, record.config.name, record.resident_mb)

@@ -117,7 +117,6 @@ class Supervisor:
         self.renewals = Renewals(tables, self.replace, self._update_any_deaths)
         self.losses = EnvLosses(tables, self.crash_log, self._update_any_deaths)
         self._start_fault: Exception | None = None
-        self._now = 0.0
 
     def add(self, host: Host, config: EnvConfig, peer: HostRecord | None = None) -> None:
         """Add a host before the start; its slots follow those of the previous host.
@@ -142,7 +141,6 @@ class Supervisor:
         if self._lifetime.open:
             return self.metas
         try:
-            self._now = now
             first = [record for record in self.records if record.stage is Stage.NEW]
             for record in first:
                 self._launch_first(record)
@@ -160,7 +158,7 @@ class Supervisor:
                 if record.place is not None:  # From now on somebody may dial in, and leave.
                     record.host.attach(AttachOrder((), (), record.close_seconds))
         except BaseException:
-            yield from self.shutdown.close(self._now)
+            yield from self.shutdown.close(self.clock())
             # Its traceback refers to the group, which would then never be garbage-collected.
             self._start_fault = None
             raise
@@ -187,20 +185,20 @@ class Supervisor:
 
     def _until(self, stage: Stage) -> Procedure[None]:
         # Hosts in this process have posted completions already.
-        self._now = yield Wait(0.0)
+        yield Wait(0.0)
         while any(r.stage.value < stage.value for r in self.records):
             if self._start_fault is not None:
                 raise self._start_fault
-            self._now = yield Wait(earliest(*(r.start_by for r in self.records)))
+            now = yield Wait(earliest(*(r.start_by for r in self.records)))
             if self._lifetime.closed:
                 raise GroupClosed("the group was closed while it was starting")
-            self._check_start_times()
+            self._check_start_times(now)
         if self._start_fault is not None:
             raise self._start_fault
 
-    def _check_start_times(self) -> None:
+    def _check_start_times(self, now: float) -> None:
         for record in self.records:
-            if record.start_by is None or self._now < record.start_by:
+            if record.start_by is None or now < record.start_by:
                 continue
             if self.detector.read_news(record) or record.note_traffic():
                 if not record.late:
@@ -363,12 +361,11 @@ class Supervisor:
 
     def check(self, now: float) -> None:
         """Restart hosts that are due, and find workers that hang."""
-        self._now = now
         if not self._lifetime.open:
             raise GroupClosed("the group was closed while this call was waiting")
         self.look_by = now + LOOK_SECONDS
         if self.any_deaths:
-            self._check_start_times()
+            self._check_start_times(now)
             for record in self.records:
                 self._restart(record, now)
         if now >= self.detector.due or self.detector.any_ending:
