@@ -122,10 +122,10 @@ def test_error_has_the_output_of_the_worker_and_its_stack(start: Start) -> None:
 
 @on_one_driver
 def test_raise_names_the_env_that_was_being_executed(start: Start) -> None:
-    """Of several envs in the worker, the error names the one that was stepping."""
+    """Of several envs in the worker, the error names the one that was stepping, not the first."""
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
     with pytest.raises(WorkerDied, match="env 'faulty-3'") as caught:
-        group.step(tokens.steps(group.group.env_ids, {"faulty-3": "exit 3"}))
+        group.step(tokens.steps(group.group.env_ids[::-1], {"faulty-3": "exit 3"}))
     error = caught.value
     assert error.env_id == "faulty-3"
     assert "faulty-3" in error.env_ids

@@ -79,22 +79,6 @@ class Hidden(random.Random):
         raise TypeError("it can't be read")
 
 
-class Tells(Walk):
-    options: Any
-
-    def told(self) -> Any:
-        return self.options
-
-
-def test_infos_that_are_read_later_are_those_of_their_worker() -> None:
-    """Though the host has had another worker since, which announced other infos."""
-    with rl.build_env_group(EnvConfig(task=Tells, recycle={"episodes": 1})) as group:
-        kept: list[Any] = []
-        while group.metrics()["envs/recycled"] < 2:
-            kept.append(group.reset(options={str(len(kept)): 1})[0])
-        assert [batch.info() for batch in kept] == [[{str(k): 1}] for k in range(len(kept))]
-
-
 def test_env_that_cannot_be_read_begins_with_a_fresh_generator() -> None:
     with rl.build_env_group(
         EnvConfig(task=partial(Fresh, hides=True), recycle={"episodes": 1})

@@ -70,7 +70,7 @@ class Play(Session):
         self.trace: Any = None
         self.collecting = False
         self.kept: list[tuple[Any, Any]] = []
-        self.unread: list[tuple[BatchedData, dict[str, Any]]] = []
+        self.unread: list[tuple[BatchedData, list[dict[str, Any]]]] = []
         self.owners = 0
         self.nested: set[str] = set()
         self.written: dict[str, Any] = {}
@@ -114,9 +114,9 @@ class Play(Session):
             client.check_done()
         for columns, copies in self.kept:
             require(same(columns, copies), "a result was overwritten", columns, copies)
-        for part, sent in self.unread:
-            own = {name: part.sent[name] for name in part.sent}
-            require(same(own, sent), "what was sent reads differently later", own, sent)
+        for part, right in self.unread:
+            own = [{name: part.sent[name] for name in part.sent}, part.infos]
+            require(same(own, right), "sent or infos read differently later", own, right)
 
     async def look_at_tasks(self, *, wait: bool = False) -> None:
         """Raise what tasks have raised, and forget those that have ended."""
@@ -333,7 +333,7 @@ class Play(Session):
             unread = part.take(list(range(len(part))))
             sent = {name: part.sent[name] for name in part.sent}
             columns.append(sent)
-            self.unread.append((unread, pickle.loads(pickle.dumps(sent))))
+            self.unread.append((unread, pickle.loads(pickle.dumps([sent, part.infos]))))
             self.kept.append((columns, pickle.loads(pickle.dumps(columns))))
 
     def check_stats(self) -> None:
