@@ -74,8 +74,7 @@ class Aborts:
         self._sums.note_failures(new, _WHY.kind)
         self._lose(new)
         self._supervisor.places.drop_unwanted(new)
-        for host_id, entry in self._supervisor.detector.abort(new, now):
-            requests.end(host_id, entry)
+        self._supervisor.detector.abort(new, now)
         self._waiting.poll()
         self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
         chosen = set(slots.tolist())

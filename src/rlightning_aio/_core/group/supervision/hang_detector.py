@@ -52,26 +52,25 @@ class HangDetector:
             pause = times.between_looks(record.limits.values())
             self.due, self._pause = 0.0, min(self._pause, pause)
 
-    def abort(self, slots: NDArray[np.intp], now: float) -> list[tuple[int, int]]:
+    def abort(self, slots: NDArray[np.intp], now: float) -> None:
         """Have hosts end the outstanding requests of `slots`, which are aborted.
 
-        A host that can't, and that can be killed, is killed if they don't end soon. Returns host
-        and entry of those that were held for a replacement, and are no longer.
+        A host that can't, and that can be killed, is killed if they don't end soon. Those that are
+        held for a replacement end here.
         """
         self._tables.stop_hardware(slots.tolist())
         entries, hosts = self._requests.numbering.entry[slots], self._requests.hosts[slots]
-        no_longer_held: list[tuple[int, int]] = []
         found: list[int] = sorted({*hosts.tolist()})
         for host_id in found:
             record, own = self._records[host_id], entries[hosts == host_id]
             if record.is_down:
-                no_longer_held += [(host_id, entry) for entry in record.drop_held(own)]
+                for entry in record.drop_held(own):
+                    self._requests.end(host_id, entry)
                 continue
             record.host.abort(own)
             if record.killable is not None:
                 record.abort_by |= dict.fromkeys(own.tolist(), now + times.ABORT)
                 self.any_ending = True
-        return no_longer_held
 
     def expiries(self) -> list[float | None]:
         """Return the times, besides `due`, when `check` must be called."""

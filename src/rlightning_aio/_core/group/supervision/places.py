@@ -134,17 +134,16 @@ class Places:
     def hold(
         self, record: HostRecord, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
-        """Hold a request, which is not in flight meanwhile, until a client dials in."""
+        """Hold the request of the only env, which is not in flight, until a client dials in."""
         record.held.append((entries, arguments))
-        self._requests.in_flight[record.host.host_id] -= len(entries)
-        self.num_held += len(entries)
+        self._requests.in_flight[record.host.host_id] -= 1
+        self.num_held += 1
 
     def release(self, record: HostRecord) -> list[tuple[NDArray[np.int64], Sequence[Any] | None]]:
         """Return what a place has held, and count it as in flight."""
         held, record.held = record.held, []
-        for entries, _ in held:
-            self._requests.in_flight[record.host.host_id] += len(entries)
-            self.num_held -= len(entries)
+        self._requests.in_flight[record.host.host_id] += len(held)
+        self.num_held -= len(held)
         return held
 
     def held(self) -> dict[int, list[HostRecord]]:
@@ -159,7 +158,7 @@ class Places:
     def drop(self, records: Sequence[HostRecord]) -> NDArray[np.intp]:
         """Take away the requests that places hold; return the slots. None of them is in flight."""
         for record in records:
-            self.num_held -= sum(len(entries) for entries, _ in record.held)
+            self.num_held -= len(record.held)
             record.held = []
             if record.place is not None:
                 record.place.drop_reset()

@@ -429,19 +429,13 @@ class Supervisor:
         record.restarts += record.was_shown
         record.deaths = {slot: count for slot, count in record.deaths.items() if count}
         self.places.take(record, taken)
-        meta = self.metas[slot]
-        self.metas[slot] = taken.started.meta.model_copy(
-            update={"max_episode_steps": self._envs.step_limits.item(slot) or None}
-        )
-        if meta.action_space is None:  # The first client decides for all places of its entry.
-            for other in range(self._envs.num_local, len(self._envs)):
-                if self._envs.configs[other] is self._envs.configs[slot] and other != slot:
-                    self.metas[other] = self.metas[slot].model_copy(
-                        update={
-                            "env_id": self._envs.env_ids[other],
-                            "max_episode_steps": self._envs.step_limits.item(other) or None,
-                        }
-                    )
+        # The first client decides for all places of its entry.
+        is_first, envs = self.metas[slot].action_space is None, self._envs
+        for other in range(envs.num_local, len(envs)):
+            if other == slot or (is_first and envs.configs[other] is envs.configs[slot]):
+                most = envs.step_limits.item(other) or None
+                update = {"env_id": envs.env_ids[other], "max_episode_steps": most}
+                self.metas[other] = taken.started.meta.model_copy(update=update)
         self._update_any_deaths()
         return self.places.release(record)
 
@@ -527,7 +521,7 @@ class Supervisor:
         self._tables.conditions.note(DEATH, any_deaths)
 
 
-def _refusal(record: HostRecord, why: OSError | str) -> str:
+def _refusal(record: HostRecord, why: OSError) -> str:
     refusal = f"can't start a worker for entry {record.config.name!r}: {why}"
     if isinstance(why, ConnectionError):
         return refusal
