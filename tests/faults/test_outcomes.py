@@ -77,18 +77,6 @@ def test_a_lost_episode_says_so_and_blames_no_neighbour(
     assert "f-0" in found["f-1"].cause
 
 
-@pytest.mark.parametrize(
-    ("deed", "kind", "blame"), [(DIE, "env_died", "env"), (HANG, "env_hung", "either")]
-)
-def test_a_worker_that_is_not_replaced_says_the_same(
-    start: Start, deed: int, kind: str, blame: str
-) -> None:
-    group = start(entry(num_workers=1, on_worker_death="raise"))
-    with pytest.raises(rl.WorkerDied) as caught:
-        step(group, deed)
-    assert said(caught.value.outcome) == (kind, blame, "f-0")
-
-
 def test_a_reset_that_hangs_is_not_the_policys(start: Start) -> None:
     group = start(entry(num_workers=1, on_worker_death="raise"))
     with pytest.raises(rl.EnvHung) as caught:
@@ -107,14 +95,6 @@ def test_awaitable_envs_say_the_same(start: Start, placement: str) -> None:
     with pytest.raises(rl.EnvRaised) as caught:
         group.reset(options={"deed": RAISE})
     assert said(caught.value.outcome) == ("not_started", "env", "f-0")
-
-
-def test_an_aborted_request_is_the_callers(start: Start) -> None:
-    group = start(entry(num_workers=1, step_timeout=None))
-    group.step_async(actions_of(group, HANG))
-    group.abort(["f-0"])
-    outcome = step(group, GO).outcome[0]
-    assert said(outcome) == ("cancelled", "caller", "f-0")
 
 
 def test_sub_environments_have_outcomes_of_their_own(start: Start) -> None:

@@ -293,5 +293,5 @@ async def test_an_episode_that_is_aborted_counts_once(num_aborts: int) -> None:
         group.step_async(batch.respond(action=[HANG_UP]))
         await asyncio.gather(*(group.abort() for _ in range(num_aborts)))
         batch, _ = await group.step(batch.respond(action=[GO]))
-        assert [one.kind for one in batch.outcome] == ["cancelled"]
+        assert [(one.kind, one.blame) for one in batch.outcome] == [("cancelled", "caller")]
         assert numbers(group).outcomes_cancelled == 1
