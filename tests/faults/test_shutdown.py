@@ -345,30 +345,6 @@ def test_an_unread_stderr_delays_nobody() -> None:
     assert 0 < written.count("e" * 1023 + "\n") < 3000
 
 
-def test_child_of_the_trainer_does_not_end_its_group() -> None:
-    """A forked child that drops its copy of the group doesn't affect the parent's."""
-    script = """
-        group = build(); group.init(); group.reset()
-        for end in ("os._exit(0)", "sys.exit(0)", "del group; os._exit(0)"):
-            child = os.fork()
-            if child == 0:
-                exec(end)
-            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-            for _ in range(3):
-                tokens.check(group.step(tokens.steps(group.env_ids))[0])
-            kill(group["faulty-0"].call("returns", os.getpid))
-            batch, _ = group.step(tokens.steps(group.env_ids))
-            say(batch["faulty-0"].info["worker_restarted"])
-        group.close()
-        say("closed")
-    """
-    with trainer(script, stderr=None) as process:
-        assert process.stdout is not None
-        *restarts, _ = read_until(process.stdout, "closed")
-        assert ["SIGKILL" in restart for restart in restarts] == [True] * 3
-        assert process.wait(HANG) == 0
-
-
 USES_IN_A_CHILD = """
 async def use_in_child(group):
     for use in (
