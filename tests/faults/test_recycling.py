@@ -102,6 +102,7 @@ def reset_until_recycled(group: Any) -> None:
     deadline = time.monotonic() + 60
     while not group.metrics()["envs/recycled"]:
         group.reset()
+        assert "1 env, placement process" in repr(group)
         assert time.monotonic() < deadline
 
 

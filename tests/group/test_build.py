@@ -115,6 +115,7 @@ def test_init_logs_what_it_has_started(caplog: pytest.LogCaptureFixture) -> None
         group.init()
         envs = "a: 2 envs of 3 sub-environments, placement inline, 0 worker processes"
         assert repr(group) == f"EnvGroup({envs})"
+    assert repr(group) == f"EnvGroup({envs})"
     (text,) = [record.getMessage() for record in caplog.records]
     assert text.startswith("started within ")
     assert text.endswith(envs)

@@ -47,11 +47,12 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        return [
-            self._described(record, now_ns)
-            for record in self._tables.records
-            if record.peer is None or len(self._tables.slots_of(record))
-        ]
+        return [self._described(record, now_ns) for record in self._with_envs()]
+
+    def _with_envs(self) -> list[HostRecord]:
+        """Return the hosts, of two peers those that have any env now."""
+        slots_of = self._tables.slots_of
+        return [r for r in self._tables.records if r.peer is None or len(slots_of(r))]
 
     def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
         env_ids, requests = self._envs.env_ids, self._tables.requests
@@ -91,9 +92,25 @@ class Workers:
     def summary(self) -> str:
         """Summarise entries, envs, placement and worker processes in one line."""
         entries: dict[str, list[HostRecord]] = {}
-        for record in (r for r in self._tables.records if r.stage is not Stage.CLOSED):
+        for record in self._with_envs():
             entries.setdefault(record.config.name, []).append(record)
-        return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
+        return "; ".join(f"{name}: {self._entry(own)}" for name, own in entries.items())
+
+    def _entry(self, records: Sequence[HostRecord]) -> str:
+        config, count = records[0].config, len(records)
+        if records[0].place is not None:
+            return f"{count} place{'' if count == 1 else 's'} for clients"
+        slots = np.concatenate([self._tables.slots_of(record) for record in records])
+        # Only its spaces say so of an env that a callable has made.
+        each: list[int] = self._envs.num_sub_envs[slots].tolist()
+        sizes = f" of {each[0]} sub-environments" if each[0] > 1 else ""
+        if len({*each}) > 1:
+            sizes = f" with {sum(each)} sub-environments"
+        workers = sum(record.killable is not None for record in records)
+        return (
+            f"{len(each)} env{'' if len(each) == 1 else 's'}{sizes}, placement {config.placement}, "
+            f"{workers} worker process{'' if workers == 1 else 'es'}"
+        )
 
 
 class Overdue:
@@ -141,20 +158,3 @@ class Overdue:
 def _listed(names: Sequence[str]) -> str:
     more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
     return ", ".join(names[:_MOST_LISTED]) + more
-
-
-def _entry(records: Sequence[HostRecord]) -> str:
-    config = records[0].config
-    if records[0].place is not None:
-        return f"{len(records)} place{'' if len(records) == 1 else 's'} for clients"
-    envs = sum(len(record.slots) for record in records)
-    # Only its spaces say so of an env that a callable has made.
-    each = [env.meta.num_envs for r in records for env in r.started] or [config.num_envs] * envs
-    sizes = f" of {each[0]} sub-environments" if each[0] > 1 else ""
-    if len({*each}) > 1:
-        sizes = f" with {sum(each)} sub-environments"
-    workers = sum(record.killable is not None for record in records)
-    return (
-        f"{envs} env{'' if envs == 1 else 's'}{sizes}, placement {config.placement}, "
-        f"{workers} worker process{'' if workers == 1 else 'es'}"
-    )
