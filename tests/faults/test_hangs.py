@@ -237,23 +237,6 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
 
 
-@on_one_driver
-def test_a_replacement_that_hangs_is_found_without_any_wait(start: Start, tmp_path: Path) -> None:
-    """The worker died idle, so the first request was a plain reset."""
-    broken = tmp_path / "broken"
-    kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
-    tokens = Tokens()
-    for member in group.group._core.supervisor.records:
-        member.config = member.config.model_copy(update={"start_timeout": LIMIT})
-    broken.touch()
-    os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)
-    while not group.group._core.supervisor.any_deaths:
-        group.step(tokens.steps(["faulty-2"]))
-    with pytest.raises(WorkerDied, match="did not start again"):
-        group.reset()
-
-
 def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> None:
     """Nothing is lost, doubled, or mixed up with another request."""
     group, tokens = start(two_workers(step_timeout=60)), Tokens()
