@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch.contents import reported_info_list
 from rlightning_aio.batch.infos import vector_infos
-from rlightning_aio.trees import index
-from rlightning_aio.vector.spaces import replaced
+from rlightning_aio.trees import index, mapped
+from rlightning_aio.vector.spaces import merged
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,7 +69,8 @@ def with_deaths(
         else:
             each[k] = cause
     if mode != AutoresetMode.SAME_STEP:
-        observations = replaced(observations, last, chosen)
+        kept = mapped(lambda column: [column[k] for k in chosen.tolist()], last)
+        observations = merged(observations, kept, chosen, len(batch))
     truncated = batch.truncated & (lost | ~restarted)
     infos = vector_infos(each)
     return Stepped(observations, batch.reward, batch.terminated, truncated, infos), lost

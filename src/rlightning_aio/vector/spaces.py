@@ -30,34 +30,22 @@ def batched(space: gym.Space[Any], observations: Any) -> Any:
     return zipped(part_of, tree_of(space), observations)
 
 
-def replaced(columns: Any, others: Any, chosen: NDArray[np.intp]) -> Any:
-    """Copy `columns`, with the rows `chosen` taken from `others`."""
-
-    def mixed(column: Any, other: Any) -> Any:
-        copy = column.copy()
-        for k in chosen.tolist():
-            copy[k] = other[k]
-        return copy
-
-    return zipped(mixed, columns, others)
-
-
 def merged(before: Any, now: Any, chosen: NDArray[np.intp], count: int) -> Any:
     """Observations of all `count` envs: those of `before`, with `now` in the rows `chosen`."""
 
     def whole_of(now: Any, before: Any = None) -> Any:
-        if isinstance(now, np.ndarray):
-            array = cast("NDArray[Any]", now)
-            shape = (count, *array.shape[1:])
-            whole = np.zeros(shape, array.dtype) if before is None else before.copy()
-            whole[chosen] = array
-            return whole
-        values: list[Any] = [None] * count if before is None else list(before)
+        whole = before.copy() if before is not None else _empty(now, count)
         for k, value in zip(chosen.tolist(), now, strict=True):
-            values[k] = value
-        return values
+            whole[k] = value
+        return whole
 
     return mapped(whole_of, now) if before is None else zipped(whole_of, now, before)
+
+
+def _empty(column: Any, count: int) -> Any:
+    if isinstance(column, list):
+        return [None] * count
+    return np.zeros((count, *column.shape[1:]), column.dtype)
 
 
 def spread(infos: dict[str, Any], chosen: NDArray[np.intp], count: int) -> dict[str, Any]:
