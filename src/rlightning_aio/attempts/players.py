@@ -11,8 +11,6 @@ from rlightning_aio.attempts.spec import EpisodeSpec
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from rlightning_aio.outcomes import Outcome
 
 
@@ -116,15 +114,10 @@ class Players:
             return {"task": spec.task, **(spec.options or {})}
         return None if spec.options is None else {**spec.options}
 
-    def can_play(self, entries: Iterable[str]) -> bool:
-        """Return True unless all envs of one of these entries are left alone."""
+    def entries_left(self) -> set[str]:
+        """The entries with an env that is not left alone."""
         alone = self.left_alone
-        left = {entry for env_id, entry in self.entry_of.items() if env_id not in alone}
-        return not alone or left.issuperset(entries)
-
-    def is_nobody_left(self) -> bool:
-        """Return True if all envs are left alone."""
-        return self.entry_of.keys() <= self.left_alone
+        return {entry for env_id, entry in self.entry_of.items() if env_id not in alone}
 
     def refusal(self, env_id: str) -> RLightningError:
         """The error for attempts that only an env which is left alone could play."""

@@ -14,15 +14,18 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 from weakref import WeakSet
 
-from rlightning_aio._core.group.api.facade import is_resettable, stop_hardware
+from rlightning_aio._core.group.api.facade import (
+    is_resettable,
+    numbers_of_attempts,
+    stop_hardware,
+)
 from rlightning_aio.attempts.clock import Clock
 from rlightning_aio.attempts.episode import AttemptInPlay
 from rlightning_aio.attempts.file import ResultsFile
 from rlightning_aio.attempts.health import Health
-from rlightning_aio.attempts.numbers import Numbers
 from rlightning_aio.attempts.players import Players
 from rlightning_aio.attempts.queue import LOOK_SECONDS, AttemptQueue
 from rlightning_aio.attempts.records import Attempt, AttemptGroup
@@ -30,7 +33,7 @@ from rlightning_aio.attempts.rules import Rules, needed
 from rlightning_aio.attempts.tasks import TaskSource, spec_of_task
 from rlightning_aio.attempts.tries import Try, surely
 from rlightning_aio.errors import EnvBusy, RLightningError
-from rlightning_aio.outcomes import Outcome
+from rlightning_aio.outcomes import Outcome, OutcomeKind
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterable, Iterable
@@ -45,6 +48,10 @@ _MOST_LACKING: Final = 1000
 """Most attempts that wait for entries without an env while tasks are read for the others."""
 _LAST: Final = 100
 """Attempts among which failures are counted."""
+_NUMBERS: Final = (
+    *("playing", "waiting", "groups_waiting", "lag", "seconds_blocked"),
+    *("seconds_in_agents", "retries", *(f"outcomes_{kind}" for kind in get_args(OutcomeKind))),
+)
 _in_play: Final[WeakSet[EnvGroup]] = WeakSet()
 _SURPLUS: Final = "enough other attempts at its task have ended"
 
@@ -148,6 +155,34 @@ def _is_bug(outcome: Outcome) -> bool:
     return outcome.kind == "agent_raised" and outcome.blame == "caller"
 
 
+class _Numbers:
+    """What `metrics` of a group has of the attempts of `play`, as sums over all its calls.
+
+    docs/metrics.md explains every number.
+    """
+
+    def __init__(self, group: Any) -> None:
+        self._numbers = numbers_of_attempts(group)
+        for name in _NUMBERS:
+            self._numbers.setdefault(f"attempts/{name}", 0)
+        self._blocked = 0.0
+
+    def note(self, clock: Clock, **now: int) -> None:
+        """Note how many attempts and groups there are now, and for how long nothing could run."""
+        self._numbers.update({f"attempts/{name}": number for name, number in now.items()})
+        self._numbers["attempts/lag"] = clock.lag
+        self._add("seconds_blocked", clock.blocked - self._blocked)
+        self._blocked = clock.blocked
+
+    def note_end(self, outcome: Outcome, *, is_retried: bool) -> None:
+        """Note the end of a try."""
+        self._add("seconds_in_agents", outcome.seconds.agent)
+        self._add("retries" if is_retried else f"outcomes_{outcome.kind}", 1)
+
+    def _add(self, name: str, number: float) -> None:
+        self._numbers[f"attempts/{name}"] += number
+
+
 class _Engine:
     """The attempts in progress.
 
@@ -179,7 +214,7 @@ class _Engine:
         self._turns = asyncio.Semaphore(rules.max_concurrency or sys.maxsize)
         self._health = Health()
         self._clock = Clock()
-        self._numbers = Numbers(group)
+        self._numbers = _Numbers(group)
         # Of a turn: what may begin now, and when more may, are asked of one moment, as a wait
         # would miss what comes between two.
         self._now = 0.0
@@ -213,7 +248,8 @@ class _Engine:
                 if self._begin():
                     await asyncio.sleep(0)
                     continue
-                self._check_envs()
+                if not self._playing:
+                    self._queue.check_players(have_more=not self._source.is_at_end)
                 self._count()
                 waiting = len(self._queue)  # Some may wait until an env has rested.
                 if not (self._playing or waiting) and self._source.is_at_end:
@@ -380,16 +416,3 @@ class _Engine:
         is_complete = task.num_whole >= needed(self._rules, self._size)
         self.done.append(AttemptGroup(task.spec, attempts, is_complete))
         self.news.set()
-
-    # -- envs that are not there ------------------------------------------------------
-
-    def _check_envs(self) -> None:
-        """Raise an error if attempts wait for envs that only their user resets."""
-        queue = self._queue
-        if self._playing:
-            return
-        queue.check_players()
-        if queue.free or self._source.is_at_end:
-            return
-        if queue.players.left_alone and queue.players.is_nobody_left():
-            raise queue.players.refusal(min(queue.players.left_alone))

@@ -352,9 +352,12 @@ class AttemptQueue:
             if env_id in present:
                 self.free.setdefault(env_id)
 
-    def check_players(self) -> None:
-        """Raise an error if attempts wait for envs that only their user resets."""
-        players = self.players
-        if players.can_play(self._entries()) and players.left_alone.isdisjoint(self._pinned_to()):
-            return
-        raise players.refusal(min(players.left_alone))
+    def check_players(self, *, have_more: bool) -> None:
+        """Raise an error if attempts wait, or `have_more` to come, for envs that only their user
+        resets.
+        """
+        players, alone = self.players, self.players.left_alone
+        left = players.entries_left()
+        is_possible = left.issuperset(self._entries()) and alone.isdisjoint(self._pinned_to())
+        if not (is_possible and (left or not have_more)):
+            raise players.refusal(min(alone))
