@@ -381,7 +381,8 @@ class Collector(Generic[G, R]):
         left = sorted(self._failed.difference(pending))
         to_reset = [env_id for env_id in left if is_resettable(self._group, env_id)]
         alone = [env_id for env_id in left if env_id not in to_reset]  # Until the program asks.
-        if alone and (self._block or not (to_reset or self._has_others())):
+        others = to_reset or self._expecting or self._unanswered
+        if alone and (self._block or not others):
             raise self._refusal(alone[0], self._asks_for(alone[0]))
         if to_reset:
             self._group.reset_async(env_ids=to_reset)
@@ -397,10 +398,6 @@ class Collector(Generic[G, R]):
             f"env {env_id!r} was lost or has raised an error, and may move something real, so it "
             f"is reset only if you ask for it: {remedy}"
         )
-
-    def _has_others(self) -> bool:
-        """Return True if results are there or may come."""
-        return bool(self._expecting or self._unanswered)
 
     # -- blocks -------------------------------------------------------------------
 
