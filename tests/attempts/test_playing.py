@@ -160,6 +160,8 @@ async def test_an_agent_that_takes_too_long(
         elif deed != "think":
             with contextlib.suppress(rl.EnvRaised):
                 await episode.step(deed)
+            with pytest.raises(rl.RLightningError, match="has failed"):  # Nothing can mend that.
+                await episode.step(1)
         thinking.append(time.monotonic())
         await asyncio.sleep(3600)
 

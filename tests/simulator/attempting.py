@@ -146,6 +146,8 @@ class Attempts(InContext):
                 await episode.step(action_of(env, [act]), **columns)
             except EnvFault as fault:
                 if rng.random() < 0.3:
+                    with self.expected(RLightningError, "a step after one that has failed"):
+                        await episode.step(None)
                     return fault.outcome.kind
                 raise
             played.acts.append(act)

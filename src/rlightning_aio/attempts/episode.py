@@ -101,7 +101,7 @@ class AttemptEpisode:
         Raises:
             EnvRaised: its reward is None or not a finite number; the attempt has failed.
             EpisodeLost: the env was replaced; the attempt has failed.
-            EnvFault: the env has raised, or is gone.
+            EnvFault: the env has raised, or is gone; the attempt has failed.
             BadAction: the action doesn't fit; nothing was sent.
             RLightningError: the attempt is over, as its episode is: look at `is_over`.
         """
@@ -112,9 +112,12 @@ class AttemptEpisode:
                 "an agent should look at `episode.is_over` before each step"
             )
         kept = copied({"action": action, **columns})
-        result = await self._timed(
-            self._episode.step(PolicyResponse(self.env_id, action, **columns))
-        )
+        response = PolicyResponse(self.env_id, action, **columns)
+        try:
+            result = await self._timed(self._episode.step(response))
+        except EnvFault:
+            self._over = "has failed: its env has raised an error in a step, or is gone"
+            raise
         reward = float(summed_rewards(result.last_reward).sum())
         if not math.isfinite(reward):
             raise self._without_reward(reward)
