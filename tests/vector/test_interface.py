@@ -101,6 +101,14 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         env.step(np.zeros(3, np.int64))
     with pytest.raises(BadAction):
         env.step(np.array([0.0, np.nan]))
+    with pytest.raises(TypeError, match="nothing was sent"):
+        env.reset(options={"reset_mask": np.array([False, True]), "odd": (_ for _ in ())})
+    env.step(np.zeros(2, np.int64))
+    with pytest.raises(TypeError, match="can't be sent"):  # The first reset was.
+        env.reset(options=[{}, {"odd": (_ for _ in ())}])
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros(2, np.int64))
+    env.reset()
     assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [1, 1]
     env.step_async(np.zeros(2, np.int64))
     with pytest.warns(UserWarning, match="pending call to `step`"):

@@ -6,7 +6,7 @@ import copy as copying
 import math
 import multiprocessing
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -42,7 +42,7 @@ from rlightning_aio.vector.interface import (
 from rlightning_aio.vector.spaces import adopted_spaces, batched, merged, spread
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -225,16 +225,16 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             self._check_whole()
         else:
             self._drop_outstanding()
-        self._is_whole = False
         if mask is None:
             drop_unraised(self.group)
         places = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         group, env_ids = self.group, self.group.env_ids
         # As many at once as have the same options.
         alike = all(each[k] is each[places[0]] for k in places)
-        for some in [places] if alike else [[k] for k in places]:
-            own = {env_ids[k]: int(seeds[k]) for k in some if seeds[k] is not None}
-            group.reset_async(own, each[some[0]], [env_ids[k] for k in some])
+        with self._unless_refused(TypeError):
+            for some in [places] if alike else [[k] for k in places]:
+                own = {env_ids[k]: int(seeds[k]) for k in some if seeds[k] is not None}
+                group.reset_async(own, each[some[0]], [env_ids[k] for k in some])
         return mask
 
     def _drop_outstanding(self) -> None:
@@ -331,17 +331,14 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
 
     def _send_steps(self, responses: BatchedData) -> None:
         """Send steps, and resets to those envs that have lost their episodes in the last one."""
-        lost, self._is_whole = self._lost, False
-        try:
+        lost = self._lost
+        with self._unless_refused(BadAction):
             if lost is None:
                 self.group.step_async(responses)
                 return
             self._due |= lost
             if not lost.all():
                 self.group.step_async(responses.take(np.flatnonzero(~lost).tolist()))
-        except BadAction:
-            self._is_whole = True  # Nothing was sent.
-            raise
         self.group.reset_async(env_ids=self._ids(np.flatnonzero(lost).tolist()))
 
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
@@ -375,6 +372,16 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         return last._replace(observations=observations, infos=vector_infos(each))
 
     # -- both -------------------------------------------------------------------------
+
+    @contextmanager
+    def _unless_refused(self, refusal: type[Exception]) -> Generator[None]:
+        """Note that a call is not at its end, unless it is refused and nothing was sent."""
+        was_whole, self._is_whole = self._is_whole, False
+        try:
+            yield
+        except refusal:
+            self._is_whole = was_whole and not self.group.pending
+            raise
 
     def _check_whole(self) -> None:
         if not self._is_whole:
@@ -441,12 +448,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """Make a call that leaves episodes alone; Ctrl-C leaves it in flight, an error doesn't."""
         check_free(self, self._pending, what)
         self._check_whole()
-        self._is_whole = False
-        try:
+        with self._unless_refused(Exception):
             found = call()
-        except Exception:
-            self._is_whole = True
-            raise
         self._is_whole = True
         return found
 
@@ -500,12 +503,8 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
         """
         check_free(self, self._pending, "restore")
         self._drop_outstanding()
-        was_whole, self._is_whole = self._is_whole, False
-        try:
+        with self._unless_refused(SnapshotError):
             batch, _ = self.group.restore(snapshot)
-        except SnapshotError:
-            self._is_whole = was_whole
-            raise
         return self._begun(batch, None)
 
     # -- the end ----------------------------------------------------------------------
