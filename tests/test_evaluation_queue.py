@@ -486,6 +486,8 @@ def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) 
         found = evaluate(group, nothing, QUEUE[:4], video=tmp_path)
     lengths = sorted(record.length or 0 for record in found.attempts)
     assert lengths == [min(k, limit) for k in (1, 2, 3, 4)]
+    cut = [one.outcome.cause for one in found.attempts if one.outcome.kind == "truncated"]
+    assert all("step limit" in cause for cause in cut)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["env-1-seed-0.mp4"]
 

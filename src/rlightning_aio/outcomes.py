@@ -111,7 +111,11 @@ def is_bystanders(outcome: Outcome) -> bool:
 
 
 def own_end(
-    env_id: str, info: Mapping[str, Any], *, terminated: bool, cut: str = "its env cut it"
+    env_id: str,
+    info: Mapping[str, Any],
+    *,
+    terminated: bool,
+    cut: str = "its env or the step limit cut it",
 ) -> Outcome:
     """The outcome of an episode that its last result has ended.
 

@@ -269,8 +269,7 @@ class Try:
         last = self._view.last
         if self._view.has_ended:
             terminated = bool(np.all(all_agents(last.last_terminated)))
-            cut = "its env or the step limit cut it"
-            return own_end(self.env_id, last.info, terminated=terminated, cut=cut)
+            return own_end(self.env_id, last.info, terminated=terminated)
         return Outcome("truncated", "policy", "the agent finished it", self.env_id)
 
     def _raised(self, error: BaseException) -> Outcome:
