@@ -148,12 +148,8 @@ class Loss(NamedTuple):
     blame: Blame
     at_fault: str | None = None
 
-    def concerns(self, env_id: str) -> bool:
-        """Return True if an env itself may be at fault, and not another one of its worker."""
-        return self.at_fault in (None, env_id)
-
     def outcome(self, env_id: str) -> Outcome:
         """The outcome of the episode that an env has lost; see `is_bystanders`."""
-        if self.concerns(env_id):
+        if self.at_fault is None or self.at_fault == env_id:
             return Outcome(self.kind, self.blame, self.cause, env_id)
-        return bystanders(self.cause, str(self.at_fault), env_id)
+        return bystanders(self.cause, self.at_fault, env_id)

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio.collecting import Rollout
-from rlightning_aio.collecting.rollout import Ends
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,7 +32,7 @@ def rollout_of(
     others = np.union1d(np.flatnonzero(columns["done"]), np.array(cuts, int))
     places = np.concatenate([lasts, np.setdiff1d(others, lasts)]).astype(np.intp)
     empty = np.zeros((len(places), 1))
-    return Rollout(columns, Ends(places, empty), {})
+    return Rollout(columns, places, empty, {}, {})
 
 
 def cleanrl(
@@ -88,7 +87,7 @@ def test_each_agent_has_its_own_advantages() -> None:
         for name in ("reward", "terminated", "truncated", "done")
     }
     columns["index"] = block.index
-    both = Rollout(columns, Ends(block.ends, np.zeros((1, 1))), {})
+    both = Rollout(columns, block.ends, np.zeros((1, 1)), {}, {})
     values = {"a": np.zeros(2), "b": np.zeros(2)}
     found = both.advantages(values, {"a": [9.0], "b": [9.0]}, 0.5, 1.0)
     assert found["a"].tolist() == [1 + 0.5 * 2, 2.0]
@@ -183,7 +182,7 @@ def test_values_after_an_agents_end_are_ignored(number: float) -> None:
     ends = np.array([2], np.intp)
     columns = {name: {"a": block[name]} for name in ("reward", "terminated", "truncated", "done")}
     columns["index"] = block.index
-    rollout = Rollout(columns, Ends(ends, np.zeros((1, 1))), {})
+    rollout = Rollout(columns, ends, np.zeros((1, 1)), {}, {})
     values = {"a": np.array([0.0, 0.0, number])}
     gains = rollout.advantages(values, {"a": [9.0]}, 0.5, 1.0)
     assert gains["a"][:2].tolist() == [1 + 0.5 * 2, 2.0]

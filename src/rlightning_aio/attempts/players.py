@@ -48,15 +48,14 @@ class Players:
         self.present: set[str] = set()
         self.refresh()
 
-    def refresh(self) -> set[str]:
-        """Look which envs are there now; return those that are."""
+    def refresh(self) -> None:
+        """Look which envs are there now."""
         present: set[str] = set()
         for worker in self._group.get_workers():
             if worker["state"] != "empty":
                 present.update(worker["env_ids"])
         self.left_alone.update(lost_hardware(self._group))
         self.present = present - self.left_alone
-        return self.present
 
     def note(self, outcome: Outcome) -> None:
         """Leave what moves something real alone after a failure of it."""

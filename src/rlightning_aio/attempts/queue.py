@@ -14,7 +14,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.attempts.players import Players
-from rlightning_aio.attempts.rules import is_of_env, is_unnamed, tries_again
+from rlightning_aio.attempts.rules import is_of_env, is_unnamed, needed, tries_again
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -312,8 +312,8 @@ class AttemptQueue:
 
     def is_done(self, task: TaskInPlay) -> bool:
         """A task needs no further attempts."""
-        first = self._rules.first
-        return len(task.attempts) == task.size or (first is not None and task.num_whole >= first)
+        whole = needed(self._rules, task.size)
+        return len(task.attempts) == task.size or task.num_whole >= whole
 
     # -- envs that are not there -----------------------------------------------------------
 
@@ -345,7 +345,8 @@ class AttemptQueue:
         if now < self._look_at and not at_once:
             return
         self._look_at = now + LOOK_SECONDS
-        present = self.players.refresh() - self.busy
+        self.players.refresh()
+        present = self.players.present - self.busy
         for env_id in self.free.keys() - present:
             del self.free[env_id]
         for env_id in self.players.entry_of:  # In their order.

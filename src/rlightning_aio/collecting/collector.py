@@ -173,7 +173,6 @@ class Collector(Generic[G, R]):
         """Forget all results and transitions."""
         self._started = False
         self._kinds: dict[str, EnvKind] = {}
-        self._num_steps = 0
         # Results in order of progress: received, not yet stored, not yet answered.
         # `_expecting`: wait for results next.
         self._received: BatchedData | None = None
@@ -335,7 +334,7 @@ class Collector(Generic[G, R]):
             return
         for part in self._unstored:
             part.kind.hold(part)
-        if not (self._num_steps or self._failed):
+        if not (self._failed or any(kind.num_steps for kind in self._kinds.values())):
             self._lay_out()
 
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
@@ -418,7 +417,6 @@ class Collector(Generic[G, R]):
                 f"num_transitions={self._quota} can't fill a block of {sum(counts)} envs "
                 "(sub-environments counted); give a multiple of that"
             )
-        self._num_steps = num_steps
         for kind, count in zip(kinds, counts, strict=True):
             kind.num_steps = num_steps
             kind.quota = num_steps * count

@@ -10,7 +10,7 @@ import numpy as np
 from rlightning_aio.batch import BatchedData, joined
 from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.collecting.results import ResultRows, columns_of_episodes, result_rows
-from rlightning_aio.collecting.rollout import Ends, Rollout
+from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.errors import BadAction
@@ -188,7 +188,7 @@ class EnvKind:
         columns["lag"] = version - columns["policy_version"]
         episodes = columns_of_episodes(staging.episodes)
         staging.carry_over()
-        return Rollout(columns, Ends(ends, end_observation), episodes, dict(self._env_ids))
+        return Rollout(columns, ends, end_observation, episodes, dict(self._env_ids))
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)

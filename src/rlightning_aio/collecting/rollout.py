@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property, partial
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -18,13 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _Pair: TypeAlias = "tuple[NDArray[Any], NDArray[Any]]"
-
-
-class Ends(NamedTuple):
-    """Where transitions have no successor; see `Rollout.ends` and `Rollout.end_observation`."""
-
-    positions: NDArray[np.intp]
-    observation: Tree
 
 
 class Rollout:
@@ -77,15 +69,16 @@ class Rollout:
     def __init__(
         self,
         columns: dict[str, Tree],
-        ends: Ends,
+        ends: NDArray[np.intp],
+        end_observation: Tree,
         episodes: dict[str, Any],
-        env_ids: Mapping[int, str] = MappingProxyType({}),
+        env_ids: Mapping[int, str],
     ) -> None:
         self._columns = columns
         self.env_ids = env_ids
         index: Any = columns["index"]
         self.shape: tuple[int, ...] = index.shape
-        self.ends, self._end_observation = ends
+        self.ends, self._end_observation = ends, end_observation
         self.episodes = episodes
 
     @property
