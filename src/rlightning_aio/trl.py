@@ -1,7 +1,8 @@
 """TRL's `rollout_func`, over `play`: the rollouts of a batch are attempts on the envs of a group.
 
-Rule: a rollout that fails trains nothing. Its only token is masked and its reward is None, so it
-counts neither for the loss, nor for its normaliser, nor for the mean of its group.
+Rule: a rollout that fails trains nothing, and neither does one whose agent was cut before it has
+returned. Its only token is masked and its reward is None, so it counts neither for the loss, nor
+for its normaliser, nor for the mean of its group.
 """
 
 from __future__ import annotations
@@ -101,22 +102,30 @@ def _task_of(prompt: Any) -> EpisodeSpec:
 
 def _columns(attempts: list[Attempt], tokenizer: Any) -> dict[str, Any]:
     """Return what TRL takes: lists with one element for each attempt."""
-    whole = [_checked(one.result) for one in attempts if one.reward is not None]
-    if not whole:
-        kinds = Counter(f"{one.outcome.kind} ({one.outcome.cause})" for one in attempts)
-        raise RLightningError(f"all rollouts of a batch have failed: {dict(kinds)}")
+    results = _results(attempts)
     ends = [tokenizer.eos_token_id]
     masked = {"prompt_ids": ends, "completion_ids": ends, "logprobs": [0.0], "env_mask": [0]}
-    rows = [masked if one.reward is None else one.result for one in attempts]
-    names = dict.fromkeys(chain.from_iterable(whole))
+    rows = [result or masked for result in results]
+    names = dict.fromkeys(chain.from_iterable(filter(None, results)))
     found: dict[str, Any] = {name: [row.get(name) for row in rows] for name in names}
     found["env_mask"] = [row.get("env_mask", [1] * len(row["completion_ids"])) for row in rows]
     return {
         "logprobs": None,
         **found,
-        "reward": [one.reward for one in attempts],
+        "reward": [one and attempt.reward for one, attempt in zip(results, attempts, strict=True)],
         "outcome": [one.outcome for one in attempts],
     }
+
+
+def _results(attempts: list[Attempt]) -> list[dict[str, Any] | None]:
+    """Return what the agents have returned; None for attempts that have failed or were cut."""
+    found = [None if one.result is None else _checked(one.result) for one in attempts]
+    if not any(found):
+        if any(one.reward is not None for one in attempts):
+            _checked(None)
+        kinds = Counter(f"{one.outcome.kind} ({one.outcome.cause})" for one in attempts)
+        raise RLightningError(f"all rollouts of a batch have failed: {dict(kinds)}")
+    return found
 
 
 def _checked(result: Any) -> dict[str, Any]:

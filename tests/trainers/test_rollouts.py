@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 import rlightning_aio as rl
+from rlightning_aio.attempts import Rules
 from rlightning_aio.trl import reward, rollouts
 
 TRAINER = SimpleNamespace(processing_class=SimpleNamespace(eos_token_id=99))
@@ -69,6 +71,18 @@ def test_a_rollout_that_fails_is_masked_and_has_no_reward() -> None:
     assert found["completion_ids"][1] == found["prompt_ids"][1] == [99]
     assert (found["env_mask"][1], found["logprobs"][1], found["seed"][1]) == ([0], [0.0], None)
     assert "the sandbox is gone" in found["outcome"][1].cause
+
+
+def test_a_rollout_that_is_cut_by_its_time_is_masked_as_well() -> None:
+    """It has a reward, but not the tokens."""
+
+    async def slow(episode: Any) -> Any:
+        found = await agent(episode)
+        await asyncio.sleep(9 * episode.index)
+        return found
+
+    found = asked(["a", "a"], slow, rules=Rules(attempt_timeout=0.5, on_timeout="end"))
+    assert (found["reward"], found["completion_ids"]) == ([1, None], [[1] * 3, [99]])
 
 
 def test_a_batch_in_which_all_fail_is_an_error() -> None:
