@@ -319,6 +319,8 @@ def test_what_was_added_just_before_an_evaluation_is_not_played_again(
     with ResultsFile(tmp_path / "results.jsonl") as results:
         results.add(replace(played, length=77))
         (found,) = evaluated(group_of(), [spec], results=results).attempts
+        results.add(replace(played, index=1))
+        assert results.left().total() == 2  # Which `play` plays first.
     assert found.length == 77
 
 

@@ -120,6 +120,7 @@ class ResultsFile:
 
     def left(self) -> Counter[EpisodeKey]:
         """Count the attempts in groups that were not handed out, but those to be played again."""
+        self.flush()
         final = (key for (key, _, _), line in self._lines.items() if line.is_final)
         return Counter(key for key in final if key not in self._handed_out)
 
