@@ -258,6 +258,14 @@ def test_a_policy_must_give_the_same_columns_each_time() -> None:
             assert collector.collect().note.tolist() == [0, 1, 0, 1]
 
 
+def test_a_seed_of_numpy_seeds_random_actions_as_well() -> None:
+    def actions(seed: Any) -> Any:
+        with poles(1) as group:
+            return Collector(group, None, num_transitions=20, seed=seed).collect().action.tolist()
+
+    assert actions(np.int64(3)) == actions(3)
+
+
 # -- the collector itself
 
 

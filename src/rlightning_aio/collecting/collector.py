@@ -22,6 +22,7 @@ from rlightning_aio._core.group.api.facade import (
     lost_hardware,
 )
 from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
+from rlightning_aio._core.group.state.episodes import as_int
 from rlightning_aio.batch.contents import readable
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
@@ -32,8 +33,6 @@ from rlightning_aio.policies.random_actions import RandomPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence
-
-    import gymnasium as gym
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta
@@ -343,13 +342,10 @@ class Collector(Generic[G, R]):
     def _kind(self, name: str) -> EnvKind:
         if name not in self._kinds:
             policy = self._policies[name] or RandomPolicy(
-                self._action_space_of, self._seed if isinstance(self._seed, int) else None
+                lambda env_id: self._meta_of(env_id).action_space, as_int(self._seed)
             )
             self._kinds[name] = EnvKind(policy, self._quota, self._meta_of, self._infos)
         return self._kinds[name]
-
-    def _action_space_of(self, env_id: str) -> gym.Space[Any] | None:
-        return self._meta_of(env_id).action_space
 
     def _meta_of(self, env_id: str) -> EnvMeta:
         """Return the metadata of an env; a place has spaces once a client has dialled in."""
