@@ -365,6 +365,11 @@ if kind == "two":
     with sync.build_env_group(entry) as group:
         group.reset()
         os.kill(os.getpid(), signal.SIGKILL)
+if kind == "left":
+    group = sync.build_env_group(entry)
+    group.init()
+    group.reset()
+    raise SystemExit
 if kind == "sync":
     with sync.build_env_group(entry) as group:
         group.reset(options={"slow": True})
@@ -378,7 +383,7 @@ else:
 
 def running(placement: str, log: Path, kind: str) -> subprocess.Popen[str]:
     """Start a trainer in a process of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", TRAINER, placement, str(log), kind]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -407,6 +412,16 @@ def test_an_arm_on_its_way_to_the_reset_position_stops(
     if number == signal.SIGKILL:
         assert said.count("env 'arm-0' was stopped, as the trainer has ended") == 1, said
         assert lines(log) == ["reset", "stop"]
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_an_arm_stops_when_a_program_ends_that_has_not_closed_its_group(
+    log: Path, placement: str
+) -> None:
+    """As after an error."""
+    with running(placement, log, "left") as trainer:
+        trainer.communicate(timeout=HANG)
+    assert lines(log) == ["reset", "stop"]
 
 
 class GymnasiumArm(Counts):

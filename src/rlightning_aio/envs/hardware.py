@@ -5,9 +5,11 @@ Rule: an action that its space does not contain never reaches it, and whatever g
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import math
+import os
 import signal
 import time
 from threading import Event, Lock, Thread, current_thread, main_thread
@@ -34,6 +36,9 @@ _STOP_SECONDS: Final = 0.1
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
+HELD: Final[set[BaseEnv]] = set()
+"""What the trainer's own process has made and not closed: it stops with that process."""
+os.register_at_fork(after_in_child=HELD.clear)
 
 
 def says_hardware(env: BaseEnv) -> bool:
@@ -48,6 +53,12 @@ def stop(env: BaseEnv) -> None:
         env.stop()
     except Exception:  # noqa: BLE001 - others must be stopped, too
         _log.exception("env %r could not be stopped", env.env_id)
+
+
+@atexit.register
+def _stop_held() -> None:
+    for env in HELD:  # One after the other: no thread can be started any more.
+        stop(env)
 
 
 def begin_stops(envs: Iterable[BaseEnv]) -> list[Thread]:
@@ -138,15 +149,15 @@ def watched(due: Callable[[], Iterable[BaseEnv]]) -> Callable[[], None]:
 
 
 @contextlib.contextmanager
-def stopped_by_signals(envs: Iterable[BaseEnv]) -> Generator[None]:
-    """Have signals that the program handles stop `envs`, too, while the block is executed.
+def stopped_by_signals() -> Generator[None]:
+    """Have signals that the program handles stop `HELD`, too, while the block is executed.
 
     An event loop only notes Ctrl-C, so nothing else would end a motion that blocks it.
     """
     before: dict[int, Any] = {}
 
     def handle(number: int, frame: Any) -> None:
-        for env in list(envs):  # By itself, as only one is at work, and is stopped again and again.
+        for env in list(HELD):  # By itself, as only one is at work, and is stopped again and again.
             ends.callback(watched(lambda env=env: [env]))
         before[number](number, frame)
 

@@ -11,7 +11,6 @@ from collections import deque
 from functools import partial
 from itertools import repeat
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
-from weakref import WeakSet
 
 import numpy as np
 
@@ -42,13 +41,10 @@ if TYPE_CHECKING:
         StartOrder,
     )
     from rlightning_aio._core.hosts.running.runner import EnvRunner
-    from rlightning_aio.envs.base import BaseEnv
 
 _Waiting: TypeAlias = "tuple[int, Any]"
 """An entry and its arguments, which are None if they are in the row."""
 _STEP: Final = int(Operation.STEP)
-_HARDWARE: Final[WeakSet[BaseEnv]] = WeakSet()
-"""Envs of this process that move something real."""
 
 
 class InlineHost(Host):
@@ -79,8 +75,6 @@ class InlineHost(Host):
     def _built(self) -> list[EnvStarted]:
         for runner in built_envs(self._order, inline=True):
             self._runners.append(runner)
-            if self._order.is_hardware:
-                _HARDWARE.add(runner.env)
         return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
@@ -136,7 +130,7 @@ class InlineHost(Host):
         return count
 
     def _run_hardware(self, execute: Callable[[], Any]) -> Any:
-        with stopped_by_signals(_HARDWARE):
+        with stopped_by_signals():
             return self._driver.interruptible(execute)
 
     def _report(self, in_rows: list[int]) -> None:

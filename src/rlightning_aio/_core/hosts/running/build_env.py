@@ -16,7 +16,7 @@ from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
 from rlightning_aio.config import makers_of
 from rlightning_aio.envs.adapted.films import RECORD_VIDEO, record
 from rlightning_aio.envs.adapted.makers import RESTARTS
-from rlightning_aio.envs.hardware import ACTION_TIMEOUT, limit_actions, says_hardware
+from rlightning_aio.envs.hardware import ACTION_TIMEOUT, HELD, limit_actions, says_hardware
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.error_text import ErrorText
@@ -136,6 +136,8 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
         finally:
             os.environ.pop(RESTARTS, None)
         env.trainer_pid = None if inline else order.trainer_pid
+        if inline and hardware:
+            HELD.add(env)
         return env
 
     env = make(is_again=order.is_again)

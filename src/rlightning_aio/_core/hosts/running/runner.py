@@ -28,7 +28,7 @@ from rlightning_aio._core.hosts.running.renewal import HandedOn
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
 from rlightning_aio.envs.base import initialised
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.hardware import begin_stops, checked_input_of, stop, stop_all
+from rlightning_aio.envs.hardware import HELD, begin_stops, checked_input_of, stop, stop_all
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -303,6 +303,7 @@ class EnvRunner:
         if self.has_closed:
             return None
         self.has_closed = True
+        HELD.discard(self.env)
         return self.env.close()
 
     def _not_attached(self) -> OutOfBand | None:
