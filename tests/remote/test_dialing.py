@@ -144,8 +144,8 @@ def test_a_client_takes_a_gymnasium_env_or_a_callable(made: str) -> None:
             assert stops == ["stop"]
             group.close()
             thread.join(HANG)
-            assert stops == ["stop", "stop"]
-        assert stops == ["stop", "stop", "stop"], "it is stopped before it is closed"
+            assert stops == 3 * ["stop"], "the end of a session stops it, and that of run()"
+        assert stops == 4 * ["stop"], "it is stopped before it is closed"
 
 
 class Awaitable:

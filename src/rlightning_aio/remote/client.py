@@ -216,6 +216,7 @@ class RemoteEnvClient:
             Exception: an error of the env in ``is_finish`` or in ``on_disconnect``. Errors of
                 steps and resets go to the trainer.
         """
+        reason = "the env is finished"
         try:
             self.connect()
             while not self._is_finished():
@@ -225,11 +226,12 @@ class RemoteEnvClient:
                     request, self._request = self._request, None
                     self._execute(request)
         except BaseException as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise
+        finally:
             if self._is_hardware:
                 stop(self._env)
-            self._leave(f"{type(error).__name__}: {error}")
-            raise
-        self._leave("the env is finished")
+            self._leave(reason)
 
     def _is_finished(self) -> bool:
         asks, self._asks_if_finished = self._asks_if_finished, False
