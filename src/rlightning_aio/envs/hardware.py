@@ -33,7 +33,8 @@ _LOOK_SECONDS: Final = 0.01
 """Time between two looks at whether an env at work must stop."""
 _STOP_SECONDS: Final = 0.1
 """How long others wait for the stop of an env, which may hang."""
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+"""That end a program, which may handle them."""
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
 HELD: Final[set[BaseEnv]] = set()
@@ -164,7 +165,7 @@ def stopped_by_signals() -> Generator[None]:
     with contextlib.ExitStack() as ends:
         try:
             if current_thread() is main_thread():
-                for number in _SIGNALS:
+                for number in SIGNALS:
                     if callable(handler := signal.getsignal(number)):
                         before[number] = handler
                         signal.signal(number, handle)

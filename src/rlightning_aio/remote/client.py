@@ -28,7 +28,14 @@ from zmq.utils.monitor import recv_monitor_message
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
-from rlightning_aio.envs.hardware import checked_input_of, says_hardware, stop, stop_all, watched
+from rlightning_aio.envs.hardware import (
+    SIGNALS,
+    checked_input_of,
+    says_hardware,
+    stop,
+    stop_all,
+    watched,
+)
 from rlightning_aio.envs.results import (
     explained,
     has_preprocess_fn,
@@ -492,7 +499,7 @@ def _signals_held_back() -> Generator[None]:
     caught: list[int] = []
     before: dict[int, Any] = {}
     try:
-        for number in _SIGNALS:
+        for number in SIGNALS:
             if signal.getsignal(number) is not None:  # None: not Python's.
                 before[number] = signal.signal(number, lambda number, _: caught.append(number))
         yield
@@ -503,7 +510,6 @@ def _signals_held_back() -> Generator[None]:
             signal.raise_signal(number)
 
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server uses other security: keys on one side only?",

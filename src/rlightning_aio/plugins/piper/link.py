@@ -88,6 +88,10 @@ class ArmLink:
         orders: for the watchdog: ``stop``, ``timeout``, ``speed``, ``gripper_effort``; see
             `guard.ArmGuard`.
 
+    Attributes:
+        stopped_because: why the arm was stopped; empty if that was asked for without a cause, or
+            it was not stopped.
+
     Raises:
         InUse: another process or link uses the channel.
         ConnectionError: the channel can't be opened; nothing is left open.
@@ -102,7 +106,7 @@ class ArmLink:
         self._commanded: list[CanFrame] = []
         self._num_sent = 0
         self._confirmed: set[bytes] = set()
-        self._stopped_because = self._own_cause = ""
+        self.stopped_because = self._own_cause = ""
         self._fault: Exception | None = None
         self._closing = threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
@@ -232,9 +236,9 @@ class ArmLink:
             if kind == Kind.FAULT:
                 self._fault = ConnectionError(content.decode())
             elif kind == Kind.STOP:
-                self._stopped_because = content.decode() or self._own_cause
+                self.stopped_because = content.decode() or self._own_cause
             elif kind == Kind.ARM:
-                self._stopped_because = ""
+                self.stopped_because = ""
             self._confirmed.add(kind)
             self._changed.notify_all()
 
@@ -297,11 +301,6 @@ class ArmLink:
     def is_lost(self) -> bool:
         """True if the watchdog or the bus is gone; only a new link reaches the arm."""
         return self._fault is not None
-
-    @property
-    def stopped_because(self) -> str:
-        """Reason why the watchdog has stopped the arm on its own; empty if it has not."""
-        return self._stopped_because
 
     def mark(self) -> int:
         """Send pending commands. Return a number for `wait_for_feedback` of newer feedback."""
@@ -373,7 +372,7 @@ class ArmLink:
             sent = self.mark()
             # Repeated, because the bus may lose frames; motors report at least every 0.1 s.
             self.wait_until(lambda since=sent: not self._missing(POWER_FRAMES, since), 0.2)
-            if self._stopped_because:
+            if self.stopped_because:
                 return
             if self.is_enabled() and not self._missing(POWER_FRAMES, sent):
                 return

@@ -312,7 +312,7 @@ class ServerSessions:
                 f"the places of {self._server_id} are for {names}, as env_kwargs.clients says"
             )
         # Of a client that is refused for good, whether there is room doesn't matter.
-        found = announced(hello, size, self._kind, self._num_envs, self._objection)
+        found = self._announced(hello, size)
         if any(session.name == hello.name for session in self._by_route.values()):
             raise Rejection(f"a client named {hello.name!r} is here already", retry=True)
         place = self._place_for(hello.name)
@@ -330,6 +330,28 @@ class ServerSessions:
         self._post(route, Welcome(env_id=place.env_id, heartbeat=heartbeat))
         LOG.info("%s: the client %r has taken %s", self._server_id, hello.name, place.env_id)
         place.events.on_taken(found)
+
+    def _announced(self, hello: ClientHello, size: int) -> Announcement:
+        """Return the contents of a hello whose header has `size` bytes.
+
+        Raises:
+            Rejection: it is invalid, or does not fit the other clients or the trainer.
+        """
+        if hello.version != VERSION:
+            raise Rejection(f"this server speaks version {VERSION}, not {hello.version}")
+        if size > MAX_HELLO_BYTES:
+            raise Rejection(f"a hello has {size} bytes; {MAX_HELLO_BYTES} are allowed")
+        if not hello.name.isprintable() or "/" in hello.name:
+            raise Rejection("a client's name must be printable and without '/'")
+        try:
+            # The trainer may let its own arithmetic raise; a client's bounds must not.
+            with np.errstate(all="ignore"):
+                return _announcement(hello, self._kind, self._num_envs, self._objection)
+        except WireError as error:
+            raise Rejection(str(error)) from None
+        # Gymnasium, NumPy and pydantic raise their own errors for unexpected inputs.
+        except Exception as error:  # noqa: BLE001  # A peer's mistake must not end the trainer.
+            raise Rejection(f"{type(error).__name__}: {error}") from None
 
     def _place_for(self, name: str) -> ClientPlace | None:
         """Return the empty place that a client gets; None if there is none.
@@ -445,42 +467,6 @@ class Announcement(NamedTuple):
     hardware: bool
     results: ResultLayout
     actions: SpaceLayout
-
-
-def announced(
-    hello: ClientHello,
-    size: int,
-    kind: ClientKind | None,
-    num_envs: int,
-    objection: Callable[[EnvMeta], str | None],
-) -> Announcement:
-    """Return the contents of a hello whose header has `size` bytes.
-
-    Args:
-        hello: of a client.
-        size: see above.
-        kind: of the first client that was let in; None before.
-        num_envs: sub-environments of each client's env, by the configuration.
-        objection: returns the trainer's reason to refuse an env, or None.
-
-    Raises:
-        Rejection: it is invalid, or does not fit the other clients or the trainer.
-    """
-    if hello.version != VERSION:
-        raise Rejection(f"this server speaks version {VERSION}, not {hello.version}")
-    if size > MAX_HELLO_BYTES:
-        raise Rejection(f"a hello has {size} bytes; {MAX_HELLO_BYTES} are allowed")
-    if not hello.name.isprintable() or "/" in hello.name:
-        raise Rejection("a client's name must be printable and without '/'")
-    try:
-        # The trainer may let its own arithmetic raise; a client's bounds must not.
-        with np.errstate(all="ignore"):
-            return _announcement(hello, kind, num_envs, objection)
-    except WireError as error:
-        raise Rejection(str(error)) from None
-    # Gymnasium, NumPy and pydantic raise their own errors for unexpected inputs.
-    except Exception as error:  # noqa: BLE001  # A peer's mistake must not end the trainer.
-        raise Rejection(f"{type(error).__name__}: {error}") from None
 
 
 def _announcement(
