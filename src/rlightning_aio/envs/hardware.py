@@ -33,8 +33,7 @@ _LOOK_SECONDS: Final = 0.01
 """Time between two looks at whether an env at work must stop."""
 _STOP_SECONDS: Final = 0.1
 """How long others wait for the stop of an env, which may hang."""
-SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
-"""That end a program, which may handle them."""
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
 HELD: Final[set[BaseEnv]] = set()
@@ -165,7 +164,7 @@ def stopped_by_signals() -> Generator[None]:
     with contextlib.ExitStack() as ends:
         try:
             if current_thread() is main_thread():
-                for number in SIGNALS:
+                for number in _SIGNALS:
                     if callable(handler := signal.getsignal(number)):
                         before[number] = handler
                         signal.signal(number, handle)
@@ -174,6 +173,29 @@ def stopped_by_signals() -> Generator[None]:
             for number, handler in before.items():
                 if signal.getsignal(number) is handle:  # The env may have set another.
                     signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def signals_held_back() -> Generator[None]:
+    """Handle signals after the block.
+
+    For what must not be left half done.
+    """
+    if current_thread() is not main_thread():
+        yield  # Handlers run in the main thread alone.
+        return
+    caught: list[int] = []
+    before: dict[int, Any] = {}
+    try:
+        for number in _SIGNALS:
+            if signal.getsignal(number) is not None:  # None: not Python's.
+                before[number] = signal.signal(number, lambda number, _: caught.append(number))
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in caught:
+            signal.raise_signal(number)
 
 
 def limit_actions(env: BaseEnv, seconds: Any) -> None:

@@ -6,9 +6,6 @@ are those that LeRobot's policies expect; `LeRobotPolicy` plays with the same on
 
 from __future__ import annotations
 
-import contextlib
-import signal
-import threading
 import warnings
 from importlib import import_module
 from pathlib import Path
@@ -17,10 +14,11 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 
 from rlightning_aio.collecting.episodes import whole_episodes
+from rlightning_aio.envs.hardware import signals_held_back
 from rlightning_aio.trees import walked
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -87,7 +85,7 @@ class LeRobotWriter:
     def __exit__(self, kind: object, *error: object) -> None:
         """Make the dataset readable, also after a fault or Ctrl-C."""
         if self.dataset is not None:
-            with _undisturbed():
+            with signals_held_back():
                 self.dataset.finalize()
         elif kind is None:
             raise ValueError("there was no whole episode to save")
@@ -123,7 +121,7 @@ class LeRobotWriter:
     def _write(self, columns: dict[str, NDArray[Any]]) -> None:
         if self.dataset is None:
             self.dataset = self._opened({name: _feature(of) for name, of in columns.items()})
-        with _undisturbed():
+        with signals_held_back():  # Half an episode would make the dataset unreadable.
             for step in range(len(columns["next.done"])):
                 frame = {name: of[step] for name, of in columns.items()}
                 self.dataset.add_frame({**frame, "task": self._task})
@@ -194,19 +192,3 @@ def _feature(column: NDArray[Any]) -> dict[str, Any]:
 
 def _kind(feature: dict[str, Any]) -> str:
     return f"{feature['dtype']} {tuple(feature['shape'])}"
-
-
-@contextlib.contextmanager
-def _undisturbed() -> Generator[None]:
-    """Deliver a Ctrl-C at the end: half an episode would make a dataset unreadable."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signals: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-        if signals:
-            signal.raise_signal(signal.SIGINT)

@@ -13,12 +13,11 @@ import contextlib
 import logging
 import os
 import re
-import signal
 import socket
 import time
 from math import ceil
 from pathlib import Path
-from threading import Lock, current_thread, main_thread
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import gymnasium as gym
@@ -29,9 +28,9 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.hardware import (
-    SIGNALS,
     checked_input_of,
     says_hardware,
+    signals_held_back,
     stop,
     stop_all,
     watched,
@@ -268,7 +267,7 @@ class RemoteEnvClient:
         """Begin an attempt; a socket that is interrupted here is closed with its context."""
         now = time.monotonic()
         self._due = now + _ATTEMPT_SECONDS
-        with _signals_held_back():
+        with signals_held_back():  # An exception within pyzmq could leave a socket to nobody.
             dealer = self._context.socket(zmq.DEALER)
             self._set_options(dealer)
             self._monitor = dealer.get_monitor_socket()
@@ -295,7 +294,7 @@ class RemoteEnvClient:
     def _close_connection(self, linger_ms: int = _LINGER_MS) -> None:
         """End the attempt or the connection, and set the time of the next attempt."""
         if self._dealer is not None:
-            with _signals_held_back():
+            with signals_held_back():
                 self._poller = zmq.Poller()
                 self._dealer.disable_monitor()
                 self._monitor.close(linger=0)
@@ -484,30 +483,6 @@ class RemoteEnvClient:
 
     def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
         self._session.finish(number, one_result(self._env, method, returned), busy_ns)
-
-
-@contextlib.contextmanager
-def _signals_held_back() -> Generator[None]:
-    """Handle signals after the block.
-
-    An exception within pyzmq could leave a socket that nobody closes, so that its context never
-    ends; and one raised while a socket is thrown away would be ignored.
-    """
-    if current_thread() is not main_thread():
-        yield  # Handlers run in the main thread alone.
-        return
-    caught: list[int] = []
-    before: dict[int, Any] = {}
-    try:
-        for number in SIGNALS:
-            if signal.getsignal(number) is not None:  # None: not Python's.
-                before[number] = signal.signal(number, lambda number, _: caught.append(number))
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for number in caught:
-            signal.raise_signal(number)
 
 
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
+from rlightning_aio.config.problems import explained, unknown_field
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.wire import MAX_HEARTBEAT, MIN_HEARTBEAT
-from rlightning_aio.registry import did_you_mean
 from rlightning_aio.remote.keys import read_server_keys
 
 if TYPE_CHECKING:
@@ -61,20 +61,17 @@ def server_settings(config: EnvConfig) -> ServerSettings:
     """Return the checked ``env_kwargs`` of an env_server entry.
 
     Raises:
-        ConfigError: naming entry and field.
+        ConfigError: naming the entry and every wrong field.
     """
-    place = f"entry {config.name!r}, env_kwargs"
-    for name in config.env_kwargs:
-        if name not in _FIELDS:
-            hint = did_you_mean(name, _FIELDS, end=" ")
-            raise ConfigError(f"{place}.{name}: unknown field; {hint}Known: {', '.join(_FIELDS)}")
+    place, given = f"entry {config.name!r}, env_kwargs", config.env_kwargs
     try:
-        settings = ServerSettings.model_validate(config.env_kwargs)
+        settings = ServerSettings.model_validate(given)
     except ValidationError as error:
-        fault = error.errors(include_url=False)[0]
-        raise ConfigError(
-            f"{place}.{fault['loc'][0]}: {fault['msg']}, got {fault['input']!r}"
-        ) from None
+        texts = [
+            f"{path}: {text if path in _FIELDS else unknown_field(path, _FIELDS)}"
+            for path, text in explained(error.errors(include_url=False), given)
+        ]
+        raise ConfigError(f"{place}.{'; env_kwargs.'.join(texts)}") from None
     if len({*settings.places} - {""}) < len([name for name in settings.places if name]):
         raise ConfigError(f"{place}.clients: a name is there twice; each has one place")
     if settings.keys is not None:
