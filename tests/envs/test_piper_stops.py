@@ -40,11 +40,3 @@ def test_arms_stop_as_configured(place: str, event: str, during: str) -> None:
     for one in found:
         assert one.degrees < 100  # On their way were more than 170.
         assert one.moved_again < 1
-
-
-def test_the_table_has_a_row_for_each_place_and_event() -> None:
-    """As on the page about faults."""
-    row = arm_stops.Stopped("client", "HUP", "reset", 0.25, 4.0, 0.0)
-    assert arm_stops.table([row] * len(arm_stops.STOPS)).splitlines()[2:] == [
-        "| client | HUP | reset | 4.0° in 0.25 s | 4.0° in 0.25 s | 4.0° in 0.25 s |"
-    ]

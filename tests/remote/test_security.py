@@ -57,15 +57,6 @@ def test_a_name_that_cannot_be_a_files_is_refused(tmp_path: Path, name: str) -> 
     assert not list(tmp_path.iterdir())
 
 
-def test_keys_are_zeromq_certificates(tmp_path: Path) -> None:
-    """ZeroMQ's own tools read them."""
-    from zmq.auth import load_certificate
-
-    (arm,) = make_keys(tmp_path, ["arm"])
-    keys = read_client_keys(arm)
-    assert load_certificate(arm / "client.key_secret") == (keys.public, keys.secret)
-
-
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
