@@ -190,20 +190,9 @@ def test_a_client_that_ended_in_its_first_reset_is_named() -> None:
             ending.join()
 
 
-def test_calls_of_clients_are_refused() -> None:
-    """Before anything is sent; offloading skips them."""
-    with (
-        sync.build_env_group(entry()) as group,
-        clients(group, CountingEnv()),
-    ):
+def test_offloading_skips_clients() -> None:
+    with sync.build_env_group(entry()) as group, clients(group, CountingEnv()):
         group.reset()
-        for call in (
-            lambda: group.call("render"),
-            lambda: group["robots-0/c0"].get_attr("steps"),
-            group.snapshot,
-        ):
-            with pytest.raises(NotImplementedError, match="clients answer resets and steps only"):
-                call()
         group.offload()
         group.reload()
         group.close()
