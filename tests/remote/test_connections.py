@@ -16,6 +16,7 @@ from patience import HANG
 from rlightning_aio import sync
 from rlightning_aio.protocol.net.wire import Bye, Reset, Welcome, Writer
 from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote import client as client_module
 
 ENTRY = served(clients=["arm", "greedy"], heartbeat=60.0)
 
@@ -125,7 +126,10 @@ def test_all_that_came_before_the_end_of_a_connection_is_read(
 def test_a_client_that_runs_again_executes_nothing_of_the_session_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Such as the request that it had read when Ctrl-C ended the first run."""
+    """Such as the request that it had read when Ctrl-C ended the first run; nor does it wait for
+    that connection's end before it dials again.
+    """
+    monkeypatch.setattr(client_module, "_ATTEMPT_SECONDS", 10 * HANG)
     with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
         port = server.bind_to_random_port("tcp://127.0.0.1")
         env: Any = CountingEnv()
@@ -139,7 +143,7 @@ def test_a_client_that_runs_again_executes_nothing_of_the_session_before(
             monkeypatch.setattr(client, "_log_state", struck)
             with pytest.raises(KeyboardInterrupt):
                 client.run()
-            monkeypatch.undo()
+            monkeypatch.setattr(client, "_log_state", lambda: None)
             welcomed(client, server, Bye(reason="enough"))
             client.run()
         assert env.resets == 0

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
 import signal
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +19,6 @@ from patience import HANG
 from rlightning_aio import sync
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.remote import RemoteEnvClient
-from rlightning_aio.remote import client as client_module
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +27,9 @@ ADD = "_add_socket"
 """Of pyzmq's contexts: what notes a new socket. No other moment is between the two."""
 
 
-@pytest.mark.parametrize(("owner", "name"), [(zmq, "Poller"), (zmq.Socket, "connect")])
+@pytest.mark.parametrize(
+    ("owner", "name"), [(zmq, "Poller"), (zmq.Socket, "connect"), (RemoteEnvClient, "_flush")]
+)
 def test_an_interrupt_while_dialing_closes_what_is_open(
     owner: object, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -65,20 +64,6 @@ def test_a_signal_while_a_socket_is_made_comes_after_that(monkeypatch: pytest.Mo
     assert env.closed
 
 
-def test_an_interrupt_while_a_client_leaves_closes_its_env(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its hardware is stopped before that."""
-
-    def interrupted(reason: str) -> None:
-        raise KeyboardInterrupt
-
-    env = CountingEnv()
-    client = RemoteEnvClient(env, "127.0.0.1", 9)
-    monkeypatch.setattr(client, "_leave", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        client.close()
-    assert env.closed
-
-
 def test_between_two_attempts_a_client_takes_no_time_of_a_core() -> None:
     """It sleeps. A server that is away may stay away for hours."""
     with RemoteEnvClient(CountingEnv(), "127.0.0.1", 1) as client:
@@ -86,31 +71,6 @@ def test_between_two_attempts_a_client_takes_no_time_of_a_core() -> None:
         with pytest.raises(TimeoutError):
             client.connect(timeout=1.0)
         assert time.thread_time() - began < 0.5
-
-
-def test_a_client_whose_run_has_ended_dials_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its next call waits for no end of the connection that it has left."""
-    monkeypatch.setattr(client_module, "_ATTEMPT_SECONDS", 10 * HANG)
-    entry: dict[str, Any] = {"name": "robots", "backend": "env_server"}
-    with sync.build_env_group(entry) as group, ThreadPoolExecutor(1) as pool:
-        env, server = CountingEnv(), cast("Any", group["robots-0"])
-        client = RemoteEnvClient(env, server.address, name="arm")
-
-        def run_twice() -> None:
-            with client:
-                for _ in range(2):
-                    env.finished = False
-                    client.connect(HANG)
-                    env.finished = True
-                    client.run()
-
-        running = pool.submit(run_twice)
-        while not running.done():
-            if not group.pending:
-                group.reset_async()
-            with contextlib.suppress(TimeoutError):
-                group.collect_async(deadline=0.01)
-        running.result()
 
 
 @pytest.mark.parametrize("made", ["env", "callable"])
