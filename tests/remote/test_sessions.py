@@ -175,21 +175,6 @@ def test_the_welcome_says_how_soon_either_end_misses_the_other(
     assert ClientHello(version=3, name="a", observation_space={}, action_space={}).hardware
 
 
-def test_a_session_is_that_of_its_connection(world: World) -> None:
-    """Nothing that another connection says belongs to it."""
-    world.reset("a")
-    client = world.clients["a"]
-    world.to_client(client)
-    client.execute()
-    (_, result), client.outbox[:] = client.outbox[0], []
-    assert result is not None
-    world.server.receive(b"s", result)
-    assert not world.take()
-    assert client.route
-    world.server.receive(client.route, result)
-    assert len(world.take()) == 1
-
-
 @pytest.mark.parametrize("spoil", ["whole", "frame"])
 def test_a_message_that_is_malformed_ends_the_session(spoil: str) -> None:
     """It says why."""
