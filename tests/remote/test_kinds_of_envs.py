@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
-from kit.counting import ClientThread, served
+from kit.counting import ClientThread, look, served
 from kit.driven import without_times
 from patience import HANG
 from remote.random_spaces import same, sampled
@@ -193,6 +194,34 @@ def test_a_client_gives_the_results_of_a_local_env(kind: type[_Sampling]) -> Non
         assert same(one, other)
     if kind is not Agents:
         assert stats["episodes"] > 0
+
+
+def test_a_mask_is_for_the_client_that_had_it() -> None:
+    """Whoever takes its place begins as a whole: a part of that env was never reset."""
+    begun, gate = list[Any](), Event()
+
+    class Noting(Vectorised):
+        def reset(self, **given: Any) -> Any:
+            begun.append(given["options"])
+            if given["options"]:
+                gate.wait(HANG)
+            return super().reset(**given)
+
+    with sync.build_env_group({**served(), "num_envs": 2}) as group:
+        address = group["robots-0"].address
+        envs = [Noting(EnvConfig(name="any", backend="any", task="any")) for _ in range(2)]
+        first = ClientThread(address, "first", envs[0], hardware=False)
+        group.reset()
+        group.reset_async(options={"reset_mask": np.array([True, False])})
+        while len(begun) < 2:
+            look(group)
+        group._core.supervisor.hosts[0].kill(dump=False)  # noqa: SLF001
+        gate.set()
+        first.join()
+        second = ClientThread(address, "second", envs[1], hardware=False)
+        group.collect_async(deadline=HANG)
+    second.join()
+    assert begun[2] is None
 
 
 class Braked(gym.Wrapper[Any, Any, Any, Any]):

@@ -209,7 +209,10 @@ class EnvServerHost(Host):
         self._entry, self._since_ns = int(entries[0]), time.monotonic_ns()
         sessions = self.server.sessions
         if is_reset:
-            self._reset, self._lost_reset = given or self._lost_reset, (None, None)
+            lost, self._lost_reset = self._lost_reset, (None, None)
+            # A mask resets a part of an env, so it can't begin an episode of another one.
+            again = (None, None) if "reset_mask" in (lost[1] or {}) else lost
+            self._reset = given or again
             sessions.reset(self._place, *self._reset)
         else:
             action, extras = given or STEP_IN_ROW
