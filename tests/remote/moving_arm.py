@@ -2,7 +2,7 @@
 
 It writes a line into the file LOG before each motion. While a file LOG.hold exists, a motion goes
 on, until the arm is stopped, which makes the file LOG.stopped. It ends with the
-program that started it.
+program that started it, or when there is a file LOG.end, and doesn't close its client.
 """
 
 from __future__ import annotations
@@ -73,5 +73,8 @@ def end_with_parent() -> None:
 if __name__ == "__main__":
     address, log = sys.argv[1:]
     threading.Thread(target=end_with_parent, daemon=True).start()
-    with RemoteEnvClient(Arm(Path(log)), address, name="arm", hardware=True) as client:
-        client.run()
+    client = RemoteEnvClient(Arm(Path(log)), address, name="arm", hardware=True)
+    serving = threading.Thread(target=client.run, daemon=True)
+    serving.start()
+    while serving.is_alive() and not Path(log).with_suffix(".end").exists():
+        time.sleep(0.01)

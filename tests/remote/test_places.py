@@ -330,6 +330,18 @@ def test_a_clients_arm_stops_when_an_action_is_refused(tmp_path: Path, action: A
         assert arm.motions() == ["reset None", "reset None", "step"]
 
 
+def test_an_arm_stops_when_the_program_of_its_client_ends(tmp_path: Path) -> None:
+    """Though that closes nothing."""
+    with sync.build_env_group(served()) as group, arms() as started:
+        arm = ArmProcess(group["robots-0"].address, tmp_path / "arm")
+        started.append(arm)
+        batch, _ = group.reset()
+        group.step(actions(batch))
+        (tmp_path / "arm.end").touch()
+        arm.process.wait(HANG)
+        assert arm.is_stopped()
+
+
 def test_a_reset_that_was_given_up_is_not_that_of_a_later_step() -> None:
     """Its seed goes with it."""
     begun, gate = threading.Event(), threading.Event()

@@ -37,7 +37,7 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 ACTION_TIMEOUT: Final = "action_timeout"
 """In `env_kwargs` of an entry of hardware: see `limit_actions`."""
 HELD: Final[set[BaseEnv]] = set()
-"""What the trainer's own process has made and not closed: it stops with that process."""
+"""What a trainer's own process, or a client's, has and has not closed: it stops with that."""
 os.register_at_fork(after_in_child=HELD.clear)
 
 
@@ -57,7 +57,7 @@ def stop(env: BaseEnv) -> None:
 
 @atexit.register
 def _stop_held() -> None:
-    for env in HELD:  # One after the other: no thread can be started any more.
+    for env in list(HELD):  # One after the other: no thread can be started any more.
         stop(env)
 
 

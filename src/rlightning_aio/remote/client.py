@@ -28,6 +28,7 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv, initialised
 from rlightning_aio.envs.fast_path import fast_path_of
 from rlightning_aio.envs.hardware import (
+    HELD,
     checked_input_of,
     says_hardware,
     signals_held_back,
@@ -153,7 +154,7 @@ class RemoteEnvClient:
         self._heartbeat = heartbeat or (HARDWARE_HEARTBEAT if hardware else DEFAULT_HEARTBEAT)
         compression = _checked_compression(compression)
         self._env = env = _own_env(env, self.name)
-        with _closed_on_error(env, is_hardware=hardware):
+        with _held(env, is_hardware=hardware):
             self._session = ClientSession(
                 initialised(env),
                 self.name,
@@ -521,16 +522,19 @@ def _close(env: BaseEnv, *, is_hardware: bool) -> None:
     """Close `env`, hardware after it was stopped."""
     if is_hardware:
         stop_all([env])
+    HELD.discard(env)
     env.close()
 
 
 @contextlib.contextmanager
-def _closed_on_error(env: BaseEnv, *, is_hardware: bool) -> Generator[None]:
-    """Close `env` if the client that owns it can't be made.
+def _held(env: BaseEnv, *, is_hardware: bool) -> Generator[None]:
+    """Hold hardware, until it is closed; close `env` if the client that owns it can't be made.
 
     Raises:
         ConfigError: its spaces can't be announced.
     """
+    if is_hardware:
+        HELD.add(env)
     try:
         yield
     except BaseException as error:
