@@ -137,6 +137,14 @@ async def test_an_error_of_the_server_is_one_of_the_env(code: str) -> None:
         assert batch.observation[0]["count"] == 1
 
 
+@pytest.mark.parametrize("option", [{"observation_field": "pixels"}, {"columns": {"pixels": 3}}])
+@on_asyncio
+async def test_a_field_that_the_server_does_not_send_is_named(option: dict[str, Any]) -> None:
+    with pytest.raises(rl.EnvRaised, match=r"names 'pixels', .* are 'answers'"):
+        async with one_env(env_kwargs=option):
+            pass
+
+
 @pytest.mark.parametrize("action", [3, {"number": object()}])
 @on_asyncio
 async def test_an_action_that_can_not_be_sent_is_refused_and_the_session_goes_on(

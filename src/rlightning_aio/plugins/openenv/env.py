@@ -192,11 +192,12 @@ class OpenEnv(BaseEnv):
         info: dict[str, Any] = dict(data.get("metadata") or inner or {})
         if self._columns:
             columns = {
-                name: _value_in(space, fields.pop(name)) for name, space in self._columns.items()
+                name: _value_in(space, _taken(fields, name, "columns"))
+                for name, space in self._columns.items()
             }
             return {**columns, "rest": fields}, info
         field = self._options.observation_field
-        return (fields if field is None else fields[field]), info
+        return (fields if field is None else _taken(fields, field, "observation_field")), info
 
     def _is_cut(self, data: dict[str, Any], info: dict[str, Any]) -> bool:
         field = self._options.truncated_field
@@ -243,6 +244,16 @@ def _space_of(env_id: str, name: str, given: Any) -> gym.Space[Any]:
             f"{env_id}: env_kwargs: columns.{name}: {given!r} makes no space ({error}); give a "
             "number for Discrete, or shape, dtype, low and high for a Box"
         ) from None
+
+
+def _taken(fields: dict[str, Any], name: str, option: str) -> Any:
+    """Remove a field of an observation, and return its value."""
+    if name not in fields:
+        there = ", ".join(map(repr, fields)) or "none"
+        raise ValueError(
+            f"env_kwargs.{option} names {name!r}, and the observation's fields are {there}"
+        )
+    return fields.pop(name)
 
 
 def _value_in(space: gym.Space[Any], value: Any) -> Any:
