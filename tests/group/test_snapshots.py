@@ -18,7 +18,6 @@ from run_python import output_of
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy, EnvRaised, SnapshotError
-from rlightning_aio.registry import PLACEMENTS, Placement
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -112,23 +111,19 @@ def entry_of(kind: str, **fields: Any) -> dict[str, Any]:
         ("mujoco, several", "process"),
         ("wrappers", "process"),
         ("of its own", "inline"),
-        ("of its own", "thread"),
     ],
     ids=", in ".join,
 )
 def groups(request: pytest.FixtureRequest) -> Iterator[tuple[sync.EnvGroup, sync.EnvGroup]]:
     """Yield a group, and another group of an equal entry elsewhere."""
     kind, placement = request.param
-    with pytest.MonkeyPatch.context() as patch:
-        place = Placement("hosts.thread_host:ThreadHost", spreads=True)
-        patch.setitem(PLACEMENTS, "thread", place)
-        elsewhere = "process" if placement == "inline" else "inline"
-        fields = {"envs_per_process": 1} if placement != "inline" else {}
-        with (
-            sync.build_env_group(entry_of(kind, placement=placement, **fields)) as one,
-            sync.build_env_group(entry_of(kind, placement=elsewhere)) as other,
-        ):
-            yield one, other
+    elsewhere = "process" if placement == "inline" else "inline"
+    fields = {"envs_per_process": 1} if placement != "inline" else {}
+    with (
+        sync.build_env_group(entry_of(kind, placement=placement, **fields)) as one,
+        sync.build_env_group(entry_of(kind, placement=elsewhere)) as other,
+    ):
+        yield one, other
 
 
 @settings(

@@ -210,6 +210,29 @@ def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
     assert slab.is_reset[0].tolist() == [[False, False, True]] * 2
 
 
+@pytest.mark.parametrize(
+    ("mode", "lengths", "returns", "over"),
+    [
+        ("disabled", [0, 0], [1, 2], [True, True]),
+        ("next_step", [1, 0], [1, 0], [False, False]),
+        ("same_step", [1, 1], [1, 1], [False, True]),
+    ],
+)
+def test_who_waits_keeps_its_return_and_who_resets_itself_begins_anew(
+    mode: Autoreset, lengths: list[int], returns: list[int], over: list[bool]
+) -> None:
+    """A reset in the next step ends nothing, whatever its flags say."""
+    writer, slab = writer_of(mode, (2,))
+    no = np.zeros(2, bool)
+    step(writer, np.ones(2), ~no, no, {})
+    begin(writer, {})
+    for ends in ([True, False], [True, True], [False, True]):
+        step(writer, np.ones(2), np.array(ends), no, {})
+    assert slab.episode_length[0].tolist() == lengths
+    assert slab.episode_return[0].tolist() == returns
+    assert slab.over[0].tolist() == over
+
+
 # -- what has no place in the row
 
 
