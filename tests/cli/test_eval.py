@@ -125,18 +125,6 @@ def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
     assert len(invoke_json("eval", config, "--episodes", 60, "--resume", file)["attempts"]) == 180
 
 
-def test_eval_draws_and_films(tmp_path: Path) -> None:
-    """The film is that of the first episode."""
-    config = write_config(tmp_path, {**JUDGED, "num_workers": 2})
-    plot, films = tmp_path / "plot.png", tmp_path / "films"
-    # In a process of its own, because matplotlib keeps its fonts open.
-    done = run("eval", config, "--episodes", 3, "--seed", 0, "--plot", plot, "--video", films)
-    assert done.returncode == 0, done.stderr
-    assert plot.read_bytes().startswith(b"\x89PNG")
-    (film,) = films.iterdir()
-    assert film.name.endswith("-seed-0-judged-0-episode-0.mp4")
-
-
 def refused(*words: object) -> str:
     done = invoke("eval", *words)
     assert done.exit_code == 2

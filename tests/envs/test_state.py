@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kit.scripted import Counts
@@ -104,6 +105,16 @@ def heavier() -> gym.Env[Any, Any]:
 def test_a_model_that_changes() -> None:
     """Masses and gravity are restored, and values that one step computes for the next."""
     check_restored(6, task=heavier)
+
+
+def wrapped() -> gym.Env[Any, Any]:
+    """Make an env whose wrappers have counters, running means and functions."""
+    env = NormalizeReward(NormalizeObservation(gym.make("Pendulum-v1", max_episode_steps=9)))
+    return gym.wrappers.TransformReward(env, lambda reward: 2 * reward)
+
+
+def test_wrappers() -> None:
+    check_restored(6, task=wrapped)
 
 
 def test_a_model_of_another_structure_raises() -> None:

@@ -1,17 +1,14 @@
-"""A restored env continues exactly as the original would have, in any placement."""
+"""Snapshots that are kept, and those that are refused; that a restored env continues exactly as the
+original would have, random programs show, and tests/envs/test_state.py for each simulator.
+"""
 
 from __future__ import annotations
 
-import os
 import threading
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-import numpy as np
 import pytest
-from gymnasium.wrappers import NormalizeObservation, NormalizeReward, RecordEpisodeStatistics
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kit.scripted import Saved
 from run_python import output_of
 
@@ -20,151 +17,28 @@ from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy, EnvRaised, SnapshotError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from rlightning_aio.batch import BatchedData
 
 
-class Clockless(RecordEpisodeStatistics):
-    """Removes times from infos, which a snapshot can't reproduce."""
-
-    def step(self, action: Any) -> Any:
-        *values, info = super().step(action)
-        info.get("episode", {}).pop("t", None)
-        return *values, info
-
-
-def wrapped() -> gym.Env[Any, Any]:
-    """Make an env with wrappers that have counters, running means and generators."""
-    env = NormalizeReward(NormalizeObservation(gym.make("Pendulum-v1", max_episode_steps=9)))
-    return gym.wrappers.TransformReward(Clockless(env), lambda reward: 2 * reward)
-
-
-class Wandering(gym.Env[Any, Any]):
-    """Draws random numbers at every step, also from its own action space."""
-
-    observation_space = gym.spaces.Dict(
-        {"at": gym.spaces.Box(-99, 99, (2,)), "n": gym.spaces.Discrete(99)}
-    )
-    action_space = gym.spaces.Discrete(3)
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        super().reset(seed=seed)
-        self.own_space = gym.spaces.Box(0, 1, (2,), seed=int(self.np_random.integers(99)))
-        self.at = self.np_random.normal(size=2).astype(np.float32)
-        return {"at": self.at, "n": 0}, {"nested": {"words": "here"}}
-
-    def step(self, action: Any) -> Any:
-        self.at += self.own_space.sample() * self.np_random.normal() * action
-        over = bool(self.np_random.random() < 0.2)
-        info = {"nested": {"words": str(action)}} if action else {"far": float(self.at.sum())}
-        return {"at": self.at, "n": int(action)}, float(self.at[0]), over, False, info
-
-
 ENTRIES: dict[str, dict[str, Any]] = {
     "gymnasium": {"backend": "gymnasium", "task": "CartPole-v1"},
-    "gymnasium, several": {"backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2},
     "mujoco": {"backend": "mujoco", "task": "Hopper-v5"},
-    "mujoco, several": {"backend": "mujoco", "task": "InvertedPendulum-v5", "num_envs": 2},
-    "wrappers": {"task": wrapped},
-    "of its own": {"task": Wandering},
 }
-
-
-def content(batch: BatchedData, flags: Any) -> list[Any]:
-    columns = (batch.reward, batch.terminated, batch.truncated, batch.is_reset, batch.done)
-    return [batch.observation, *columns, batch.limit_reached, batch.info(), flags]
-
-
-class Run:
-    """A group under auto-reset, stepped with random actions."""
-
-    def __init__(self, group: sync.EnvGroup, seed: int) -> None:
-        self.group, self.seed = group, seed
-
-    def proceed(
-        self, batch: BatchedData, num_steps: int, turn: int
-    ) -> tuple[BatchedData, list[Any]]:
-        space = self.group.get_action_spaces()[0]
-        assert space is not None
-        space.seed(self.seed + turn)
-        trace: list[Any] = []
-        for _ in range(num_steps):
-            batch, flags = self.group.step(
-                batch.respond(action=[space.sample() for _ in batch.ids()])
-            )
-            trace.append(content(batch, flags))
-        return batch, trace
 
 
 def entry_of(kind: str, **fields: Any) -> dict[str, Any]:
     return {"name": "e", "num_workers": 2, **ENTRIES[kind], **fields}
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        ("gymnasium", "process"),
-        ("gymnasium, several", "inline"),
-        ("mujoco", "inline"),
-        ("mujoco, several", "process"),
-        ("wrappers", "process"),
-        ("of its own", "inline"),
-    ],
-    ids=", in ".join,
-)
-def groups(request: pytest.FixtureRequest) -> Iterator[tuple[sync.EnvGroup, sync.EnvGroup]]:
-    """Yield a group, and another group of an equal entry elsewhere."""
-    kind, placement = request.param
-    elsewhere = "process" if placement == "inline" else "inline"
-    fields = {"envs_per_process": 1} if placement != "inline" else {}
-    with (
-        sync.build_env_group(entry_of(kind, placement=placement, **fields)) as one,
-        sync.build_env_group(entry_of(kind, placement=elsewhere)) as other,
-    ):
-        yield one, other
-
-
-@settings(
-    max_examples=4 if "RLIGHTNING_AIO_EXAMPLES" not in os.environ else settings().max_examples
-)
-@given(
-    seed=st.integers(0, 2**20),
-    before=st.integers(0, 30),
-    between=st.integers(0, 12),
-    after=st.integers(1, 25),
-    limit=st.integers(2, 30),
-)
-def test_a_restored_env_continues_as_the_original(
-    groups: tuple[sync.EnvGroup, sync.EnvGroup],
-    seed: int,
-    before: int,
-    between: int,
-    after: int,
-    limit: int,
-) -> None:
-    """Bit for bit: in its place, and in another env of another group, in another process."""
-    for group in groups:
-        group.reset()  # The other env has a different state.
-    one, other = groups
-    run = Run(one, seed)
-    first, _ = one.reset(seed=seed)
-    with one.auto_reset(limit):
-        batch, _ = run.proceed(first, before, 0)
-        snapshot = one.snapshot()
-        _, expected = run.proceed(batch, after, 1)
-        run.proceed(batch, between, 2)
-        shown, flags = one.restore(snapshot)
-        assert shown.is_reset.all()
-        assert not any([*shown.done.ravel(), *shown.reward.ravel(), *flags])
-        np.testing.assert_equal(shown.observation, batch.observation)
-        shown, found = run.proceed(shown, after, 1)
-        np.testing.assert_equal(found, expected)
-    with other.auto_reset(limit):
-        shown, _ = other.restore(snapshot)
-        _, found = Run(other, seed).proceed(shown, after, 1)
-        np.testing.assert_equal(found, expected)
+def stepped(group: sync.EnvGroup, batch: BatchedData, num_steps: int, seed: int) -> BatchedData:
+    """Step with random actions; return the last results."""
+    space: Any = group.get_action_spaces()[0]
+    space.seed(seed)
+    for _ in range(num_steps):
+        batch, _ = group.step(batch.respond(action=[space.sample() for _ in batch.ids()]))
+    return batch
 
 
 def test_a_snapshot_can_be_restored_in_another_run(tmp_path: Path) -> None:
@@ -172,9 +46,9 @@ def test_a_snapshot_can_be_restored_in_another_run(tmp_path: Path) -> None:
     config = entry_of("mujoco")
     with sync.build_env_group(config) as group:
         batch, _ = group.reset(seed=1)
-        batch, _ = Run(group, 0).proceed(batch, 7, 0)
+        batch = stepped(group, batch, 7, 0)
         (tmp_path / "snapshot").write_bytes(group.snapshot())
-        batch, _ = Run(group, 0).proceed(batch, 5, 1)
+        batch = stepped(group, batch, 5, 1)
     program = tmp_path / "program.py"
     program.write_text(
         "from rlightning_aio import sync\n"
@@ -313,7 +187,7 @@ async def test_an_episode_that_had_ended_is_not_begun_again_after_a_failed_resto
 
 
 def test_a_snapshot_without_the_state_to_branch_is_refused() -> None:
-    with sync.build_env_group(entry_of("of its own", num_workers=3, placement="inline")) as group:
+    with sync.build_env_group(entry_of("gymnasium", num_workers=3, placement="inline")) as group:
         group.reset(seed=3)
         snapshot = group.snapshot(["e-2", "e-0"])
         with pytest.raises(SnapshotError, match="no state of 'e-1', only of e-2, e-0; nothing"):

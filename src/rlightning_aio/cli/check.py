@@ -141,7 +141,7 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding], steps: i
 
 async def _try(config: EnvConfig, found: _Finding, steps: int) -> None:
     """Build one env of the entry and step it."""
-    alone = {"num_workers": 1, "recycle": {}}
+    alone: dict[str, Any] = {"num_workers": 1, "recycle": {}}
     # A replacement would hide what is wrong.
     raising = {"on_env_error": "raise", "on_worker_death": "raise"}
     one = moved(config.model_copy(update=alone | raising), config.placement)
