@@ -469,8 +469,8 @@ def test_one_message_lists_every_problem_of_a_file(write: Write) -> None:
     assert head == f"{path}: {len(lines)} problems"
     assert [line.split(": ")[0].strip() for line in lines] == [
         "import",
-        "envs.0 ('hopper'), num_worker",
         "envs.0 ('hopper'), num_workers",
+        "envs.0 ('hopper'), num_worker",
         "envs.0 ('hopper'), num_envs",
         "envs.1",
         "envs.2 ('zzz'), task",
@@ -545,10 +545,10 @@ def test_env_config_lists_everything_that_is_wrong() -> None:
     """In the words of an entry that is a mapping, also for what is nested."""
     wrong: dict[str, Any] = {"name": "", "num_workers": "2", "placement": "moon"}
     with pytest.raises(ConfigError) as caught:
-        EnvConfig(**{**wrong, "imports": ["math", 3]})
+        EnvConfig(**{**wrong, "imports": ["math", 3], "nme": 1, "tsk": 2})
     said = str(caught.value)
-    assert said.startswith("EnvConfig: 5 problems\n  name: String should have at least 1 character")
-    for field in ("backend", "num_workers", "imports.1", "placement"):
+    assert said.startswith("EnvConfig: 7 problems\n  name: String should have at least 1 character")
+    for field in ("backend", "num_workers", "imports.1", "placement", "nme", "tsk"):
         assert f"\n  {field}: " in said
     assert "http" not in said
 

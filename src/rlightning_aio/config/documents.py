@@ -181,20 +181,17 @@ def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
         problems.add(place, f"should be a mapping of fields, got {as_text(entry)}")
         return None
     given = cast("Mapping[Any, Any]", entry)
-    known = EnvConfig.model_fields
-    fields = completed({k: _plain(v, place) for k, v in given.items() if k in known})
+    fields = completed({k: _plain(v, place) for k, v in given.items()})
     if isinstance(name := fields.get("name"), str) and name:
         place = f"{place} ({name!r})"
-    for unknown in (k for k in given if k not in known):
-        problems.add(f"{place}, {unknown}", unknown_field(unknown, known))
     try:
         return Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:
         faults = error.errors(include_url=False)
-    for path, text in explained(faults, fields):
+    for path, text in explained(faults, fields, EnvConfig.model_fields):
         problems.add(f"{place}, {path}", text)
     faulty = {str(fault["loc"][0]) for fault in faults}
-    right = {k: v for k, v in fields.items() if k not in faulty}
+    right = {k: v for k, v in fields.items() if str(k) not in faulty}
     return Entry(place, EnvConfig.model_validate({"name": "?", "backend": "?"} | right), faulty)
 
 

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
+from rlightning_aio.config.problems import Problems, as_text, explained
 from rlightning_aio.registry import CALLABLE, ENVS, PLACEMENTS, is_mujocos, name_of, placement_of
 
 MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
@@ -33,7 +33,8 @@ class _Fields(BaseModel):
             try:
                 super().__init__(**fields)
             except ValidationError as error:
-                for path, text in explained(error.errors(include_url=False), fields):
+                known = type(self).model_fields
+                for path, text in explained(error.errors(include_url=False), fields, known):
                     problems.add(path, text)
             problems.raise_any()
 
@@ -121,14 +122,9 @@ class EnvConfig(_Fields):
 
     @model_validator(mode="before")
     @classmethod
-    def _suggest_known_names(cls, fields: Any) -> Any:
-        if not isinstance(fields, Mapping):
-            return fields
-        given = cast("Mapping[str, Any]", fields)
-        for name in given:
-            if name not in cls.model_fields:
-                raise ValueError(f"{name}: {unknown_field(name, cls.model_fields)}")
-        return completed(given)
+    def _complete(cls, fields: Any) -> Any:
+        is_mapping = isinstance(fields, Mapping)
+        return completed(cast("Mapping[str, Any]", fields)) if is_mapping else fields
 
     @field_validator("backend")
     @classmethod

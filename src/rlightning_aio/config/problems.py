@@ -47,9 +47,9 @@ def as_text(value: object) -> str:
 
 
 def explained(
-    faults: Sequence[ErrorDetails], fields: Mapping[str, Any]
+    faults: Sequence[ErrorDetails], fields: Mapping[str, Any], known: Iterable[str]
 ) -> Iterator[tuple[str, str]]:
-    """Yield path and text of each fault that pydantic has found in `fields`.
+    """Yield path and text of each fault that pydantic has found in `fields`; `known` are possible.
 
     Branches of a union share a path, so they share a text.
     """
@@ -59,9 +59,11 @@ def explained(
         path = _path(fault["loc"], fields)
         text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
         text = text.replace("valid tuple", "list")
-        texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
-        if fault["type"] not in ("missing", "value_error"):
+        if fault["type"] in ("extra_forbidden", "invalid_key"):
+            text = unknown_field(path, known)
+        elif fault["type"] != "value_error":
             inputs[path] = f", got {as_text(fault['input'])}"
+        texts.setdefault(path, []).append(text)
     for path, (first, *others) in texts.items():
         alternatives = [first, *(other.removeprefix("should be ") for other in others)]
         yield path, " or ".join(alternatives) + inputs.get(path, "")
