@@ -249,7 +249,7 @@ def test_a_configuration_class_with_overrides(make: Any) -> None:
     [
         ({"task": "Isaac-Cartpol"}, r"isaac-0: task 'Isaac-Cartpol'.*did you mean 'Isaac-Cart"),
         ({"task": "nowhere::Cfg"}, r"isaac-0: task: 'nowhere::Cfg' can't be loaded"),
-        ({"env_kwargs": {"devize": "cpu"}}, r"isaac-0: env_kwargs: devize.*device"),
+        ({"env_kwargs": {"devize": "cpu"}}, r"isaac-0: env_kwargs\.devize.*device"),
         ({"env_kwargs": {"overrides": {"sim.td": 1}}}, r"overrides\.sim\.td: there is no 'td'"),
         (
             {"task": CARTPOLE_CFG, "backend": "isaac_marl"},

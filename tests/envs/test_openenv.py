@@ -300,7 +300,7 @@ def test_a_server_that_is_not_there_is_named_by_check(tmp_path: Path) -> None:
     [
         ({"columns": {"a": {"shap": [3]}}}, "columns.a"),
         ({"columns": {"a": 5}, "observation_field": "b"}, "exclude each other"),
-        ({"url": "x"}, "Known fields: urls"),
+        ({"url": "x", "colums": 1}, "url: .* did you mean 'urls'(?s:.*) mean 'columns'"),
     ],
     ids=str,
 )

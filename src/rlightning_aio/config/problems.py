@@ -28,11 +28,15 @@ class Problems:
 
     def raise_any(self) -> None:
         """Raise one `ConfigError` that lists all problems, if there are any."""
-        if len(self.lines) == 1:
-            raise ConfigError(f"{self.source}: {self.lines[0]}")
         if self.lines:
-            listed = "".join(f"\n  {line}" for line in self.lines)
-            raise ConfigError(f"{self.source}: {len(self.lines)} problems{listed}")
+            raise self.error()
+
+    def error(self) -> ConfigError:
+        """Return the error that lists them."""
+        if len(self.lines) == 1:
+            return ConfigError(f"{self.source}: {self.lines[0]}")
+        listed = "".join(f"\n  {line}" for line in self.lines)
+        return ConfigError(f"{self.source}: {len(self.lines)} problems{listed}")
 
 
 def unknown_field(name: object, known: Iterable[str]) -> str:
@@ -59,7 +63,7 @@ def explained(
         path = _path(fault["loc"], fields)
         text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
         text = text.replace("valid tuple", "list")
-        if fault["type"] in ("extra_forbidden", "invalid_key"):
+        if fault["type"] in ("extra_forbidden", "invalid_key") and len(fault["loc"]) == 1:
             text = unknown_field(path, known)
         elif fault["type"] != "value_error":
             inputs[path] = f", got {as_text(fault['input'])}"

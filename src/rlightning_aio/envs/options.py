@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from rlightning_aio.config.problems import Problems, explained
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,18 +19,19 @@ if TYPE_CHECKING:
 Options = TypeVar("Options", bound=BaseModel)
 
 
-def read_options(model: type[Options], env_id: str, env_kwargs: Mapping[str, Any]) -> Options:
-    """Parse `env_kwargs` as `model`.
+def read_options(model: type[Options], owner: str, env_kwargs: Mapping[str, Any]) -> Options:
+    """Parse `env_kwargs` as `model`; `owner`, of whom they are, is named in messages.
 
     Raises:
-        ConfigError: a field is unknown, missing or of the wrong type or value.
+        ConfigError: fields are unknown, missing or of the wrong type or value; all are named.
     """
     try:
         return model.model_validate(env_kwargs)
     except ValidationError as error:
-        known = ", ".join(model.model_fields)
-        faults = "; ".join(_describe(fault) for fault in error.errors())
-        raise ConfigError(f"{env_id}: env_kwargs: {faults}. Known fields: {known}") from None
+        problems, faults = Problems(owner), error.errors(include_url=False)
+    for path, text in explained(faults, env_kwargs, model.model_fields):
+        problems.add(f"env_kwargs.{path}".rstrip("."), text)
+    raise problems.error()
 
 
 def load_named(env_id: str, field: str, name: str, separator: str = ":") -> Any:
@@ -43,9 +45,3 @@ def load_named(env_id: str, field: str, name: str, separator: str = ":") -> Any:
         return getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{env_id}: {field}: {name!r} can't be loaded: {error}") from error
-
-
-def _describe(fault: Any) -> str:
-    place = ".".join(map(str, fault["loc"]))
-    text = fault["msg"].removeprefix("Value error, ")
-    return f"{place}: {text}" if place else text

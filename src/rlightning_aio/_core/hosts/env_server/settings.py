@@ -6,9 +6,9 @@ import ipaddress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
-from rlightning_aio.config.problems import explained, unknown_field
+from rlightning_aio.envs.options import read_options
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.net.wire import MAX_HEARTBEAT, MIN_HEARTBEAT
 from rlightning_aio.remote.keys import read_server_keys
@@ -49,9 +49,6 @@ class ServerSettings(BaseModel):
         return [""] * self.clients if isinstance(self.clients, int) else self.clients
 
 
-_FIELDS: Final = (*ServerSettings.model_fields, "zmq_port", "num_clients", "min_clients")
-
-
 def place_names(config: EnvConfig) -> list[str]:
     """Return the name of each place of an env_server entry, which ends the id of its env."""
     return [name or str(index) for index, name in enumerate(server_settings(config).places)]
@@ -63,15 +60,8 @@ def server_settings(config: EnvConfig) -> ServerSettings:
     Raises:
         ConfigError: naming the entry and every wrong field.
     """
-    place, given = f"entry {config.name!r}, env_kwargs", config.env_kwargs
-    try:
-        settings = ServerSettings.model_validate(given)
-    except ValidationError as error:
-        texts = [
-            f"{path}: {text if path in _FIELDS else unknown_field(path, _FIELDS)}"
-            for path, text in explained(error.errors(include_url=False), given)
-        ]
-        raise ConfigError(f"{place}.{'; env_kwargs.'.join(texts)}") from None
+    place = f"entry {config.name!r}, env_kwargs"
+    settings = read_options(ServerSettings, f"entry {config.name!r}", config.env_kwargs)
     if len({*settings.places} - {""}) < len([name for name in settings.places if name]):
         raise ConfigError(f"{place}.clients: a name is there twice; each has one place")
     if settings.keys is not None:
