@@ -208,6 +208,7 @@ class Casting(Plays):
             "count": gym.spaces.Box(0, 99, (1,), np.int32),
             "list": gym.spaces.Box(-1, 1, (2,)),
             "number": gym.spaces.Discrete(9),
+            "both": gym.spaces.Tuple([gym.spaces.Discrete(9), gym.spaces.Box(-1, 1, (2,))]),
         }
     )
 
@@ -218,6 +219,7 @@ class Casting(Plays):
             "count": np.full(1, self.steps),
             "list": [0.5, 0.5],
             "number": 3,
+            "both": (3, np.zeros(2)),
         }
 
 

@@ -135,6 +135,7 @@ def test_check_names_observations_that_are_cast(env: str, placement: str, tmp_pa
     said = [problem.partition(";")[0] for problem in found["problems"]]
     free = "no number changes, but it takes time"
     assert said == [
+        f"observation['both'][1] is converted from float64 to float32: {free}",
         f"observation['count'] is converted from int64 to int32: {free}",
         f"observation['list'] is converted from list to float32: {free}",
         "observation['pose'] is converted from float64 to float32: numbers are rounded",

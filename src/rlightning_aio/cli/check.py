@@ -36,7 +36,7 @@ from rlightning_aio.config import check_installed, load_config, moved
 from rlightning_aio.config.documents import parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.policies.random_actions import allowed_action, sampler_of
-from rlightning_aio.protocol.columns import out_of_bounds
+from rlightning_aio.protocol.columns import held, in_brackets, out_of_bounds
 from rlightning_aio.trees import as_numpy, index, tree_of, walked
 from rlightning_aio.types import PolicyResponse
 
@@ -327,11 +327,7 @@ def _casts(space: gym.Space[Any], observation: Any) -> dict[str, str]:
     """Say which parts of an observation have another dtype than their space."""
     said = dict[str, str]()
     for path, part in walked(tree_of(space)):
-        value: Any = observation
-        name = "observation"
-        for key in path:
-            # An agent that takes no part has no observation.
-            value, name = None if value is None else value.get(key), f"{name}[{key!r}]"
+        value, name = held(observation, path), f"observation{in_brackets(path)}"
         kind = str(getattr(value, "dtype", type(value).__name__))
         # Numbers of Python have no dtype of their own.
         if not isinstance(part, _NUMBERS) or kind == str(part.dtype) or not _is_array(value):

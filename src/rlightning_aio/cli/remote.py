@@ -21,7 +21,7 @@ from rlightning_aio.cli.terminal import (
     print_lines,
 )
 from rlightning_aio.config import check_installed, load_config
-from rlightning_aio.errors import ConfigError, RLightningError, env_raised
+from rlightning_aio.errors import ConfigError, RemoteTraceback, RLightningError
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.remote import RemoteEnvClient
 from rlightning_aio.remote.client import is_address
@@ -134,16 +134,11 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
     except RLightningError:
         raise
     except Exception as error:  # noqa: BLE001  # It is the env author's code.
-        words, env_id = ErrorText.of(error), f"{entry.name}-0"
-        fault = env_raised(
-            f"{env_id} (backend {entry.backend!r}, task {entry.task_name!r}) raised "
-            f"{words.summary}; its __cause__ is the remote traceback",
-            env_id=env_id,
-            exception_type=words.type_name,
-            exception_text=words.text,
-            traceback_text=words.traceback,
-        )
-        raise fault from fault.__cause__
+        words = ErrorText.of(error)
+        raise RLightningError(
+            f"{entry.name}-0 (backend {entry.backend!r}, task {entry.task_name!r}) raised "
+            f"{words.summary}; its __cause__ is the remote traceback"
+        ) from RemoteTraceback(words.traceback)
 
 
 def keygen(

@@ -276,7 +276,7 @@ def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
 
 def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
     for path, part in walked(tree_of(space)):
-        bounds, found = _bounds(part), _held(value, path)
+        bounds, found = _bounds(part), held(value, path)
         if bounds is None or not isinstance(found, _NUMBERS):
             continue
         array = np.asarray(found)
@@ -291,7 +291,8 @@ def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
             yield f"{what}{name} holds {number}, and the space goes from {least} to {most}"
 
 
-def _held(value: Any, path: Path) -> Any:
+def held(value: Any, path: Path) -> Any:
+    """Return what `value` has at `path`; None if it has nothing there, as of an absent agent."""
     for key in path:
         try:
             value = value[key]
