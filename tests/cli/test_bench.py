@@ -17,7 +17,7 @@ from cli.command import CARTPOLE, invoke, invoke_json, line_with, run, start, wr
 from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli import bench, settings
+from rlightning_aio.cli import baselines, bench, settings
 
 STUB = {"name": "stub", "backend": "stub", "task": "any", "num_workers": 4}
 QUICK = ["--seconds", 0.01, "--rounds", 2]
@@ -235,6 +235,14 @@ def test_a_sweep_may_be_of_a_field_of_env_kwargs(tmp_path: Path) -> None:
     assert [c["place"] for c in contenders] == [
         "env_kwargs.observation_size=1", "env_kwargs.observation_size=3"
     ]  # fmt: skip
+
+
+async def test_baselines_are_made_without_arguments_of_ours() -> None:
+    kwargs = {"num_threads": 1, "record_video": {"folder": "films"}}
+    config = entry(backend="mujoco", task="InvertedPendulum-v5", env_kwargs=kwargs)
+    for baseline in baselines.baselines_of([config])[:2]:
+        async with baseline.opened(None):
+            pass
 
 
 def test_one_place_is_open_at_a_time(tmp_path: Path) -> None:

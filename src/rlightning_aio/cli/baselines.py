@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.cli.measuring import Place, Round, Rule, as_round
+from rlightning_aio.envs.adapted.films import RECORD_VIDEO
 from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
 from rlightning_aio.policies.random_actions import (
     allowed_action,
@@ -35,8 +36,8 @@ _PLAIN: Final = ("gymnasium", "mujoco")
 """Backends whose envs are those of `gymnasium.make`, unchanged."""
 _MANY: Final = 128
 """Above this number, AsyncVectorEnv is left out: it starts a process for each env."""
-
-
+_OURS: Final = (RECORD_VIDEO, "num_threads")
+"""Arguments that `gymnasium.make` doesn't know."""
 _CLOSE_SECONDS: Final = 2.0
 """Time for AsyncVectorEnv to end a step that Ctrl-C has interrupted."""
 
@@ -183,7 +184,7 @@ def _made(baseline: Baseline) -> _Loop | _Vector:
         "max_episode_steps": config.max_episode_steps,
         # As in our workers.
         "disable_env_checker": True,
-        **config.env_kwargs,
+        **{name: value for name, value in config.env_kwargs.items() if name not in _OURS},
     }
 
     def make() -> Any:
