@@ -252,6 +252,22 @@ def test_an_arm_stops_when_the_group_refuses_its_batch(
     assert lines(log).count("reset") == 2
 
 
+@pytest.mark.parametrize("wrong", [np.zeros(3), PolicyResponse("right-0", np.zeros(2))])
+async def test_only_the_arm_stops_whose_own_action_is_refused(
+    arm: Any, tmp_path: Path, wrong: Any
+) -> None:
+    """Though the steps of both arms, which are asked for one by one, are sent together."""
+    logs = [tmp_path / name for name in ("left", "right")]
+    entries = [arm("inline", log=str(own)) | {"name": own.name} for own in logs]
+    async with build_env_group(entries) as group:
+        await group.reset()
+        steps = group["left-0"].step(wrong), group["right-0"].step(np.zeros(2))
+        found = await asyncio.gather(*steps, return_exceptions=True)
+        assert list(map(type, found)) == [BadAction, EnvRet]
+        wait_for(logs[0], "stop")
+        assert "stop" not in lines(logs[1])
+
+
 class AwaitableArm(Arm):
     """An arm whose methods are coroutine functions."""
 

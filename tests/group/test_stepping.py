@@ -170,7 +170,7 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     for count in (0, 3, 5):  # Refused where it is attached.
         with pytest.raises(BadAction, match="action"):
             batch.respond(action=np.zeros((count, 2)))
-    with pytest.raises(BadAction, match=r"response is for env 'probe-1'.*handle of 'probe-0'"):
+    with pytest.raises(BadAction, match=r"'probe-0' there is a response of 'probe-1'.* handle"):
         await group["probe-0"].step(PolicyResponse("probe-1", [0, 1]))
     for ids, error, said in (
         ([*IDS, "probe-9"], UnknownEnv, "'probe-9'; its envs are probe-0, probe-1"),

@@ -15,8 +15,6 @@ from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.conditions import NO_SPAN
 from rlightning_aio._core.group.timeline import Trace
-from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import BadAction
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import GroupDriver, Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
-
+    from rlightning_aio.batch import BatchedData
 
 _log = logging.getLogger("rlightning_aio")
 _NOT_CLOSED: Final = ("TimeoutError", "WorkerDied")
@@ -41,21 +39,9 @@ def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
     return results[0].values()[0]
 
 
-def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
-    """A batch of one step; raises `BadAction` for a response to another env."""
-    return BatchedData([env_id], [response_to(env_id, response)])
-
-
 def response_to(env_id: str, response: PolicyResponse | Any) -> PolicyResponse:
-    """Return the response to an env, given it or an action; `BadAction` if it is another env's."""
-    if not isinstance(response, PolicyResponse):
-        return PolicyResponse(env_id, response)
-    if response.env_id != env_id:
-        raise BadAction(
-            f"the response is for env {response.env_id!r}, and this is the handle of {env_id!r}; "
-            "step that env, or the group; nothing was sent"
-        )
-    return response
+    """Return the response to an env, given it or an action."""
+    return response if isinstance(response, PolicyResponse) else PolicyResponse(env_id, response)
 
 
 class AutoResetContext(Scope):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio._core.group.api.facade import only_result, steps_of
+from rlightning_aio._core.group.api.facade import only_result, response_to
 from rlightning_aio._core.group.api.interface import (
     EnvHandleInterface,
     GroupInterface,
@@ -17,6 +17,7 @@ from rlightning_aio._core.group.api.interface import (
 )
 from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio._core.group.setup.plan import PreprocessFn, plan_group
+from rlightning_aio.batch import BatchedData
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.setup.plan import Plan
-    from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "due_for_reset"]
@@ -128,7 +128,8 @@ class EnvHandle(EnvHandleInterface):
         return only_result(self._group.reset(seeds, options, [self.env_id]))
 
     def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        return only_result(self._group.step(steps_of(self.env_id, response)))
+        batch = BatchedData([self.env_id], [response_to(self.env_id, response)])
+        return only_result(self._group.step(batch))
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         return self._group.call_with(name, args, kwargs, [self.env_id])[0]

@@ -264,7 +264,9 @@ class AgentSteps:
             each = [cast("MethodCall", step.what) for step in asked]
             calls = [(call.name, call.args, call.kwargs) for call in each]
             return self._calls.prepared(now, env_ids, calls)
-        slots, packed = self._steps.write(BatchedData(env_ids, [step.what for step in asked]), now)
+        batch = BatchedData(env_ids, [step.what for step in asked])
+        # Of several, each is sent by itself then, and only one with a wrong action stops.
+        slots, packed = self._steps.write(batch, now, stops=len(asked) == 1)
         return slots, partial(self._steps.send, slots, packed, now)
 
     def _hand_out(self, ticket: Ticket) -> bool:

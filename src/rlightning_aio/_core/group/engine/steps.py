@@ -219,18 +219,20 @@ class Steps:
 
     # -- check, write, send -----------------------------------------------------------
 
-    def write(self, batch: BatchedData, now: float) -> tuple[NDArray[np.intp], Packed | None]:
+    def write(
+        self, batch: BatchedData, now: float, *, stops: bool = True
+    ) -> tuple[NDArray[np.intp], Packed | None]:
         """Write the actions of a batch into the rows of its envs, all of which are idle.
 
         Args:
             batch: of responses.
             now: monotonic seconds.
+            stops: if an action is wrong, hardware of the batch stops.
 
         Returns their slots, and what goes out of band.
 
         Raises:
-            RLightningError: something is wrong with the batch or its envs; nothing was sent. If it
-                is an action, hardware of the batch stops.
+            RLightningError: something is wrong with the batch or its envs; nothing was sent.
         """
         try:
             if self._completions:
@@ -256,7 +258,7 @@ class Steps:
             self._results.note_sent(slots, columns)
             return slots, None
         except (BadAction, UnknownEnv, EnvBusy) as error:
-            if isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
+            if stops and isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
                 self._stop_hardware(batch.ids(), error)
             raise
 
@@ -457,6 +459,6 @@ def _answered(batch: BatchedData) -> list[str]:
         if env_id != id_:
             raise BadAction(
                 f"under the id {id_!r} there is a response of {env_id!r}; give each under its own "
-                "env's id; nothing was sent"
+                "env's id, or to that env's handle; nothing was sent"
             )
     return env_ids
