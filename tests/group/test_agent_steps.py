@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kit.scripted import DIE, GO, HANG, RAISE, Awaited, Scripted
+from kit.scripted import DIE, END, GO, HANG, RAISE, Awaited, Scripted
 
 import rlightning_aio as rl
 from rlightning_aio._core.group.api.episode import outcome_of
@@ -195,23 +195,45 @@ def pause(monkeypatch: pytest.MonkeyPatch, *, share: float, longest: float, many
         monkeypatch.setattr(agent_steps, name, value)
 
 
-async def test_an_agent_that_leaves_while_its_result_waits_for_others_frees_its_env(
-    monkeypatch: pytest.MonkeyPatch,
+class Cancelling(Awaited):
+    """Has its agent cancelled a turn of the loop before the step ends that ends the episode."""
+
+    agent: asyncio.Task[Any]
+
+    async def step(self, action: Any) -> Any:
+        result = await super().step(action)
+        if action == END:
+            Cancelling.agent.cancel()
+            await asyncio.sleep(0)
+        return result
+
+
+@pytest.mark.parametrize("action", [GO, END], ids=["waits for others", "comes"])
+async def test_an_agent_that_leaves_while_its_result_waits_or_comes_frees_its_env(
+    monkeypatch: pytest.MonkeyPatch, action: int
 ) -> None:
-    pause(monkeypatch, share=1000, longest=30, many=2)
-    async with rl.build_env_group(Long, num_workers=2, placement="loop") as group:
-        requests = group._core.tables.requests
+    """So that it can be reset at once."""
+
+    async def agent(episode: Any, action: int) -> None:
+        try:
+            await episode.step(action)
+        finally:
+            await episode.__aexit__()
+
+    async with rl.build_env_group(Cancelling, num_workers=2, placement="loop") as group:
         first, other = await episodes(group)
-        steps = [asyncio.ensure_future(first.step(0)), asyncio.ensure_future(other.step(HANG))]
-        while requests.state[0] != State.READY:  # noqa: ASYNC110  # Nothing tells.
-            await asyncio.sleep(0.001)
-        assert not steps[0].done()
-        steps[0].cancel()
-        await asyncio.wait(steps[:1])
-        await first.__aexit__()
-        assert requests.is_idle(0)
-        await group.close()
-        await asyncio.wait(steps)
+        pause(monkeypatch, share=1000, longest=30, many=2)
+        going_on = asyncio.ensure_future(agent(other, HANG))
+        leaving = Cancelling.agent = asyncio.ensure_future(agent(first, action))
+        if action == GO:
+            while group._core.tables.requests.state[0] != State.READY:  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+            assert not leaving.done()
+            leaving.cancel()
+        await asyncio.wait([leaving])
+        await group.reset(env_ids=group.env_ids[:1])
+        going_on.cancel()
+        await asyncio.wait([going_on])
 
 
 @pytest.mark.parametrize("action", [GO, RAISE], ids=["result", "error"])

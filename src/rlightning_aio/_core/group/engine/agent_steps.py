@@ -221,6 +221,9 @@ class AgentSteps:
         """Return when to hand out a ready result with those that come soon; 0.0: now."""
         if len(self._sent) < _MANY or not ticket.ended or ticket.errors or self._asked:
             return 0.0
+        ended = [slot for slots in ticket.ended for slot in slots.tolist()]
+        if any(self._sent[slot].reply.done() for slot in ended):
+            return 0.0  # Its agent has left, and its env is to be free.
         since = self._requests.sent_ns.item(ticket.ended[0].item(0)) / 1e9
         pause = min((now - since) * _SHARE, _LONGEST_PAUSE)
         return now + pause if pause >= _SHORTEST_PAUSE else 0.0
