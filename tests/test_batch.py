@@ -773,8 +773,9 @@ def test_the_text_of_a_batch_has_shapes_and_no_contents() -> None:
 def test_an_empty_batch_of_results_has_columns() -> None:
     """Such as a step of no envs in a group of several layouts."""
     batch = results()
-    for name in ("done", "is_reset", "limit_reached", "restarted", "index"):
+    for name in ("reward", "done", "is_reset", "limit_reached", "restarted", "index", "outcome"):
         assert len(getattr(batch, name)) == 0
+    assert not (batch.terminated | batch.truncated).any()
 
 
 def test_tensors_that_do_not_stack_can_be_attached_to_responses() -> None:

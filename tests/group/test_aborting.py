@@ -53,7 +53,9 @@ async def test_a_drain_raises_errors_once_all_envs_are_idle(start: Any) -> None:
     faulty = {raised.value.env_id, *(other.env_id for other in raised.value.others)}
     assert faulty == {IDS[0], IDS[2]}
     assert group.pending == []
-    assert len((await group.drain())[0]) == 0
+    batch, flags = await group.drain()
+    empty = batch.observation, batch.done, batch.outcome, batch.sent.action, batch.take([]).done
+    assert (flags, list(map(len, empty))) == ([], [0] * 5)
 
 
 @pytest.mark.one_driver_for_each_place

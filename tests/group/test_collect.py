@@ -104,8 +104,10 @@ def test_a_window_ends_while_others_are_pending(group: Any) -> None:
         ({"timeout": -1.0}, "timeout must be a positive"),
         ({"timeout": float("nan")}, "timeout must be a positive"),
         ({"deadline": 0}, "deadline must be a positive"),
-        ({"min_results": 0}, "min_results must be at least 1"),
-        ({"max_results": 0}, "max_results must be at least 1"),
+        ({"min_results": 0}, "min_results must be an int, at least 1"),
+        ({"min_results": 4 / 2}, "min_results must be an int.*not 2.0"),
+        ({"max_results": 0}, "max_results must be an int, at least 1"),
+        ({"max_results": 4 / 2}, "max_results must be an int.*not 2.0"),
         ({"min_results": 3, "max_results": 2}, r"min_results \(3\) is above max_results \(2\)"),
     ],
 )

@@ -220,8 +220,6 @@ class BatchedData:
         """
         if len(self._parts) == 1:
             return self._parts[0].stacked_head("done")
-        if not len(self):
-            return self.limit_reached
         return zipped(np.bitwise_or, self.terminated, self.truncated)
 
     @property
@@ -515,6 +513,8 @@ def _head(batch: BatchedData, column: str, attribute: str) -> Any:
     if len(batch._parts) == 1:
         part = batch._parts[0]
         return part.stacked_head(column) if part.agents else getattr(part, column)
+    if not len(batch):
+        return np.empty(0, np.float64 if column == "reward" else np.bool_)
     return stacked_values([getattr(value, attribute) for value in batch.values()])
 
 

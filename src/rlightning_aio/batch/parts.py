@@ -228,9 +228,9 @@ def outcomes_of(
     """See `BatchedData.outcome`; `infos_of` returns the infos of some rows."""
     over = all_agents(batch.done) | batch.restarted
     found = np.full(over.shape, None, np.object_)
-    rows: list[int] = np.flatnonzero(over.reshape(len(over), -1).any(axis=1)).tolist()
-    if not rows:
+    if not over.any():
         return found
+    rows: list[int] = np.flatnonzero(over.reshape(len(over), -1).any(axis=1)).tolist()
     terminated, cut, env_ids = all_agents(batch.terminated), batch.limit_reached, batch.env_ids()
     for row, info in zip(rows, infos_of(rows), strict=True):
         for place in np.argwhere(over[row]).tolist():  # One, and empty, without sub-environments.

@@ -131,8 +131,8 @@ class Sent:
             example = like[0] if len(like) == 1 else concatenated(like)
             found.append(mapped(lambda leaf: _filler(leaf, len(missing)), example))
             places.append(missing)
-        if len(found) == 1:
-            return found[0]
+        if len(found) < 2:
+            return found[0] if found else like[0]
         return concatenated(found, np.argsort(np.concatenate(places)))
 
     def _listed(self, found: list[Any], places: list[NDArray[np.intp]]) -> list[Any]:

@@ -14,6 +14,7 @@ from rlightning_aio._core.group.drivers.wait import Scope, this_process
 from rlightning_aio._core.group.engine.steps import CollectRules
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.conditions import NO_SPAN
+from rlightning_aio._core.group.state.episodes import as_int
 from rlightning_aio._core.group.timeline import Trace
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -285,10 +286,10 @@ class Facade:
         if timeout is not None or deadline is not None:
             check_seconds("timeout", timeout)
             check_seconds("deadline", deadline)
-        if min_results < 1:
-            raise ValueError(f"min_results must be at least 1, not {min_results!r}")
-        if max_results is not None and max_results < 1:
-            raise ValueError(f"max_results must be at least 1, not {max_results!r}")
+        if type(min_results) is not int or min_results < 1:
+            min_results = _checked_count("min_results", min_results)
+        if max_results is not None and (type(max_results) is not int or max_results < 1):
+            max_results = _checked_count("max_results", max_results)
         if max_results is not None and min_results > max_results:
             raise ValueError(f"min_results ({min_results}) is above max_results ({max_results})")
         if wait_all and timeout is not None:
@@ -460,6 +461,13 @@ def _disown_all() -> None:
 
 
 os.register_at_fork(after_in_child=_disown_all)
+
+
+def _checked_count(name: str, given: Any) -> int:
+    count = as_int(given)
+    if count is None or count < 1:
+        raise ValueError(f"{name} must be an int, at least 1, not {given!r}")
+    return count
 
 
 def check_seconds(name: str, seconds: float | None) -> None:

@@ -23,7 +23,6 @@ from rlightning_aio._core.group.engine.snapshots import Snapshots
 from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.engine.waiting import Waiting
 from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
-from rlightning_aio.batch.data import BatchedData
 from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.episodes import Seeds
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta
 
 
@@ -170,10 +170,10 @@ class Core:
                 yield from self._aborts.end(self.envs.all, now)
         finally:
             self.waiting.collecting = 0.0
-        results: tuple[BatchedData, Flags] = BatchedData([], []), []
         if collector.num_ready:
-            slots = collector.pop_ready(collector.num_ready)
-            results = self.steps.hand_out(slots)
+            results = self.steps.hand_out(collector.pop_ready(collector.num_ready))
+        else:
+            results = self.steps.nothing()
         if collector.faults:
             faults = [*collector.faults]
             for fault in faults:

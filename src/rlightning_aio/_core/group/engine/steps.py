@@ -405,6 +405,12 @@ class Steps:
             self._hint.look()
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()
 
+    def nothing(self) -> tuple[BatchedData, Flags]:
+        """Return a batch of no results."""
+        slots = self._envs.all[:0]
+        sources = self._results.sources(slots)
+        return batch_of_results((), self._tables, slots, self._envs.names, sources), []
+
     @staticmethod
     def _mark_cut(part: ResultColumns, is_cut: NDArray[np.bool_]) -> None:
         """Mark where the step limit cuts an episode."""
