@@ -160,6 +160,9 @@ def test_a_list_holds_one_action_for_each_env() -> None:
     rows = Rows(threes)
     rows.write([action["arm"] for action in drawn])
     assert rows.slab.action[1][[2, 0, 1]].tolist() == [1, 4, 7]
+    for free in (False, True):  # A tuple of columns has these shapes, too.
+        with pytest.raises(BadAction, match=r"env 'e-2' .* give a list with one action for each"):
+            Rows(spaces.Box(-9, 9, (3,)), free=free).write((np.arange(3),) * 3)
 
 
 @given(

@@ -63,27 +63,29 @@ def write_actions(
         write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
     else:
         if columns is not None and isinstance(columns.get("action"), tuple):
-            _check_tuple(slots, envs, layout)
+            for slot in slots.tolist():
+                _check_tuple(layout.of(slot)[0], slot, envs)
         _write_one_by_one(batch, slots, envs, layout, beside)
     return None if beside is None else _steps_beside_rows(batch, slots, envs, beside)
 
 
-def _check_tuple(slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout) -> None:
-    """Refuse a tuple for envs whose actions have no parts: it would be taken for their columns."""
-    for slot in slots.tolist():
-        space = layout.slabs[layout.slab[slot]].layout.action_space
-        if not is_tuple(space):
-            raise BadAction(
-                f"a tuple of actions is one of columns, of a Tuple space, but the action space of "
-                f"{envs.describe(slot)} is {space}; give a list with one action for each result; "
-                "nothing was sent"
-            )
+def _check_tuple(slab: Slab, slot: int, envs: EnvTable) -> None:
+    """Refuse a tuple for an env whose action has no parts: they would be taken for columns."""
+    space = slab.layout.action_space
+    if not is_tuple(space):
+        raise BadAction(
+            f"a tuple of actions is one of columns, of a Tuple space, but the action space of "
+            f"{envs.describe(slot)} is {space}; give a list with one action for each result; "
+            "nothing was sent"
+        )
 
 
 def write_column(
     action: Any, slab: Slab, slots: NDArray[np.intp], rows: Rows, envs: EnvTable
 ) -> None:
     """Write the actions of a whole batch, one copy per leaf of the action space."""
+    if isinstance(action, tuple):
+        _check_tuple(slab, slots.item(0), envs)
     for leaf, target in slab.action_columns:
         source = _as_array(_column_at(action, leaf) if leaf.path else action)
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
