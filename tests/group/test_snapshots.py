@@ -176,8 +176,9 @@ class Unloadable:
 
 
 async def test_an_episode_that_had_ended_is_not_begun_again_after_a_failed_restore() -> None:
+    """Nor with its options, which may hold code."""
     async with rl.build_env_group(Unloadable, placement="loop") as group, group.auto_reset(9):
-        batch, _ = await group.reset(seed=3)
+        batch, _ = await group.reset(seed=3, options={"judge": lambda: 0})
         snapshot = await group.snapshot()
         await group.step(batch.respond(action=[0]))
         with pytest.raises(EnvRaised, match="the disk is gone"):

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import pickle
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from rlightning_aio._core.hosts.messages import EnvState
 from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.envs.hardware import stop_all
 from rlightning_aio.protocol.entries import answers_with_value
+from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.row_writer import Execute, ShownResult
@@ -73,7 +73,7 @@ class AwaitedRunner(EnvRunner):
 
     def _snapshot(self) -> EnvState:
         versions, state = super()._snapshot()
-        return EnvState(versions, state and pickle.dumps((self.reset_with, state)))
+        return EnvState(versions, state and dumped((self.reset_with, state), "its options"))
 
     def _restore(self, versions: dict[str, str], state: bytes) -> ShownResult:
         reset_with, state = loaded(state)
