@@ -178,12 +178,15 @@ def test_a_reward_is_one_number_in_any_form() -> None:
         runner.step()
         assert (row.slab.reward[1], row.slab.episode_return[1]) == (2, 2 * number)
     for reward, message in (
-        (None, r"reward of env 'plain-0' must be a number, not None"),
+        ({}, r"reward of env 'plain-0' must be a number, not {}"),
         (np.zeros(2), r"reward of env 'plain-0' has shape \(2,\), expected \(\)"),
     ):
         env.next = reward, False, False, {}
         with pytest.raises(ValueError, match=message):
             runner.step()
+    env.next = None, False, False, {}  # As Gymnasium's vector envs have it.
+    runner.step()
+    assert np.isnan(row.slab.reward[1])
 
 
 # -- what a row says, in each mode

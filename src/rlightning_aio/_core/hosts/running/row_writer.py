@@ -347,7 +347,7 @@ class RowWriter:
             ValueError: it holds no number, or several.
         """
         try:
-            return float(self._checked(what, value))
+            return float(np.asarray(self._checked(what, value), np.float64))
         except TypeError:
             raise ValueError(
                 f"{what} of env {self._env_id!r} must be a number, not {value!r}"
