@@ -31,7 +31,6 @@ from rlightning_aio._core.hosts.awaiting.awaited_env import (
 )
 from rlightning_aio._core.hosts.awaiting.event_loop import (
     awaited_calls,
-    cancel,
     leave_behind,
     log,
     new_task,
@@ -144,7 +143,6 @@ class AwaitedEnvs:
         self._ending = False
         config = order.config
         self._close_seconds = config.close_timeout or times.AWAITED_CLOSE
-        self._renews = config.on_env_error == "restart"
         self._limits = limits_of(config)
         self._pause = times.between_looks(self._limits.values())
         self._look: asyncio.TimerHandle | None = None
@@ -280,7 +278,10 @@ class AwaitedEnvs:
         Returns what was wrong, with the env's index.
         """
         self._end()
-        await cancel(self._tasks, times.CANCEL)
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=times.CANCEL)
         # Others that still run were closed, and reported, when they were put away.
         open_ = [env for env in self._envs if not env.has_closed]
         envs = sorted(open_, key=lambda env: env.index)
@@ -382,9 +383,7 @@ class AwaitedEnvs:
 
         None: its row holds the whole result.
         """
-        raised = completion.error if isinstance(completion, Raised) and self._renews else None
-        is_ended = raised is not None and raised.ends_env(op_of(record.entry))
-        if by is not None and record.env is by and (is_ended or by.runner.is_spent):
+        if by is not None and record.env is by and by.runner.is_spent:
             self._end_env(record, by)
         if self._ending:
             return

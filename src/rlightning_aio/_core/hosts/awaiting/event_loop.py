@@ -11,7 +11,7 @@ from types import coroutine
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Coroutine, Generator
+    from collections.abc import Callable, Coroutine, Generator
     from contextvars import Context
 
 LONG_TURN_SECONDS: Final = 0.1
@@ -106,13 +106,6 @@ def awaited_calls(answering: Any) -> str:
         f"{frame.f_code.co_qualname}, {frame.f_code.co_filename}:{frame.f_lineno}"
         for frame in frames
     )
-
-
-async def cancel(tasks: Collection[asyncio.Task[Any]], seconds: float) -> set[asyncio.Task[Any]]:
-    """Cancel `tasks` and wait for them for some seconds; returns those that go on."""
-    for task in tasks:
-        task.cancel()
-    return (await asyncio.wait(tasks, timeout=seconds))[1] if tasks else set()
 
 
 def leave_behind(task: asyncio.Task[Any]) -> None:

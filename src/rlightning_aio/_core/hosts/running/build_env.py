@@ -151,7 +151,7 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
     # Others are replaced by their host, with a runner of their own.
     rebuilt = not (kind.is_awaitable or order.is_hardware)
     rebuild = partial(make, is_again=True) if rebuilt else None
-    renews = rebuilt and config.on_env_error == "restart"
+    renews = config.on_env_error == "restart"
     return kind(env, inline=inline, rebuild=rebuild, renews=renews, is_hardware=order.is_hardware)
 
 
