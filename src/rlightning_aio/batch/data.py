@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from rlightning_aio.batch.columns import EnvNames
 from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.parts import (
+    all_agents,
     column_of_parts,
     in_order,
     infos_of_parts,
     observations_of_parts,
-    outcomes_of,
     rets_of,
     rows_in_order,
     shapes,
@@ -31,6 +31,7 @@ from rlightning_aio.batch.parts import (
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction
+from rlightning_aio.outcomes import own_end
 from rlightning_aio.trees import index, mapped, zipped
 from rlightning_aio.types import PolicyResponse
 
@@ -259,7 +260,19 @@ class BatchedData:
         Where `restarted` is True, that is the episode before, which is lost. An env may say more
         than its flags do by an `Outcome` in its info, as ``outcome``, where it ends an episode.
         """
-        return outcomes_of(self, lambda rows: self.take(rows).info())
+        over = all_agents(self.done) | self.restarted
+        found = np.full(over.shape, None, np.object_)
+        if not over.any():
+            return found
+        rows: list[int] = np.flatnonzero(over.reshape(len(over), -1).any(axis=1)).tolist()
+        terminated, cut, env_ids = all_agents(self.terminated), self.limit_reached, self.env_ids()
+        for row, info in zip(rows, self.take(rows).info(), strict=True):
+            for place in np.argwhere(over[row]).tolist():  # One, and empty, without sub-envs.
+                where = (row, *place)
+                cause = "it reached the step limit" if cut[where] else "its env cut it"
+                ended = bool(terminated[where])
+                found[where] = own_end(env_ids[row], info, terminated=ended, cut=cause)
+        return found
 
     @property
     def index(self) -> NDArray[np.int64]:
@@ -452,12 +465,6 @@ def slots_of(batch: BatchedData, issuer: object) -> NDArray[np.intp] | None:
     if origin is None or origin.issuer is not issuer or origin.repeats:
         return None
     return origin.slots
-
-
-def names_of(batch: BatchedData) -> EnvNames | None:
-    """Names of the envs of the group when it returned the batch; None for plain values."""
-    origin = batch._origin
-    return None if origin is None else origin.names
 
 
 def _entry_of(env_id: str) -> str:

@@ -7,13 +7,12 @@ knows the positions of its rows in the batch; a single part has the rows in orde
 from __future__ import annotations
 
 from itertools import repeat
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 
 from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
 from rlightning_aio.batch.stacking import differing, stacked_values
-from rlightning_aio.outcomes import own_end
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.trees import key_of, tree_of, zipped
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, unchecked
@@ -206,39 +205,6 @@ def _ret(part: ResultColumns, row: int) -> EnvRet | MultiAgentEnvRet:
     )
     kind = MultiAgentEnvRet if part.agents else EnvRet
     return unchecked(kind, dict(zip(_FIELDS, fields, strict=True)), kept.get("extra"))
-
-
-class Endings(Protocol):
-    """The columns of a batch that say how episodes ended."""
-
-    @property
-    def done(self) -> Any: ...
-    @property
-    def terminated(self) -> Any: ...
-    @property
-    def limit_reached(self) -> NDArray[np.bool_]: ...
-    @property
-    def restarted(self) -> NDArray[np.bool_]: ...
-    def env_ids(self) -> list[str]: ...
-
-
-def outcomes_of(
-    batch: Endings, infos_of: Callable[[list[int]], list[dict[str, Any]]]
-) -> NDArray[np.object_]:
-    """See `BatchedData.outcome`; `infos_of` returns the infos of some rows."""
-    over = all_agents(batch.done) | batch.restarted
-    found = np.full(over.shape, None, np.object_)
-    if not over.any():
-        return found
-    rows: list[int] = np.flatnonzero(over.reshape(len(over), -1).any(axis=1)).tolist()
-    terminated, cut, env_ids = all_agents(batch.terminated), batch.limit_reached, batch.env_ids()
-    for row, info in zip(rows, infos_of(rows), strict=True):
-        for place in np.argwhere(over[row]).tolist():  # One, and empty, without sub-environments.
-            where = (row, *place)
-            cause = "it reached the step limit" if cut[where] else "its env cut it"
-            ended = bool(terminated[where])
-            found[where] = own_end(env_ids[row], info, terminated=ended, cut=cause)
-    return found
 
 
 def summed_rewards(reward: Any) -> NDArray[np.float64]:

@@ -271,10 +271,6 @@ def row_reader(tree: Tree, row: int) -> Callable[[], Any]:
 
 def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
     """Describe the first number of `value` outside the bounds of `space`; None without any."""
-    return next(_faults(space, value, what), None)
-
-
-def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
     for path, part in walked(tree_of(space)):
         bounds, found = _bounds(part), held(value, path)
         if bounds is None or not isinstance(found, _NUMBERS):
@@ -288,7 +284,8 @@ def _faults(space: gym.Space[Any], value: Any, what: str) -> Iterator[str]:
         if outside.any():
             name = in_brackets(path)
             number, least, most = (one[outside][0] for one in (array, low, high))
-            yield f"{what}{name} holds {number}, and the space goes from {least} to {most}"
+            return f"{what}{name} holds {number}, and the space goes from {least} to {most}"
+    return None
 
 
 def held(value: Any, path: Path) -> Any:

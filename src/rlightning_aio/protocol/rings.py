@@ -355,15 +355,11 @@ class TrainerBell:
             return []
         return [k for k, count in enumerate(self.counters) if count != self.read[k]]
 
-    def goal(self, wanted: int) -> int:
-        """Goal for a number of unread reports; it stays the same until they are read."""
-        return self.read[-1] + wanted
-
     def arm(self, goal: int, *, at_last: bool) -> bool:
         """Make a worker ring once, at `goal`; repeated calls with the same goal change nothing.
 
         Args:
-            goal: see `goal`.
+            goal: the number of reports of all workers, those included that were read.
             at_last: only workers without further work need to check.
 
         Returns True if the goal is reached already, so no ring needs to be awaited.

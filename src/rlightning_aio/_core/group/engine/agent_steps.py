@@ -13,7 +13,7 @@ import time
 from asyncio import CancelledError
 from copy import copy
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from rlightning_aio._core.group.drivers.wait import TURN, Wait
 from rlightning_aio._core.group.engine.waiting import REPLIES
@@ -22,6 +22,7 @@ from rlightning_aio.batch.data import BatchedData
 from rlightning_aio.errors import EnvAway, EnvFault, WorkerDied
 
 if TYPE_CHECKING:
+    from asyncio import Future
     from collections.abc import Callable, Sequence
 
     import numpy as np
@@ -60,18 +61,6 @@ class StepEnd(NamedTuple):
     lost: BatchedData | None
 
 
-class _Reply(Protocol):
-    """The future of a caller; done early if that is cancelled."""
-
-    def done(self) -> bool: ...
-
-    def cancel(self) -> Any: ...
-
-    def set_result(self, result: Any, /) -> None: ...
-
-    def set_exception(self, exception: BaseException, /) -> None: ...
-
-
 class EpisodeStart(NamedTuple):
     """What an agent's env is reset with; see `Env.reset`."""
 
@@ -93,7 +82,8 @@ class AgentStep:
     Args:
         env_id: of its env.
         what: the response that the env is stepped with, what it is reset with, or the call.
-        reply: gets its `StepEnd`, the value of a call, or the error.
+        reply: gets its `StepEnd`, the value of a call, or the error; done early if its caller is
+            cancelled.
 
     Attributes:
         env_id, what, reply: as given.
@@ -105,7 +95,7 @@ class AgentStep:
     __slots__ = ("env_id", "is_collectable", "is_outstanding", "number", "reply", "what")
 
     def __init__(
-        self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall, reply: _Reply
+        self, env_id: str, what: PolicyResponse | EpisodeStart | MethodCall, reply: Future[Any]
     ) -> None:
         self.env_id = env_id
         self.what = what
@@ -313,7 +303,7 @@ class AgentSteps:
         number = self._requests.numbering.number(slot)
         return isinstance(step.what, EpisodeStart) and step.number == number
 
-    def _ended(self, slot: int) -> _Reply:
+    def _ended(self, slot: int) -> Future[Any]:
         step = self._sent.pop(slot)
         step.is_outstanding = False
         return step.reply

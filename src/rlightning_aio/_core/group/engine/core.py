@@ -177,7 +177,7 @@ class Core:
         if collector.faults:
             faults = [*collector.faults]
             for fault in faults:
-                self.steps.note_raised(fault)
+                collector.take_fault(fault)
             faults[0].results, faults[0].others = results[0], tuple(faults[1:])
             raise faults[0]
         return results

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.columns import Rows
 
 _STEP: Final = int(Operation.STEP)
@@ -104,7 +103,8 @@ class Steps:
         self._waiting = waiting
         self._intake = waiting.intake
         self._sums = tables.sums
-        self._has_places = False
+        # The hosts of all local envs had rings when the group started.
+        self._in_rings = self._has_places = False
 
     def begin(self) -> None:
         """Note what kind of envs were started."""
@@ -114,11 +114,11 @@ class Steps:
         own: set[int] = {*self._requests.hosts[: envs.num_local].tolist()}
         local = [hosts[host_id] for host_id in own]
         is_inline = len(local) == 1 and isinstance(local[0], Executing)
-        self._requests.in_rings = all(self._requests.rings[host_id] for host_id in own)
+        self._in_rings = all(self._requests.rings[host_id] for host_id in own)
         in_one_slab = len(slabs) == 1 and envs.num_local > 0
         ordinary = (
             in_one_slab
-            and (is_inline or self._requests.in_rings)
+            and (is_inline or self._in_rings)
             and not envs.any_beside_rows
             and bool(slabs[0].action_columns)
         )
@@ -206,16 +206,12 @@ class Steps:
         """Raise the collector's oldest error, or else if no result can come."""
         fault = next(iter(self._requests.collector.faults), None)
         if fault is not None:
-            self.note_raised(fault)
+            self._requests.collector.take_fault(fault)
             raise fault
         if not total:
             raise NothingPending(
                 "nothing to collect: no request is outstanding; send one with step_async"
             )
-
-    def note_raised(self, fault: EnvFault) -> None:
-        """Note that an error of the collector is raised, so that its envs are free."""
-        self._requests.collector.take_fault(fault)
 
     # -- check, write, send -----------------------------------------------------------
 
@@ -315,7 +311,7 @@ class Steps:
         """Number the requests of a batch that is written, and give them to their hosts."""
         requests = self._requests
         owner = COLLECTOR if ticket is None else ticket.owner
-        is_ordinary = requests.in_rings and len(slots) > 0 and not self._conditions.unusual
+        is_ordinary = self._in_rings and len(slots) > 0 and not self._conditions.unusual
         if is_ordinary and not (self._has_places and self._asks_a_place(slots)):
             for ring in requests.publish(slots, self._episodes.due[slots], owner, now):
                 ring.wake()

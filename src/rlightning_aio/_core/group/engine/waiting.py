@@ -457,5 +457,4 @@ class Poller:
             bell.disarm()
             return False
         wanted = min(wanted, total)
-        # As `TrainerBell.goal`, without a call.
         return bell.arm(bell.read[-1] + wanted, at_last=wanted == total)

@@ -198,7 +198,6 @@ class Requests:
         methods: by slot, the name of the method that was called last.
         in_flight: requests of each host that are not answered; the only count of them.
         rings: of each host, if it is a live worker of this machine; kept up by the hosts.
-        in_rings: the hosts of all local envs had rings when the group started.
         unwanted: slots whose requests belong to nobody; the reply of each is dropped.
         anything_ended: something has ended since this was set to False.
     """
@@ -220,7 +219,6 @@ class Requests:
         self.methods: dict[int, str] = {}
         self.in_flight = [0] * num_hosts
         self.rings: list[exchange.Ring | None] = [None] * num_hosts
-        self.in_rings = False
         self._fence = exchange.new_fence()
         self.anything_ended = False
 
