@@ -170,6 +170,8 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     for count in (0, 3, 5):  # Refused where it is attached.
         with pytest.raises(BadAction, match="action"):
             batch.respond(action=np.zeros((count, 2)))
+    with pytest.raises(BadAction, match="no column can be called 'env_id'"):
+        batch.respond(action=good, env_id=IDS)
     with pytest.raises(BadAction, match=r"'probe-0' there is a response of 'probe-1'.* handle"):
         await group["probe-0"].step(PolicyResponse("probe-1", [0, 1]))
     for ids, error, said in (

@@ -32,7 +32,7 @@ from rlightning_aio import (
     sync,
 )
 from rlightning_aio._core.hosts.process.host import ProcessHost
-from rlightning_aio.errors import BadAction
+from rlightning_aio.errors import BadAction, UnknownEnv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -239,6 +239,8 @@ async def test_each_place_has_the_time_of_its_own_call_and_entry() -> None:
     servers = [served(clients=2, connect_timeout=0.5), served(connect_timeout=math.inf)]
     servers[1]["name"] = "spares"
     async with build_env_group(servers) as group:
+        with pytest.raises(UnknownEnv, match="'robots-0'; its envs are robots-0/0, robots-0/1"):
+            group.episode("robots-0")
         group.reset_async(env_ids=["robots-0/0", "spares-0/0"])
         with pytest.raises(EnvAway, match=r"for robots-0/0 within 0.5 s"):
             await group.collect_async(wait_all=True)

@@ -391,13 +391,15 @@ class BatchedData:
             extras: further columns of n rows (``log_prob``, ``value``, …).
 
         Raises:
-            BadAction: the number of rows of a column is not the number of results. Hardware of the
-                batch stops.
+            BadAction: the number of rows of a column is not the number of results, or one is called
+                ``env_id``. Hardware of the batch stops.
         """
         columns = {"action": action, **extras}
         origin = self._origin
         count = len(self) if origin is None else len(origin.slots)
         try:
+            if "env_id" in extras:  # Every response has one.
+                raise BadAction("no column can be called 'env_id'; give it another name")
             for name, column in columns.items():
                 if type(column) is not np.ndarray or not column.ndim or len(column) != count:
                     mapped(lambda leaf, name=name: _check_rows(name, leaf, len(self)), column)

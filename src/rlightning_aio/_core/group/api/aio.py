@@ -135,6 +135,7 @@ class EnvGroup(GroupInterface):
         Raises:
             UnknownEnv: no env of this group has that id.
         """
+        self._core.envs.find_one(env_id)  # An env_server has a handle, too, but no episodes.
         return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
     async def close(self) -> None:

@@ -232,7 +232,7 @@ class GroupInterface(Facade):
         """Return the complete state of envs as bytes that can be stored.
 
         Args:
-            env_ids: the envs, all idle and reset before; None: all local ones.
+            env_ids: the envs, all idle and reset before; None: all.
 
         The bytes hold the state of simulators, wrappers and generators, the sums of the current
         episodes, the step counts of `auto_reset`, and which envs are due for a reset;

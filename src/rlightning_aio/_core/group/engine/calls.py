@@ -33,7 +33,7 @@ class Calls:
         self._waiting = waiting
 
     def call(self, now: float, env_ids: Sequence[str] | None, call: Call) -> Procedure[list[Any]]:
-        """Call a method of envs, or of every local env, in parallel and return its values."""
+        """Call a method of envs, or of all, in parallel and return its values."""
         with self._observed.call("call", now):
             slots = self._envs.chosen(env_ids)
             send = self._prepared(now, slots, [call] * len(slots), call[0])
