@@ -248,3 +248,24 @@ async def test_who_waits_for_a_busy_env_is_named() -> None:
             await group.reset()
         Endless.goes_on.set()
         assert (await task)[0].observation == ["stepped"]
+
+
+async def test_only_who_waits_for_the_busy_env_is_named() -> None:
+    """Not who waits for others; of an agent, the task of the agent."""
+    Endless.goes_on = asyncio.Event()
+    fields: Any = {"name": "e", "num_workers": 3, "placement": "loop"}
+    async with rlightning_aio.build_env_group(Endless, **fields) as group:
+        batch, _ = await group.reset()
+        steps = [batch.take([k]).respond(action=[0]) for k in range(3)]
+        of_one, agent = group.step(steps[1]), group["e-2"].step(0)
+        tasks = [asyncio.create_task(of_one, name="S"), asyncio.create_task(agent, name="A")]
+        group.step_async(steps[0])
+        while len(group.pending) < 3:  # noqa: ASYNC110  # Twice.
+            await asyncio.sleep(0)
+        for step, said in zip(
+            steps, (r"replied yet; c", "in task 'S'", "in task 'A'"), strict=True
+        ):
+            with pytest.raises(EnvBusy, match=f"{said}[^']*$"):
+                await group.step(step)
+        Endless.goes_on.set()
+        await asyncio.gather(*tasks)

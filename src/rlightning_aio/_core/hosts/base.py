@@ -74,8 +74,8 @@ class Driver(Protocol):
         """Call a function that runs an env; Ctrl-C may interrupt it."""
         ...
 
-    def others(self) -> str:
-        """Return a clause on the tasks that wait in other calls of the group, if there are any."""
+    def others(self, held: object) -> str:
+        """Return a clause on the other tasks whose calls hold an object, if there are any."""
         ...
 
 

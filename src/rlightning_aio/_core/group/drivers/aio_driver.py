@@ -133,19 +133,19 @@ class AioDriver:
             f"{do}; nothing was sent"
         )
 
-    def others(self) -> str:
-        """Name the tasks that wait in other calls, and where they do: only errors ask for them."""
+    def others(self, held: object) -> str:
+        """See `base.Driver.others`; also say where the tasks wait. Only errors ask for them."""
         loop, found = self._loop, list[str]()
         for task in asyncio.all_tasks(loop) if loop is not None and loop.is_running() else ():
-            where, step = "", task.get_coro()
-            while (frame := getattr(step, "cr_frame", None)) is not None:
-                if frame.f_code is _RUN and frame.f_locals.get("self") is self:
-                    if task is not asyncio.current_task():
-                        found.append(f"task {task.get_name()!r} ({where})")
-                    break
+            where, holds, step = "", False, task.get_coro()
+            while (frame := getattr(step, "cr_frame", getattr(step, "gi_frame", None))) is not None:
+                holds = holds or any(value is held for value in frame.f_locals.values())
                 if not frame.f_globals.get("__name__", "").startswith("rlightning_aio."):
                     where = f"{frame.f_code.co_filename}:{frame.f_lineno}"
-                step = getattr(step, "cr_await", None)
+                inner = getattr(step, "cr_await", getattr(step, "gi_yieldfrom", None))
+                step = frame.f_locals["procedure"] if frame.f_code is _RUN else inner
+            if holds and task is not asyncio.current_task():
+                found.append(f"task {task.get_name()!r} ({where})")
         if not found:
             return ""
         return (

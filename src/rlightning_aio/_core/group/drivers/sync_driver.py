@@ -206,7 +206,8 @@ class SyncDriver:
         finally:
             self._is_interruptible = before
 
-    def others(self) -> str:
+    def others(self, held: object) -> str:
+        del held
         return ""
 
     # -- waiting ----------------------------------------------------------------------

@@ -178,7 +178,7 @@ class AgentSteps:
     def serve(self, now: float) -> Procedure[None]:
         """Send the steps that agents ask for, and hand out their results, until none is left."""
         try:
-            yield from self._waiting.serve(now, self._work)
+            yield from self._waiting.serve(now, self._work, self._sent)
         except BaseException as error:
             self.fail(error)
             if not isinstance(error, Exception):

@@ -199,7 +199,7 @@ class Steps:
         if self._waiting.collecting:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
-                + self._driver.others()
+                + self._driver.others(self._requests.collector)
             )
 
     def _check_possible(self, total: int) -> None:

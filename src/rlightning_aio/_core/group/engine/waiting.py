@@ -22,7 +22,7 @@ from rlightning_aio._core.hosts.spinner import Spinner
 from rlightning_aio.errors import EnvBusy
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -68,6 +68,7 @@ class Waiting:
         self._shares_thread = tables.shares_thread
         # Of the call of `serve`, while there is one.
         self._served: Ticket | None = None
+        self._steps: Mapping[int, object] = {}
         self.wanted: dict[int, int] = {}
         self.collecting = 0.0
         # By call, since when it waits for empty places alone.
@@ -146,11 +147,13 @@ class Waiting:
             State.SPENT: "its last request ended in an error that was not collected",
         }[State(state)]
         if owner == COLLECTOR:
-            others = self._driver.others()
+            others = self._driver.others(self._requests.collector)
             return f"{why}{others}; collect it first, with collect_async(), or end it with drain()"
         if state != State.BUSY:
             why = "the call that asked it has not returned yet"
-        return f"{why}{self._driver.others()}; wait for that call first"
+        ticket = self._requests.tickets.waiting[owner]
+        held = self._steps.get(slot, ticket) if ticket is self._served else ticket
+        return f"{why}{self._driver.others(held)}; wait for that call first"
 
     def _end_call(self, now: float, slot: int) -> bool:
         """Note the end of a request of nobody that has ended since the group last waited.
@@ -278,7 +281,12 @@ class Waiting:
         self._requests.close(ticket)
         return ticket, now
 
-    def serve(self, now: float, work: Callable[[Ticket, float], Wait | None]) -> Procedure[None]:
+    def serve(
+        self,
+        now: float,
+        work: Callable[[Ticket, float], Wait | None],
+        steps: Mapping[int, object],
+    ) -> Procedure[None]:
         """Do some work again and again, whenever replies to its requests are ready.
 
         After an error, it is as with `ask`.
@@ -288,7 +296,9 @@ class Waiting:
             work: takes the replies that its ticket has, sends more requests for it, and returns
                 what to wait for, `REPLIES` or a wait; None at the end. Gets the ticket and the
                 time.
+            steps: by slot, what whoever waits for its request holds.
         """
+        self._steps = steps
         self._served = ticket = self._requests.tickets.open(np.zeros(0, np.intp), apart=True)
         try:
             while (wait := work(ticket, now)) is not None:
