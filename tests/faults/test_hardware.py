@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import os
 import signal
 import subprocess
@@ -461,14 +462,33 @@ class GymnasiumArm(Counts):
             file.write("close\n")
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_an_arm_of_a_callable_is_hardware(log: Path, placement: str) -> None:
+class CoroutineArm(GymnasiumArm):
+    """Its methods are coroutine functions, but for those that end its motion."""
+
+    async def reset(self, **arguments: Any) -> Any:  # type: ignore[override]
+        return super().reset(**arguments)
+
+    async def step(self, action: Any) -> Any:  # type: ignore[override]
+        return super().step(action)
+
+
+class StoppedByCoroutine(CoroutineArm):
+    async def stop(self) -> None:  # type: ignore[override]
+        super().stop()
+
+
+@pytest.mark.parametrize(
+    ("kind", "placement"),
+    [(GymnasiumArm, "process"), (GymnasiumArm, "inline"), (CoroutineArm, "process"),
+     (CoroutineArm, "loop")],
+)  # fmt: skip
+async def test_an_arm_of_a_callable_is_hardware(log: Path, kind: Any, placement: str) -> None:
     """It is what its class says, without a backend of its own."""
-    entry = {"name": "arm", "task": partial(GymnasiumArm, log), "placement": placement}
-    with sync.build_env_group(entry) as group:
-        batch, _ = group.reset()
+    entry = {"name": "arm", "task": partial(kind, log), "placement": placement}
+    async with build_env_group(entry) as group:
+        batch, _ = await group.reset()
         with pytest.raises(BadAction, match=r"holds 1\.5"):
-            group.step(batch.respond(action=np.full((1, 1), 1.5)))
+            await group.step(batch.respond(action=np.full((1, 1), 1.5)))
         before = lines(log)
     assert set(before) == {"stop"}
     assert lines(log)[len(before) :][-2:] == ["stop", "close"]
@@ -482,6 +502,28 @@ def test_an_arm_that_is_not_announced_as_one_is_refused(log: Path, placement: st
     entry = {"name": "arm", "task": lambda: GymnasiumArm(log), "placement": placement}
     with pytest.raises(RLightningError, match="on the callable, too"):
         sync.build_env_group(entry).init()
+
+
+def test_an_arm_that_would_be_stopped_by_a_coroutine_is_refused(log: Path) -> None:
+    """Nobody would await it."""
+    with pytest.raises(ConfigError, match=r"stop\(\).*make it a plain method"):
+        sync.build_env_group(partial(StoppedByCoroutine, log), name="arm").init()
+
+
+@pytest.mark.parametrize(("kind", "placement"), [(GymnasiumArm, "inline"), (CoroutineArm, "loop")])
+def test_an_arm_stops_whose_group_is_never_closed(log: Path, kind: Any, placement: str) -> None:
+    """As at the end of a program that raises."""
+
+    async def dropped() -> list[str]:
+        group = build_env_group(partial(kind, log), name="arm", placement=placement)
+        await group.init()
+        await group.reset()
+        del group
+        gc.collect()
+        return lines(log)
+
+    with pytest.warns(ResourceWarning, match="not closed"):
+        assert asyncio.run(dropped()) == ["stop"]
 
 
 @pytest.mark.parametrize("end", ["abort", "close"])

@@ -24,7 +24,7 @@ from rlightning_aio._core.hosts.messages import (
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, stop_one
-from rlightning_aio.envs.hardware import stopped_by_signals
+from rlightning_aio.envs.hardware import stop_all, stopped_by_signals
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.trees import copied
@@ -148,6 +148,7 @@ class InlineHost(Host):
             raise KeyboardInterrupt  # It is meant for the program.
 
     def release(self) -> None:
-        """Drop the envs and their requests."""
+        """Drop the envs, hardware after it was stopped, and their requests."""
+        stop_all([runner.env for runner in self._runners if runner.is_hardware])
         self._runners.clear()
         self._queue.clear()

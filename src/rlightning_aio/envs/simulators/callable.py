@@ -76,19 +76,23 @@ def _adopted(
     return env
 
 
+def _stop(made: Any) -> None:
+    """Call the method `stop` of the outermost wrapper or env that has one."""
+    bare = getattr(made, "unwrapped", made)
+    while made is not bare and not callable(getattr(made, "stop", None)):
+        made = made.env
+    stop: Any = getattr(made, "stop", None)
+    if callable(stop):
+        stop()
+
+
 class _GivenEnv(GymnasiumEnv):
     def __init__(self, made: Any, *args: Any) -> None:
         self._made = made
         super().__init__(*args)
 
     def stop(self) -> None:
-        """Call the method of that name of the outermost wrapper or env that has one."""
-        made, bare = self._made, self._made.unwrapped
-        while made is not bare and not callable(getattr(made, "stop", None)):
-            made = made.env
-        stop: Any = getattr(made, "stop", None)
-        if callable(stop):
-            stop()
+        _stop(self._made)
 
     def _make(self) -> Any:
         made, config = self._made, self.config
@@ -158,6 +162,9 @@ class _AwaitableEnv(FastPath, BaseEnv):
             f"env {self.env_id!r} is awaitable (its step is `async def`), and the vector "
             "interfaces take gymnasium.Env only; step it through build_env_group"
         )
+
+    def stop(self) -> None:
+        _stop(self.env)
 
     def close(self) -> Awaitable[None] | None:
         close = getattr(self.env, "close", None)

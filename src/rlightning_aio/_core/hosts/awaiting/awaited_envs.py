@@ -42,7 +42,7 @@ from rlightning_aio._core.hosts.messages import Lost, NotBuilt, Raised
 from rlightning_aio._core.hosts.running.build_env import built_env, check_distinct
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
-from rlightning_aio.envs.hardware import begin_stops
+from rlightning_aio.envs.hardware import begin_stops, stop_all
 from rlightning_aio.errors import EnvAway
 from rlightning_aio.outcomes import Loss
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
@@ -299,8 +299,10 @@ class AwaitedEnvs:
         return errors
 
     def release(self) -> None:
-        """Cancel everything without waiting. Idempotent."""
+        """Cancel everything without waiting, but for stops of hardware. Idempotent."""
         self._end()
+        moving = [one for one in self.runners if one.is_hardware and not one.has_closed]
+        stop_all([runner.env for runner in moving])
         if self._envs and not self._loop.is_closed():
             for task in self._tasks.union(*(env.tasks() for env in self._envs)):
                 task.cancel()
@@ -486,8 +488,7 @@ class AwaitedEnvs:
 
     def _on_broken(self, env: AwaitedEnv) -> None:
         """An env has left by itself while it was idle."""
-        record = self._records[env.index]
-        if self._ending or record.env is not env:
+        if self._ending or (record := self._records[env.index]).env is not env:
             return
         record.env, record.is_ending = None, True
         record.leaving = env.task

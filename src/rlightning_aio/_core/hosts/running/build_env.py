@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 from functools import partial
+from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -120,7 +121,8 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
 
     Raises:
         TypeError: the env is awaitable and its placement can't await it, or the reverse.
-        ConfigError: the env says that it is hardware, and what makes it doesn't.
+        ConfigError: the env says that it is hardware, and what makes it doesn't; or its `stop` is
+            a coroutine function.
     """
     config, worker_index = order.config, order.worker_indices[index]
     if makers := makers_of(config):
@@ -147,12 +149,21 @@ def built_env(order: StartOrder, index: int, *, inline: bool = False) -> EnvRunn
             "group has to know before it is made: set `hardware = True` on the callable, too, or "
             "register a backend with hardware=True"
         )
+    if order.is_hardware and any(map(_stops_by_coroutine, (env, env.env))):
+        raise ConfigError(
+            f"env {env.env_id!r} moves something real, and its stop() is called from any thread, "
+            "also while nothing else runs: make it a plain method, not `async def`"
+        )
     kind = _runner_class(env, config)
     # Others are replaced by their host, with a runner of their own.
     rebuilt = not (kind.is_awaitable or order.is_hardware)
     rebuild = partial(make, is_again=True) if rebuilt else None
     renews = config.on_env_error == "restart"
     return kind(env, inline=inline, rebuild=rebuild, renews=renews, is_hardware=order.is_hardware)
+
+
+def _stops_by_coroutine(env: Any) -> bool:
+    return iscoroutinefunction(getattr(env, "stop", None))
 
 
 def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
