@@ -23,14 +23,7 @@ from patience import HANG
 from remote.proxy import Proxy
 from remote.test_hostile_hellos import hello
 
-from rlightning_aio import (
-    BatchedData,
-    EnvAway,
-    PolicyResponse,
-    ResetNeeded,
-    build_env_group,
-    sync,
-)
+from rlightning_aio import BatchedData, EnvAway, PolicyResponse, ResetNeeded, build_env_group, sync
 from rlightning_aio._core.hosts.process.host import ProcessHost
 from rlightning_aio.errors import BadAction, UnknownEnv
 

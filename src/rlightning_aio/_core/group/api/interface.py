@@ -15,7 +15,6 @@ from rlightning_aio._core.group.api.facade import Facade
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.hosts.base import Server
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import PolicyResponse
@@ -338,8 +337,6 @@ class EnvHandleInterface:
 
     def __init__(self, group: Any, env_id: str) -> None:
         self._group = group
-        self._core: Core = group._core  # noqa: SLF001  # Same module.
-        self._driver: Any = group._driver  # noqa: SLF001  # Likewise.
         self._env_id = env_id
 
     def __repr__(self) -> str:
