@@ -12,7 +12,7 @@ import textwrap
 import pytest
 
 import rlightning_aio
-from rlightning_aio.errors import GroupClosed, StartFailed
+from rlightning_aio.errors import GroupClosed, RLightningError, StartFailed
 
 ENTRY = {"name": "cartpole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
 
@@ -29,6 +29,16 @@ async def test_cancelling_init_closes_the_group_and_raises_the_cancellation(time
         await starting
     with pytest.raises(GroupClosed):
         await group.init()
+
+
+@pytest.mark.parametrize("placement", ["process", "inline"])
+async def test_a_group_that_starts_may_be_closed_and_is_started_once(placement: str) -> None:
+    for other, error in (("close", GroupClosed), ("init", RLightningError)):
+        group = rlightning_aio.build_env_group({**ENTRY, "placement": placement})
+        calls = group.init(), getattr(group, other)()
+        found = await asyncio.gather(*calls, return_exceptions=True)
+        assert error in map(type, found)
+        await group.close()
 
 
 async def test_a_start_that_fails_keeps_no_memory() -> None:

@@ -38,7 +38,7 @@ class GroupInterface(Facade):
             StartFailed: an env could not be built, or took longer than ``start_timeout``.
             ConfigError: the envs' action spaces have different shapes (a `ValueError`).
             GroupClosed: the group was closed before.
-            RLightningError: another event loop has initialised the group.
+            RLightningError: another event loop has initialised the group, or another `init` starts it.
         """
         raise NotImplementedError
 

@@ -45,7 +45,13 @@ from rlightning_aio._core.hosts.messages import (
     Died,
     NotBuilt,
 )
-from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed
+from rlightning_aio.errors import (
+    ConfigError,
+    GroupClosed,
+    RemoteTraceback,
+    RLightningError,
+    StartFailed,
+)
 from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.types import EnvMeta
 
@@ -140,8 +146,10 @@ class Supervisor:
             raise GroupClosed("this group is closed; build a new one")
         if self._lifetime.open:
             return self.metas
+        first = [record for record in self.records if record.stage is Stage.NEW]
+        if not first:
+            raise RLightningError("another init() is starting this group; wait for that one")
         try:
-            first = [record for record in self.records if record.stage is Stage.NEW]
             for record in first:
                 self._launch_first(record)
             yield from self._until(Stage.BUILT)
@@ -184,17 +192,17 @@ class Supervisor:
         record.give_time(self.clock())
 
     def _until(self, stage: Stage) -> Procedure[None]:
-        # Hosts in this process have posted completions already.
-        yield Wait(0.0)
-        while any(r.stage.value < stage.value for r in self.records):
-            if self._start_fault is not None:
-                raise self._start_fault
-            now = yield Wait(earliest(*(r.start_by for r in self.records)))
+        until: float | None = 0.0  # Hosts in this process have posted completions already.
+        while True:
+            now = yield Wait(until)
             if self._lifetime.closed:
                 raise GroupClosed("the group was closed while it was starting")
             self._check_start_times(now)
-        if self._start_fault is not None:
-            raise self._start_fault
+            if self._start_fault is not None:
+                raise self._start_fault
+            if all(r.stage.value >= stage.value for r in self.records):
+                return
+            until = earliest(*(r.start_by for r in self.records))
 
     def _check_start_times(self, now: float) -> None:
         for record in self.records:
