@@ -586,6 +586,17 @@ async def test_closing_ends_whatever_envs_do(wrong: dict[str, Any]) -> None:
     assert sorted(Scripted.closed) == ["e-0", "e-1"]
 
 
+async def test_a_close_waits_for_another_one() -> None:
+    """The end of its loop would cut the other one short."""
+    group = rl.build_env_group(entry(num_workers=2))
+    await group.init()
+    closing = asyncio.ensure_future(group.close())
+    await asyncio.sleep(0)
+    await group.close()
+    assert len(Scripted.closed) == 2
+    await closing
+
+
 async def test_a_cancelled_start_leaves_nothing_running() -> None:
     group = rl.build_env_group(entry(num_workers=2000))
     starting = asyncio.create_task(group.init())

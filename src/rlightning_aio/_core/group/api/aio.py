@@ -55,6 +55,7 @@ class EnvGroup(GroupInterface):
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan)
         self._agents = Agents(self._core.agent_steps, self._driver)
+        self._closing: asyncio.Future[None] | None = None
 
     def _new_driver(self) -> AioDriver:
         return AioDriver()
@@ -139,9 +140,15 @@ class EnvGroup(GroupInterface):
         return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
     async def close(self) -> None:
+        loop, before = asyncio.get_running_loop(), self._closing
+        if self._core.lifetime.closed and before is not None and before.get_loop() is loop:
+            await asyncio.wait([before])
+            return
+        self._closing = closing = loop.create_future()
         try:
             await self._driver.run_last(self._core.close(time.monotonic()))
         finally:
+            closing.set_result(None)
             self._after_close()
 
 

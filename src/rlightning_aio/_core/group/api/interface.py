@@ -38,7 +38,8 @@ class GroupInterface(Facade):
             StartFailed: an env could not be built, or took longer than ``start_timeout``.
             ConfigError: the envs' action spaces have different shapes (a `ValueError`).
             GroupClosed: the group was closed before.
-            RLightningError: another event loop has initialised the group, or another `init` starts it.
+            RLightningError: another event loop has initialised the group, or another call is
+                starting it.
         """
         raise NotImplementedError
 
@@ -321,10 +322,11 @@ class GroupInterface(Facade):
         """Close all envs and end their workers, by force after the ``close_timeout`` of
         their entry.
 
-        Idempotent. Calls that wait get `GroupClosed`, and results that were not collected are
-        gone. Cancelled, it ends the remaining workers by force. A warning names an env that
-        raises in its own `close`, and the log names those that were not closed in time. A signal
-        handler may close a synchronous group; the call that it interrupts raises `GroupClosed`.
+        Idempotent; while another task closes the group, it waits for that. Calls that wait get
+        `GroupClosed`, and results that were not collected are gone. Cancelled, it ends the
+        remaining workers by force. A warning names an env that raises in its own `close`, and the
+        log names those that were not closed in time. A signal handler may close a synchronous
+        group; the call that it interrupts raises `GroupClosed`.
 
         Raises:
             RLightningError: the loop that the group belongs to runs in another thread.
