@@ -647,7 +647,9 @@ class Model:
 
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
         if not (env.torn or env.lost):
-            require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
+            failed_start = self.starts_fail and row.info["outcome"].kind == "not_started"
+            may_be_lost = env.may_be_lost or failed_start
+            require(env.host.mortal and may_be_lost, "marked, and nothing has died")
             is_known = env.entry.on_death != "raise" or env.host.aborted or env.host.raised
             require(is_known, "marked, where a death is to be raised")
         cause = "worker_restarted" if env.client is None else "client_lost"
