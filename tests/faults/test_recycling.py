@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import time
 from functools import partial
@@ -15,6 +16,8 @@ from kit.scripted import Counts
 
 import rlightning_aio.sync as rl
 from rlightning_aio import ConfigError, EnvConfig
+from rlightning_aio._core.group.state.host_record import Stage
+from rlightning_aio.errors import WorkerDied
 from rlightning_aio.vector import VectorEnv
 
 
@@ -95,6 +98,37 @@ def test_worker_goes_on_if_the_next_one_cannot_be_started(tmp_path: Path) -> Non
             assert batch.restarted is None or not batch.restarted.any()
         Path(path).unlink()
         reset_until_recycled(group)
+
+
+class Mortal(Walk):
+    """Ends its worker with action 9, or while it is made once `path` exists."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        if Path(path).exists():
+            time.sleep(0.5)
+            os._exit(4)
+
+    def does(self, action: Any) -> float:
+        return float(action) if action < 9 else os._exit(3)
+
+
+def test_a_worker_that_inherits_envs_inherits_whom_they_died_of(tmp_path: Path) -> None:
+    """Not whom an earlier worker of its host died of; it is no restart more, either."""
+    path = tmp_path / "there"
+    config = {"task": partial(Mortal, str(path)), "recycle": {"episodes": 4}, "max_restarts": 1}
+    with rl.build_env_group(num_workers=2, envs_per_process=2, **config) as group:
+        first, _ = group._core.supervisor.records
+        batch, _ = group.reset()
+        for actions in ([0, 9], [0, 0]):
+            group.step(batch.respond(actions))
+        while first.stage is not Stage.CLOSED:
+            group.reset()
+        path.touch()
+        while first.stage is Stage.CLOSED:
+            group.reset()
+        with pytest.raises(WorkerDied, match=r"env 'Mortal-0'.*code 4.*1 restarts in a row"):
+            group.step(batch.take([0]).respond([9]))
 
 
 def reset_until_recycled(group: Any) -> None:

@@ -60,7 +60,7 @@ class Renewals:
             peer.started, peer.order = record.started, record.order
             peer.stage, peer.is_next, peer.restart_at = Stage.DOWN, True, self._tables.clock()
             peer.restarts -= 1  # This is none.
-            peer.deaths, peer.last_loss = {None: 0}, None
+            peer.deaths, peer.culprit, peer.last_loss = {None: 0}, None, None
             self._note_change()
             self._start(peer.host.host_id)
         is_coming = peer.is_down and not any(peer.deaths.values())  # No start of it has failed.
@@ -136,6 +136,7 @@ class Renewals:
             return False
         self._move(peer, self._tables.slots_of(record).tolist())
         peer.deaths |= record.deaths
+        peer.culprit = record.culprit
         peer.restarts += 1  # Here it is one.
         self.note_closed(record)
         return True
