@@ -201,6 +201,7 @@ def test_an_interrupted_start_names_the_envs_that_have_not_started() -> None:
         group.init()
     names = ", ".join(f"a-{k}" for k in range(8))
     assert caught.value.__notes__ == [f"not started yet: {names} and 2 more"]
+    assert caught.value.__context__ is None
 
 
 def trainer_of_worker() -> int:

@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import signal
-import subprocess
-import sys
-import textwrap
 
 import pytest
 
@@ -46,33 +41,3 @@ async def test_a_start_that_fails_keeps_no_memory() -> None:
     group = rlightning_aio.build_env_group({**ENTRY, "task": "NoSuchTask-v0"})
     with pytest.raises(StartFailed):
         await group.init()
-
-
-def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
-    """Ctrl-C while workers start raises KeyboardInterrupt, and the group is closed."""
-    script = textwrap.dedent(f"""
-        import rlightning_aio.sync
-        from rlightning_aio._core.hosts.process import host as process
-
-        launch = process.ForkServerHandle._launch
-        def announced(server):
-            messages = launch(server)
-            print("started", flush=True)
-            return messages
-        process.ForkServerHandle._launch = announced
-
-        group = rlightning_aio.sync.build_env_group({ENTRY!r})
-        try:
-            group.init()
-        except KeyboardInterrupt as interrupt:
-            print("interrupted", interrupt.__context__, flush=True)
-    """)
-    child = subprocess.Popen(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env={**os.environ}
-    )
-    assert child.stdout is not None
-    with child, child.stdout:
-        assert child.stdout.readline() == "started\n"
-        child.send_signal(signal.SIGINT)
-        assert child.stdout.readline() == "interrupted None\n"
-    assert child.returncode == 0
