@@ -196,32 +196,39 @@ def test_a_client_gives_the_results_of_a_local_env(kind: type[_Sampling]) -> Non
         assert stats["episodes"] > 0
 
 
-def test_a_mask_is_for_the_client_that_had_it() -> None:
-    """Whoever takes its place begins as a whole: a part of that env was never reset."""
+MASK = {"reset_mask": np.array([True, False])}
+
+
+@pytest.mark.parametrize("given", [{"seed": 5}, {"options": MASK}], ids=["seed", "mask"])
+def test_a_reset_that_a_client_took_with_it_is_for_no_other(given: dict[str, Any]) -> None:
+    """Once it was aborted; and what is lost with a mask begins as a whole in the next client."""
     begun, gate = list[Any](), Event()
 
     class Noting(Vectorised):
         def reset(self, **given: Any) -> Any:
-            begun.append(given["options"])
-            if given["options"]:
+            begun.append(given)
+            if len(begun) == 2:
                 gate.wait(HANG)
             return super().reset(**given)
 
     with sync.build_env_group({**served(), "num_envs": 2}) as group:
-        address = group["robots-0"].address
-        envs = [Noting(EnvConfig(name="any", backend="any", task="any")) for _ in range(2)]
-        first = ClientThread(address, "first", envs[0], hardware=False)
-        group.reset()
-        group.reset_async(options={"reset_mask": np.array([True, False])})
+        address, config = group["robots-0"].address, EnvConfig(name="n", backend="n", task="n")
+        first = ClientThread(address, "first", Noting(config), hardware=False)
+        batch, _ = group.reset()
+        group.reset_async(**given)
         while len(begun) < 2:
             look(group)
-        group._core.supervisor.hosts[0].kill(dump=False)  # noqa: SLF001
+        if "seed" in given:
+            group.abort()
+            group.step_async(batch.respond(action=np.zeros((1, 2), int)))
+        else:
+            group._core.supervisor.hosts[0].kill(dump=False)  # noqa: SLF001
         gate.set()
         first.join()
-        second = ClientThread(address, "second", envs[1], hardware=False)
+        second = ClientThread(address, "second", Noting(config), hardware=False)
         group.collect_async(deadline=HANG)
     second.join()
-    assert begun[2] is None
+    assert begun[2] == {"seed": None, "options": None}
 
 
 class Braked(gym.Wrapper[Any, Any, Any, Any]):

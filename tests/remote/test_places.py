@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import zmq
-from kit.counting import ClientThread, CountingEnv, look, served
+from kit.counting import ClientThread, look, served
 from kit.scripted import Counts
 from patience import HANG
 from remote.proxy import Proxy
@@ -335,29 +335,3 @@ def test_an_arm_stops_when_the_program_of_its_client_ends(tmp_path: Path) -> Non
         (tmp_path / "arm.end").touch()
         arm.process.wait(HANG)
         assert arm.is_stopped()
-
-
-def test_a_reset_that_was_given_up_is_not_that_of_a_later_step() -> None:
-    """Its seed goes with it."""
-    begun, gate = threading.Event(), threading.Event()
-
-    class Slow(CountingEnv):
-        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-            if seed == 5:
-                begun.set()
-                gate.wait(HANG)
-            return super().reset(seed=seed)
-
-    with sync.build_env_group(served()) as group:
-        address = group["robots-0"].address
-        first = ClientThread(address, "first", Slow(), hardware=False)
-        batch, _ = group.reset()
-        group.reset_async(seed=5)
-        wait_for(group, begun.is_set)
-        group.abort()
-        gate.set()
-        first.join()
-        second = ClientThread(address, "second", CountingEnv(2), hardware=False)
-        batch, _ = group.step(actions(batch))
-        assert batch.observation.tolist() == [[2, -1, 0]]
-    second.join()
