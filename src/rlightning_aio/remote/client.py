@@ -467,7 +467,8 @@ class RemoteEnvClient:
         began_ns = time.perf_counter_ns()
         with self._at_work():
             ret = self._env.reset(seed=request.seed, options=request.options)
-        self._answer(request.number, "reset", ret, time.perf_counter_ns() - began_ns)
+        busy_ns = time.perf_counter_ns() - began_ns
+        self._session.finish(request.number, one_result(self._env, "reset", ret), busy_ns)
 
     def _step(self, request: Step) -> None:
         began_ns = time.perf_counter_ns()
@@ -480,10 +481,7 @@ class RemoteEnvClient:
             outcome = ResultFields(observation, reward, terminated, truncated)
             self._session.answer(request.number, outcome, info, {}, busy_ns, time.time_ns())
         else:
-            self._answer(request.number, "step", returned, busy_ns)
-
-    def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
-        self._session.finish(number, one_result(self._env, method, returned), busy_ns)
+            self._session.finish(request.number, one_result(self._env, "step", returned), busy_ns)
 
 
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {

@@ -220,11 +220,11 @@ class ServerSessions:
         packed = Packed([], step.texts)
         client = session.announced
         try:
-            if client.free_actions:
+            if client.hello.free_actions:
                 step.action = action
             else:
                 client.actions.pack(action, packed)
-            if extras and client.reads_extras:
+            if extras and client.hello.reads_extras:
                 step.extras = self._portable_extras(extras)
             return self._writer.write(step, packed.frames)
         except (Misfit, Untransferable) as error:
@@ -460,11 +460,9 @@ class ClientKind(NamedTuple):
 class Announcement(NamedTuple):
     """The contents of a valid hello, and the layouts that follow from it."""
 
+    hello: ClientHello
     kind: ClientKind
     meta: EnvMeta
-    free_actions: bool
-    reads_extras: bool
-    hardware: bool
     results: ResultLayout
     actions: SpaceLayout
 
@@ -506,11 +504,9 @@ def _announcement(
     if (reason := objection(meta)) is not None:
         raise WireError(reason)
     return Announcement(
+        hello,
         kind,
         meta,
-        hello.free_actions,
-        hello.reads_extras,
-        hello.hardware,
         ResultLayout(observation_space, hello.num_envs, hello.agents, hello.compression),
         SpaceLayout(action_space, "action"),
     )

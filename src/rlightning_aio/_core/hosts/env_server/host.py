@@ -243,11 +243,11 @@ class EnvServerHost(Host):
             announce=infos_out_of_band,
         )
         self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)
-        in_row = slab.action is not None and not announced.free_actions
+        in_row = slab.action is not None and not announced.hello.free_actions
         self._read_action = row_reader(slab.action, self._row) if in_row else None
-        started = EnvStarted(meta, slab.layout, announced.reads_extras, not in_row)
+        started = EnvStarted(meta, slab.layout, announced.hello.reads_extras, not in_row)
         new, first_slot = slab if is_new else None, self.first_slot - self._row
-        self._post(Taken(self.host_id, started, announced.hardware, new, first_slot))
+        self._post(Taken(self.host_id, started, announced.hello.hardware, new, first_slot))
 
     def on_answer(self, answer: Answer) -> None:
         self._num_messages += 1
