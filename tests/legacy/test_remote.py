@@ -31,6 +31,7 @@ class Robot(BaseEnv):
     """It is finished after some steps; its resets may wait for those of others."""
 
     resets = steps = 0
+    stop: Any = None
     fails_in = 0
     together: threading.Barrier | None = None
 
@@ -111,6 +112,18 @@ def test_a_robot_serves_a_group_and_reconnects() -> None:
     assert results[0].observation["joints"].tolist() == [0.5] * 7
     assert (results[-1].observation["rgb"].max(), results[-1].info) == (STEPS, {"gripper": "open"})
     assert robot.steps == STEPS
+
+
+def test_a_robot_stops_when_its_trainer_is_gone() -> None:
+    """Those of our backends have a `stop` in place of an `on_disconnect`; here it ends the run."""
+    config = EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
+    group = build_env_group(config)
+    thread, robot = serving(group.env_servers[0].get_address_port(), times=1)
+    robot.stop = lambda: setattr(robot, "steps", STEPS)
+    group.reset()
+    group.close()
+    thread.join(HANG)
+    assert not thread.is_alive()
 
 
 def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:

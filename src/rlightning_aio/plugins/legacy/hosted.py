@@ -108,13 +108,18 @@ class HostedEnv(BaseEnv):
 
     def stop(self) -> None:
         """Call the method `stop` of RLightning's env, or its `on_disconnect`, if it has one."""
-        for name in ("stop", "on_disconnect"):
-            if callable(method := getattr(self.env, name, None)):
-                method()
-                return
+        call_first(self.env, "stop", "on_disconnect")
 
     def close(self) -> None:
         self.env.close()
+
+
+def call_first(env: Any, *names: str) -> None:
+    """Call the first of some methods that an env has, if it has any."""
+    for name in names:
+        if callable(method := getattr(env, name, None)):
+            method()
+            return
 
 
 def off_device(response: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from rlightning_aio import BaseEnv as OurEnv
 from rlightning_aio import EnvConfig, EnvRet, PolicyResponse
+from rlightning_aio.plugins.legacy.hosted import call_first
 from rlightning_aio.plugins.legacy.names import named
 from rlightning_aio.remote import RemoteEnvClient as OurClient
 from rlightning_aio.trees import as_numpy
@@ -63,9 +64,7 @@ class _DialledEnv(OurEnv):
         return self.env.is_finish()
 
     def on_disconnect(self) -> None:
-        stop = getattr(self.env, "on_disconnect", None)
-        if stop is not None:
-            stop()
+        call_first(self.env, "on_disconnect", "stop")
 
     def close(self) -> None:
         """Do nothing: RLightning's client leaves its env open, to serve again."""
