@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,28 +126,6 @@ def test_an_invalid_action_stops_a_moving_arm(monkeypatch: pytest.MonkeyPatch, p
             assert np.abs(arm.joints - arm.targets).max() < 0.1, "it holds where it is"
             with pytest.raises(EnvRaised, match=r"the arm is stopped; reset\(\) starts it again"):
                 step([*READY[:5], 0.1, 0.0])
-
-
-def test_a_watchdog_says_that_it_has_stopped_the_arm_of_a_trainer_that_was_killed() -> None:
-    """The arm stands still then: its joints are where they are to be."""
-    arm = WatchedArm()
-    script = Path(__file__).with_name("piper_trainer.py")
-    command, pipe = [sys.executable, script], subprocess.PIPE
-    with (
-        contextlib.closing(SlcanPort()) as port,
-        running(arm, port),
-        subprocess.Popen([*command, port.path, "inline"], stdout=pipe, stderr=pipe) as trainer,
-    ):
-        assert trainer.stdout
-        assert trainer.stderr
-        assert trainer.stdout.readline() == b"moving\n"
-        assert not arm.emergency_stopped
-        trainer.kill()
-        trainer.wait()
-        assert arm.wait_for(lambda: arm.emergency_stopped)
-        said = "has stopped it: the program that drove it has ended\n"
-        assert said.encode() in trainer.stderr.read()
-        assert np.abs(arm.joints - arm.targets).max() == 0
 
 
 @pytest.mark.parametrize("killed", ["worker", "fork server"])
