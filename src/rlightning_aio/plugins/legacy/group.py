@@ -410,11 +410,8 @@ class EnvStepCounter:
             self._steps[env_id] += 1
         return self.is_reached_max_steps(env_id)
 
-    def get_steps(self, env_id: str) -> int:
-        """Return the count of an env."""
-        return self._steps[env_id]
-
     def __getitem__(self, env_id: str) -> int:
+        """Return the count of an env."""
         return self._steps[env_id]
 
     def is_reached_max_steps(self, env_id: str) -> bool:
