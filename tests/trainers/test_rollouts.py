@@ -33,6 +33,7 @@ async def agent(episode: Any) -> Any:
     prompt = episode.last.observation
     action = 0 if prompt == "?!" or (episode.index == 1 and "?" in prompt) else episode.index + 1
     await episode.step(action)
+    await asyncio.sleep(9 * episode.index * (prompt == "slow"))
     return {
         "prompt_ids": [ord(one) for one in prompt],
         "completion_ids": [action] * 3,
@@ -66,23 +67,14 @@ def test_each_prompt_gets_a_rollout_in_its_place() -> None:
 
 
 def test_a_rollout_that_fails_is_masked_and_has_no_reward() -> None:
-    found = asked(["?", "?", "a", "a"])
-    assert found["reward"] == [1, None, 1, 2]
+    """One whose agent was cut has a reward, but not the tokens."""
+    rules = Rules(attempt_timeout=0.5, on_timeout="end")
+    found = asked(["?", "?", "slow", "slow", "a", "a"], rules=rules)
+    assert found["reward"] == [1, None, 1, None, 1, 2]
+    assert found["completion_ids"][3] == [99]
     assert found["completion_ids"][1] == found["prompt_ids"][1] == [99]
     assert (found["env_mask"][1], found["logprobs"][1], found["seed"][1]) == ([0], [0.0], None)
     assert "the sandbox is gone" in found["outcome"][1].cause
-
-
-def test_a_rollout_that_is_cut_by_its_time_is_masked_as_well() -> None:
-    """It has a reward, but not the tokens."""
-
-    async def slow(episode: Any) -> Any:
-        found = await agent(episode)
-        await asyncio.sleep(9 * episode.index)
-        return found
-
-    found = asked(["a", "a"], slow, rules=Rules(attempt_timeout=0.5, on_timeout="end"))
-    assert (found["reward"], found["completion_ids"]) == ([1, None], [[1] * 3, [99]])
 
 
 def test_a_batch_in_which_all_fail_is_an_error() -> None:
