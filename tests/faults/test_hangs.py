@@ -112,7 +112,9 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     assert batch["faulty-0"].info["worker_restarted"] == "hung in a step and was killed"
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [False, False, True, True]
-    assert "its fork server: it didn't react" in batch["faulty-2"].info["worker_restarted"]
+    innocent = batch["faulty-2"].info
+    assert "its fork server: it didn't react" in innocent["worker_restarted"]
+    assert (innocent["outcome"].blame, "env_at_fault" in innocent) == ("infrastructure", False)
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 

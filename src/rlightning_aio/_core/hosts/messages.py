@@ -143,7 +143,7 @@ class Death:
         requests: entries, beginning with those that it may have been executing; they may be
             answered already, or be 0. Where envs are awaitable, the first is the one whose code
             ran, or 0 if all envs waited.
-        refused: the system did not let it start.
+        refused: the system did not let it start; with_server: its fork server has ended.
         in_order: it was a client that said goodbye, which is no fault.
     """
 
@@ -152,6 +152,7 @@ class Death:
     stderr_tail: str = ""
     requests: tuple[int, ...] = ()
     refused: bool = False
+    with_server: bool = False
     in_order: bool = False
 
 

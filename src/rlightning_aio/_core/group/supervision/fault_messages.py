@@ -173,11 +173,10 @@ def _why(envs: EnvTable, requests: Requests, record: HostRecord, death: Death) -
         why = hung(cause, op, at_fault)
     elif record.place is not None:
         return Loss(cause, "env_away", "infrastructure")
-    elif death.refused:
-        return Loss(cause, "not_started", "infrastructure", at_fault)
     else:
-        kind = "not_started" if record.late or record.rebuild_error is not None else "env_died"
-        why = Loss(cause, kind, "env", at_fault)
+        is_start = death.refused or record.late or record.rebuild_error is not None
+        blame = "infrastructure" if death.refused or death.with_server else "env"
+        why = Loss(cause, "not_started" if is_start else "env_died", blame, at_fault)
     if at_fault is None and record.awaits_several:
         return why._replace(blame="infrastructure")  # All were waiting, so none is named.
     return why

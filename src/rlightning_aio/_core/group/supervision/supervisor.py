@@ -482,7 +482,9 @@ class Supervisor:
     def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Count a death, decide if the host is replaced, log that, and return what it means."""
         requests = self._requests
-        if record.stage is Stage.UP and not record.is_hung:
+        if death.with_server and not record.is_hung:
+            record.culprit = record.aborted_slot  # No env of it is at fault.
+        elif record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
             record.culprit = culprit_of(record, death.requests, requests, owed)
         # A worker killed for an abort, or a client that said goodbye, did nothing wrong.

@@ -250,7 +250,7 @@ class ForkServerHandle:
             if not self._ready and self._interpreter:
                 why += f"; is {self._interpreter} a Python with the packages that workers need?"
         for host in hosts:
-            host.on_end(Death(f"ended with its fork server: {why.rstrip()}"))
+            host.on_end(Death(f"ended with its fork server: {why.rstrip()}", with_server=True))
 
     def release(self, seconds: float) -> None:
         """Keep the fork server for another group if this one had started, and it has no workers and
