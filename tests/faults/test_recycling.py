@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import time
+from collections import OrderedDict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,10 @@ class Walk(Counts):
 
     def __init__(self, leaks_mb: float = 0.0) -> None:
         self.leaks_mb, self.kept = leaks_mb, list[Any]()
-        self.draws, self.more = random.Random(3), {"dice": [np.random.default_rng(5)]}
+        self.draws, self.more = random.Random(3), OrderedDict[str, Any]()
+        self.more["dice"] = [np.random.default_rng(5)]
+        kinds = random.Random, np.random.RandomState, np.random.default_rng
+        self.more["several"] = tuple(kind(5) for kind in kinds)
 
     def does(self, action: Any) -> float:
         return float(action)
@@ -37,7 +41,7 @@ class Walk(Counts):
         if not self.steps:
             self.kept.append(np.ones(int(self.leaks_mb * 1e6), np.uint8))
             self.length = int(self.np_random.integers(2, 9))
-        dice = self.more["dice"][0].random()
+        dice = sum(one.random() for all_of in self.more.values() for one in all_of)
         return np.array([self.np_random.random(), self.draws.random(), dice, self.steps])
 
 

@@ -421,9 +421,19 @@ def load_generators(env: Any, saved: Mapping[str, Any]) -> None:
         elif type(holder) is list:
             for place, generator in saved[path].items():
                 cast("list[Any]", holder)[place : place + 1] = [generator]
+        elif type(holder) is tuple:
+            for place, generator in saved[path].items():
+                _go_on(cast("tuple[Any, ...]", holder)[place], generator)
         else:
-            held = cast("dict[Any, Any]", holder if type(holder) is dict else _held(holder))
+            held = cast("dict[Any, Any]", holder if isinstance(holder, dict) else _held(holder))
             held.update(saved[path])
+
+
+def _go_on(generator: Any, saved: Any) -> None:
+    """Go on with the random numbers of another generator."""
+    # A Generator of NumPy has its state in another object.
+    own, other = (getattr(one, "bit_generator", one) for one in (generator, saved))
+    own.__setstate__(other.__getstate__())
 
 
 def _is_generator(name: Any, value: Any) -> bool:
@@ -459,11 +469,11 @@ def _name_first(member: tuple[Any, Any]) -> str:
 
 
 def _members(holder: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield what an object, a list or a dict holds, by name."""
-    if type(holder) is list:
+    """Yield what an object, a list, a tuple or a dict holds, by name."""
+    if type(holder) in (list, tuple):
         if holder and not isinstance(holder[0], _PLAIN):
             yield from enumerate(cast("list[Any]", holder))
-    elif type(holder) is dict:
+    elif isinstance(holder, dict):
         yield from cast("dict[Any, Any]", holder).items()
     else:
         yield from getattr(holder, "__dict__", {}).items()
