@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 POLE = {**CARTPOLE, "placement": "inline", "num_workers": 3}
 STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
-JUDGED = {"name": "judged", "task": "cli.judged_env:Judged", "placement": "inline"}
 
 
 def by_number(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -252,7 +252,6 @@ class FaultyEnv(BaseEnv):
             self._faults = {}
         self._switch = kwargs.get("while_exists")
         self._resets = self._steps = 0
-        self._seconds = 0.0
         self._instead: dict[str, Callable[[], Any]] = {}
         if worker_index == 0 and "gate" in kwargs and Path(kwargs["gate"]).exists():
             Path(kwargs["gate"]).read_bytes()
@@ -285,7 +284,6 @@ class FaultyEnv(BaseEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         code, token = self._preprocess_fn(policy_resp)
-        time.sleep(self._seconds)
         _BY_CODE[int(code)]()
         self._steps += 1
         fields = {
@@ -307,10 +305,6 @@ class FaultyEnv(BaseEnv):
     def arm(self, place: str, fault: str) -> None:
         """Fail later, at `place`."""
         self._faults[place] = fault
-
-    def step_takes(self, seconds: float) -> None:
-        """Make steps slow, but otherwise normal."""
-        self._seconds = seconds
 
     def answer_with(self, **instead: Callable[[], Any]) -> None:
         """Replace fields of the next step's result by the values of these functions."""
