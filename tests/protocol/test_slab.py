@@ -12,10 +12,7 @@ from hypothesis import strategies as st
 from remote.random_spaces import any_space, same, sampled
 
 from rlightning_aio.protocol.columns import Misfit, leaves, row_reader, row_writer
-from rlightning_aio.protocol.slab import (
-    RowLayout,
-    Slab,
-)
+from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.trees import index
 
 fixed_space = any_space.filter(lambda space: leaves(space) is not None)
@@ -108,35 +105,3 @@ def test_a_misfit_names_position_and_difference(space: Any, value: Any, said: st
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
     with pytest.raises(Misfit, match=said):
         row_writer(slab.observation, 0, "observation")(value)
-
-
-def test_doubles_are_narrowed_as_gymnasium_does() -> None:
-    """Simulators compute in doubles and declare floats."""
-    space = spaces.Dict(x=spaces.Box(-1, 1, (2,)), n=spaces.Discrete(5))
-    layout = RowLayout(space, spaces.Discrete(2), (), ())
-    slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
-    row_writer(slab.observation, 0, "observation")({"n": 3, "x": [0.1, 0.2]})
-    found = index(slab.observation, 0)
-    assert found["x"].tolist() == np.array([0.1, 0.2], np.float32).tolist()
-    assert found["n"] == 3
-
-
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Text(3),
-        spaces.Sequence(spaces.Discrete(2)),
-        spaces.Graph(spaces.Box(0, 1, (2,)), None),
-        spaces.OneOf([spaces.Discrete(2), spaces.Box(0, 1, (2,))]),
-        spaces.Dict(a=spaces.Discrete(2), b=spaces.Text(3)),
-        spaces.Tuple([spaces.Sequence(spaces.Discrete(2))]),
-    ],
-    ids=str,
-)
-def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
-    """One such part makes the whole value pickled."""
-    assert leaves(space) is None
-    layout = RowLayout(space, spaces.Discrete(2), (), ())
-    slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
-    assert slab.observation is None
-    assert slab.action is not None
