@@ -68,13 +68,6 @@ def test_random_actions_are_in_their_space(space: gym.Space[Any], num_envs: int,
         assert space.contains(response.action), (space, response.action)
 
 
-@given(boxes(), st.integers(0, 2**32 - 1))
-def test_a_seed_repeats_actions(space: spaces.Box, seed: int) -> None:
-    """The same seed gives the same actions."""
-    first, second = sample(space, 3, seed), sample(space, 3, seed)
-    assert np.array_equal(first.action, second.action)
-
-
 def test_bounded_numbers_are_spread_over_their_range() -> None:
     """Both halves of each dimension's range occur equally often."""
     space = spaces.Box(np.array([-1.0, 10.0]), np.array([1.0, 30.0]), dtype=np.float64)
@@ -88,17 +81,6 @@ def test_unbounded_numbers_are_small() -> None:
     space = spaces.Box(-np.inf, np.inf, (2,))
     actions = sample(space, 1000, 0).action
     assert 0.05 < actions.std() < 0.2
-
-
-@given(st.lists(any_space, min_size=2, max_size=4), st.integers(0, 2**32 - 1))
-def test_each_env_gets_actions_of_its_own_space(kinds: list[gym.Space[Any]], seed: int) -> None:
-    """This holds for any composition and order of batches."""
-    by_id = {f"env-{k}": space for k, space in enumerate(kinds)}
-    policy = RandomPolicy(by_id.__getitem__, seed)
-    for ids in (list(by_id), list(reversed(by_id)), ["env-1"]):
-        batch = BatchedData(ids, [None] * len(ids))
-        for response in batch.respond(action=policy(batch)).values():
-            assert by_id[response.env_id].contains(response.action)
 
 
 MASK = np.array([0, 1, 0, 1, 0], np.int8)
