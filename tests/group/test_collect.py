@@ -131,6 +131,9 @@ async def test_closing_wakes_all_waiters() -> None:
             asyncio.create_task(group.step(steps(e1=HANG))),
         ]
         await asyncio.sleep(0)
+        first: Any = group._core.supervisor.hosts[0]  # noqa: SLF001
+        while not first.current_request()[0]:  # noqa: ASYNC110  # Else it closes before the step.
+            await asyncio.sleep(0.001)
         closing = asyncio.create_task(group.close())
         await asyncio.wait(waiting)
         assert not closing.done()
