@@ -19,7 +19,7 @@ from gymnasium import spaces
 from rlightning_aio.trees import as_array, key_of, mapped, tree_of, walked
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
@@ -88,15 +88,6 @@ def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
 def assemble(space: gym.Space[Any], arrays: Iterator[Any]) -> Tree:
     """Arrange `arrays`, or others, given in the order of `leaves`, in the structure of `space`."""
     return mapped(lambda _: next(arrays), tree_of(space))
-
-
-def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, NDArray[Any]]]:
-    """Yield each leaf with its array in `tree`."""
-    for leaf in space_leaves:
-        array = tree
-        for key in leaf.path:
-            array = array[key]
-        yield leaf, array
 
 
 def gather(tree: Node, rows: Rows) -> Any:

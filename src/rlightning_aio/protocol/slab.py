@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf, assemble, leaf_of, leaves, structure
+from rlightning_aio.protocol.columns import Leaf, assemble, leaves, structure
 from rlightning_aio.protocol.info import INFO_BYTES, INFO_BYTES_OF_SUB_ENV
+from rlightning_aio.trees import walked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -177,7 +178,8 @@ class Slab:
         self.action_columns: list[tuple[Leaf, NDArray[Any]]] = []
         if (action_leaves := layout.action_leaves) is not None:
             self.action = assemble(layout.action_space, arrays)
-            self.action_columns = list(leaf_of(action_leaves, self.action))
+            columns = [column for _, column in walked(self.action)]
+            self.action_columns = [*zip(action_leaves, columns, strict=True)]
         self.reward = next(arrays)
         self.flags = next(arrays)
         self.terminated, self.truncated = self.flags[..., TERMINATED], self.flags[..., TRUNCATED]

@@ -21,11 +21,11 @@ from rlightning_aio._core.hosts.messages import Built, NewSchema
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import close_all, give_rows
-from rlightning_aio.protocol.columns import leaf_of
 from rlightning_aio.protocol.entries import OP_MASK, Operation, slot_of, slots_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import Slab, rows_for
+from rlightning_aio.trees import walked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -134,13 +134,8 @@ class RowTable:
 
 def _outputs(slab: Slab) -> Columns:
     """Return the columns of a result except the info; the last one is its mark."""
-    observation = (
-        []
-        if slab.observation is None
-        else [
-            column for _, column in leaf_of(slab.layout.observation_leaves or (), slab.observation)
-        ]
-    )
+    in_rows = slab.observation is not None
+    observation = [column for _, column in walked(slab.observation)] if in_rows else []
     sums = [slab.episode_return, slab.episode_length]
     return [*observation, slab.reward, slab.flags, *sums, slab.busy_ns, slab.info_mark]
 
