@@ -237,6 +237,22 @@ def test_restarts_outlast_a_shortage_of_descriptors(
     assert [marked(ret) for ret in again.values()] == [False, True]
 
 
+@on_one_driver
+def test_a_worker_that_cannot_be_started_for_a_request_ends_it(start: Start) -> None:
+    """The worker is tried when the request is sent, as those before are given up."""
+    group, tokens = start(two_workers(max_restarts=0)), Tokens()
+    with pytest.raises(WorkerDied, match="code 3"):
+        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    kept = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, kept[1]))
+    try:
+        with pytest.raises(WorkerDied, match="can't start a worker for entry 'faulty'"):
+            group.reset(env_ids=["faulty-0"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, kept)
+    assert marked(group.reset(env_ids=["faulty-0"])[0]["faulty-0"])
+
+
 def test_worker_that_loses_its_channel_is_replaced(start: Start) -> None:
     """An env that closes a descriptor of the worker ends its worker only."""
     group, tokens = start(two_workers()), Tokens()

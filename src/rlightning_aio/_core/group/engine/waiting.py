@@ -270,8 +270,8 @@ class Waiting:
         ticket = self._requests.tickets.open(slots)
         try:
             send(ticket)
-            if self._supervisor.places.servers:
-                self.poll()  # A client may turn out to be gone as it is asked.
+            if self._completions:  # A client is gone, say, or no worker can be started.
+                self.poll()
             while ticket.remaining > 0:
                 now = yield from self.turn(ticket.remaining, None)
                 self.poll()
