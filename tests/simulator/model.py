@@ -293,7 +293,8 @@ class Env:
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
         exceptions: how often it may have raised, where it is then rebuilt.
         errors: of these since it last completed a step: at least and at most as many.
-        put_away: it has raised, and is rebuilt before it does anything else.
+        put_away: it has raised, and is rebuilt before it does anything else; perhaps: unless a
+            Ctrl-C came before that.
         lost: its episode surely is, which its next result says, unless that is a restore's.
         seen: `deaths` that its results have shown.
         loose: states of which it may have one, because a call was given up; torn: the same of a
@@ -318,6 +319,7 @@ class Env:
     exceptions: int = 0
     errors: tuple[int, int] = (0, 0)
     put_away: bool = False
+    perhaps: bool = False
     lost: bool = False
     seen: int = 0
     loose: list[State] = field(default_factory=list)
@@ -366,7 +368,7 @@ class Env:
         if self.client is not None:
             self.client.befores.clear()
         self.state, self.dirty, self.torn = state, False, []
-        self.put_away = self.lost = False
+        self.put_away = self.perhaps = self.lost = False
         self.loose = [other for other in others if other.scripts.subs[0].mark != mark]
 
     def possible(self) -> list[State]:
@@ -535,7 +537,7 @@ class Model:
         if restarted[0]:
             self._judge_marked(env, request, row)
             return
-        require(not (env.lost or env.put_away), "lost, and not marked")
+        require(not env.lost and (not env.put_away or env.perhaps), "lost, and not marked")
         states = [env.state, *env.loose]
         if not was_shown:  # It had nothing to lose.
             states = env.possible()
@@ -579,17 +581,23 @@ class Model:
     def _raising(self, env: Env, request: Request) -> list[Act]:
         """What of a request an env may raise."""
         request = self._executed(env, request)
-        states = [state.copy() for state in (env.state, *env.loose)]  # They stay as they are.
-        acts = [act for state in states for act in state.faults(request)]
+        asked = [(state, request) for state in (env.state, *env.loose)]
         for state in env.torn:  # A new episode in place of the step.
-            acts += state.copy().faults(Request("reset"))
+            asked.append((state, Request("reset")))
             if request.resets:  # Sent when the loss was known.
-                acts += state.copy().faults(request)
+                asked.append((state, request))
+            elif env.entry.form == "awaitable":
+                asked.append((state, self._begun_again(env, request)))
         if env.lost and request.resets:  # Its replacement knows nothing of what was before.
-            acts += env.fresh().faults(request)
+            asked.append((env.fresh(), request))
         if env.entry.form == "awaitable" and env.may_be_lost:  # Its last reset may have raised.
-            acts += env.fresh().faults(self._begun_again(env, request))
-        return [act for act in acts if act[0] in (*RAISING, "rubbish")]
+            asked.append((env.fresh(), self._begun_again(env, request)))
+        acts: list[Act] = []
+        for state, one in asked:  # They stay as they are.
+            each = state.copy().faults(one)
+            raised = [act for act in each if act[0] in RAISING]
+            acts += raised[:1] or [act for act in each if act[0] == "rubbish"]
+        return acts
 
     def _executed(self, env: Env, request: Request) -> Request:
         """What an env does for a request: one that was put away begins again."""
@@ -632,7 +640,7 @@ class Model:
         env.state = env.fresh()
         env.state.begun = begun.seed, begun.options
         env.loose, env.torn = [], []
-        env.put_away = True
+        env.put_away, env.perhaps = True, False
         self.counts["exceptions past max_restarts"] += 1
 
     def judge_heads(self, row: Row, cause: str = "worker_restarted") -> None:
@@ -755,7 +763,8 @@ class Model:
                 after.append(state.copy())
                 after[-1].play(done)
             if self._may_be_rebuilt(env, request):  # And interrupted in the reset that follows.
-                env.errors, env.put_away = (env.errors[0], self._most_errors(env)), True
+                env.errors = env.errors[0], self._most_errors(env)
+                env.put_away = env.perhaps = True
                 after += [env.fresh(), env.fresh()]
                 after[-1].play(Request("reset"))
             env.loose += after

@@ -551,8 +551,14 @@ class Play(Session):
 
     def may_drop(self) -> bool:
         """A reset of all envs drops what is in flight, and nothing stops it on the way."""
-        known = not ("interrupts" in self.features or self.clients or self.is_stopped)
+        known = not ("interrupts" in self.features or self.waits_with_nothing_sent())
+        known &= not (self.clients or self.is_stopped)
         return known and self.may_abort() and all(map(self.is_abortable, self.model.pending()))
+
+    def waits_with_nothing_sent(self) -> bool:
+        """Whether a task might see a reset of all that waits, for clients or cancelled calls."""
+        waits = self.clients or any(env.limbo for env in self.model.envs.values())
+        return "tasks" in self.features and bool(waits)
 
     async def drop(self, rng: Random) -> None:
         """Reset all envs, of which some are busy: their results and errors are dropped."""
@@ -578,7 +584,7 @@ class Play(Session):
         seed, options, requests = self.resets(envs, rng)
         if rng is not None:
             everyone = drops or (everyone and rng.random() < 0.7)
-        if self.clients and "tasks" in self.features:  # It may wait for one, with nothing sent.
+        if self.waits_with_nothing_sent():
             everyone = False
         if everyone:  # It drops errors that nobody has collected.
             for env in envs:
