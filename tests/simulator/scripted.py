@@ -16,6 +16,7 @@ import string
 import time
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, get_args
+from weakref import WeakKeyDictionary
 
 import gymnasium as gym
 import numpy as np
@@ -531,11 +532,16 @@ def decoded(controls: str, action: Any) -> tuple[str, int]:
 # -- envs
 
 
+_MADE_AS: WeakKeyDictionary[_Body, int] = WeakKeyDictionary()
+"""The code of each env, also when the state of another was restored."""
+
+
 class _Body:
     """What all envs of scripts have: the scripts, and what can be asked of them."""
 
     def __init__(self, codes: Sequence[int], mode: str, layout: str, controls: str) -> None:
         machine.make(codes[0])
+        _MADE_AS[self] = codes[0]
         self.layout, self.controls = layout, controls
         self.scripts = Scripts(codes, mode)
 
@@ -631,7 +637,7 @@ class Awaitable(_Single):
         return self._stepped(act)
 
     async def close(self) -> None:
-        code = self.scripts.subs[0].code
+        code = _MADE_AS[self]
         machine.closing(code, ends=False)
         try:
             if code % 2:
