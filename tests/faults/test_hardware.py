@@ -569,6 +569,18 @@ async def test_play_that_ends_early_stops_the_arm_before_its_agent_ends(
         wait_for(log, "stop")
 
 
+@pytest.mark.parametrize("placement", PLACEMENTS)
+async def test_an_agent_that_leaves_its_episode_stops_the_arm(
+    arm: Any, log: Path, placement: str
+) -> None:
+    """Whatever makes it do so between two steps, nobody drives the arm any more."""
+    async with build_env_group(arm(placement)) as group:
+        with pytest.raises(ZeroDivisionError):
+            async with group.episode(group.env_ids[0]):
+                raise ZeroDivisionError
+        await asyncio.to_thread(wait_for, log, "stop")
+
+
 class InHalves(Arm):
     """Its step is in two halves."""
 

@@ -108,7 +108,7 @@ class EnvEpisode:
     """
 
     last: EnvRet | MultiAgentEnvRet
-    is_over: bool
+    is_over = False
 
     def __init__(
         self,
@@ -136,6 +136,8 @@ class EnvEpisode:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
+        if not self.is_over:  # Nobody drives the env any more.
+            self._agents.steps.stop_hardware(self.env.env_id)
         for step in self._open_steps:
             if not step.is_outstanding:
                 step.reply.cancel()  # It will not be sent.
