@@ -413,6 +413,7 @@ def running(placement: str, log: Path, kind: str) -> subprocess.Popen[str]:
         ("inline", signal.SIGINT),
         ("process", signal.SIGTERM),
         ("process", signal.SIGKILL),
+        ("process", signal.SIGSTOP),
     ],
 )
 def test_an_arm_on_its_way_to_the_reset_position_stops(
@@ -425,6 +426,7 @@ def test_an_arm_on_its_way_to_the_reset_position_stops(
         wait_for(log, "reset")
         trainer.send_signal(number)
         wait_for(log, "stop")
+        trainer.send_signal(signal.SIGCONT)
         _, said = trainer.communicate(timeout=HANG)
     if number == signal.SIGKILL:
         assert said.count("env 'arm-0' was stopped, as the trainer has ended") == 1, said

@@ -17,6 +17,7 @@ the armed word, and the trainer arms and fences before it adds up the counters.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -213,18 +214,19 @@ class WorkerRings:
         self._stops = _stops(self._words, num_envs)
         self._stopped = [0] * num_envs
 
-    def to_stop(self, first_slot: int) -> list[int]:
+    def to_stop(self, first_slot: int, *, whatever: bool = False) -> list[int]:
         """Return the indices of the envs that must stop now.
 
         Those that were named since the last call, and the one that executes a request which was to
-        be stopped.
+        be stopped, or `whatever` it executes.
         """
         stops, current = self._stops.tolist(), self._words[CURRENT]
         found = [k for k, number in enumerate(stops) if number != self._stopped[k]]
         self._stopped = stops
         index = slot_of(current) - first_slot
         # An env that is being built or closed has the number 0, as if it were to be stopped.
-        if 0 < number_of(current) <= stops[index] and index not in found:
+        number, most = number_of(current), math.inf if whatever else stops[index]
+        if 0 < number <= most and index not in found:
             found.append(index)
         return found
 

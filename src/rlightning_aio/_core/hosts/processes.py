@@ -103,6 +103,15 @@ def resident_mb(pid: int) -> float:
     return pages * _PAGE_MB + sum(map(resident_mb, children))
 
 
+def is_suspended(pid: int) -> bool:
+    """Return True if a process was stopped, by a signal or a debugger."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2]
+    except OSError:  # It has ended, or this isn't Linux.
+        return False
+    return text[:1] in (b"T", b"t")
+
+
 def processor_ns(pid: int) -> int | None:
     """Return for how long the living threads of a process have run or waited for a core, in ns.
 

@@ -19,12 +19,13 @@ import time
 import traceback
 import weakref
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn, cast
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import SENDER, frame_of
 from rlightning_aio._core.hosts.logs import log_like
 from rlightning_aio._core.hosts.messages import Built, Closed
+from rlightning_aio._core.hosts.processes import is_suspended
 from rlightning_aio._core.hosts.running.build_env import built_envs, not_built
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
@@ -47,6 +48,10 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.runner import EnvRunner
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.error_text import ErrorText
+
+
+_LOOKS: Final = 10
+"""At the state of the trainer of hardware is looked once in so many looks, a tenth of a second."""
 
 
 class TrainerGone(Exception):
@@ -272,7 +277,7 @@ class Worker:
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
             if order.is_hardware:
-                self._unwatch = watched(self._watch())
+                self._unwatch = watched(self._watch(order.trainer_pid))
             self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
             started = [runner.started() for runner in self._runners]
         except BaseException as error:
@@ -283,15 +288,22 @@ class Worker:
         gc.collect()
         self._post(Built(SENDER, started))
 
-    def _watch(self) -> Callable[[], list[BaseEnv]]:
-        """Return what says which envs must stop now: all, once the trainer is gone."""
+    def _watch(self, trainer_pid: int | None) -> Callable[[], list[BaseEnv]]:
+        """Return what says which envs must stop now: all, once the trainer is gone or stopped."""
         poll = select.poll()
         poll.register(self._channel, select.POLLRDHUP)
+        num_looks, is_late = 0, False
 
         def to_stop() -> list[BaseEnv]:
-            runners = self._runners
+            nonlocal num_looks, is_late
+            runners, was_late = self._runners, is_late
+            num_looks += 1
+            if trainer_pid is not None and not num_looks % _LOOKS:
+                is_late = is_suspended(trainer_pid)
             if not poll.poll(0):
-                runners = [self._runners[k] for k in self._rings.to_stop(self._first_slot)]
+                chosen = self._rings.to_stop(self._first_slot, whatever=is_late)
+                if was_late or not is_late:
+                    runners = [runners[k] for k in chosen]
             return [runner.env for runner in runners if not runner.has_closed]
 
         return to_stop
