@@ -140,15 +140,18 @@ class EnvGroup(GroupInterface):
         return EnvEpisode(self, self._agents, self[env_id], seed, options)
 
     async def close(self) -> None:
-        loop, before = asyncio.get_running_loop(), self._closing
-        if self._core.lifetime.closed and before is not None and before.get_loop() is loop:
-            await asyncio.wait([before])
+        other, closing = self._closing, None
+        if other is not None and other.get_loop() is asyncio.get_running_loop():
+            await asyncio.wait([other])
             return
-        self._closing = closing = loop.create_future()
+        if not self._core.lifetime.closed:  # As it is in a forked child, where no loop runs.
+            closing = self._closing = asyncio.get_running_loop().create_future()
         try:
             await self._driver.run_last(self._core.close(time.monotonic()))
         finally:
-            closing.set_result(None)
+            if closing is not None:
+                self._closing = None
+                closing.set_result(None)
             self._after_close()
 
 
