@@ -225,13 +225,13 @@ class VectorEnv(  # pyright: ignore[reportIncompatibleMethodOverride]  # `np_ran
             self._check_whole()
         else:
             self._drop_outstanding()
-        if mask is None:
-            drop_unraised(self.group)
         places = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         group, env_ids = self.group, self.group.env_ids
         # As many at once as have the same options.
         alike = all(each[k] is each[places[0]] for k in places)
         with self._unless_refused(TypeError):
+            if mask is None:
+                drop_unraised(self.group)
             for some in [places] if alike else [[k] for k in places]:
                 own = {env_ids[k]: int(seeds[k]) for k in some if seeds[k] is not None}
                 group.reset_async(own, each[some[0]], [env_ids[k] for k in some])
