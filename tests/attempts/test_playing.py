@@ -775,10 +775,11 @@ async def test_lines_are_written_beside_the_event_loop(
     """Attempts go on while the disk is slow; no group comes before it is in the file, and who waits
     for that and is cancelled costs no line.
     """
-    disk, to_json = threading.Event(), Attempt.to_json
+    disk, begins, to_json = threading.Event(), threading.Event(), Attempt.to_json
     ended, most_have_ended = Counter[int](), asyncio.Event()
 
     def slow(attempt: Attempt) -> dict[str, Any]:
+        begins.set()
         assert disk.wait(HANG)
         return to_json(attempt)
 
@@ -793,7 +794,7 @@ async def test_lines_are_written_beside_the_event_loop(
         with ResultsFile(tmp_path / "results") as results:
             playing = asyncio.ensure_future(played(group, tasks(6), agent, 2, results=results))
             await most_have_ended.wait()
-            await asyncio.sleep(0.05)  # For lines of these.
+            assert await asyncio.to_thread(begins.wait, HANG)
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(results.written(), 0.05)
             assert not playing.done()
