@@ -129,3 +129,6 @@ def test_only_what_was_asked_to_stop_stops() -> None:
     assert worker.to_stop(0) == []
     worker.begin(entry(6, 2, STEP), 0)
     assert worker.to_stop(0) == []
+    assert worker.to_stop(0, whatever=True) == [2]
+    worker.idle()
+    assert worker.to_stop(5, whatever=True) == worker.to_stop(5) == []  # Its envs are 5, 6 and 7.

@@ -17,7 +17,6 @@ the armed word, and the trainer arms and fences before it adds up the counters.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -223,11 +222,11 @@ class WorkerRings:
         stops, current = self._stops.tolist(), self._words[CURRENT]
         found = [k for k, number in enumerate(stops) if number != self._stopped[k]]
         self._stopped = stops
-        index = slot_of(current) - first_slot
-        # An env that is being built or closed has the number 0, as if it were to be stopped.
-        number, most = number_of(current), math.inf if whatever else stops[index]
-        if 0 < number <= most and index not in found:
-            found.append(index)
+        # An env that is being built or closed has the number 0, and so has a worker that waits.
+        if number := number_of(current):
+            index = slot_of(current) - first_slot
+            if (whatever or number <= stops[index]) and index not in found:
+                found.append(index)
         return found
 
     def requests(self) -> list[int]:
