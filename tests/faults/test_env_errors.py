@@ -222,16 +222,6 @@ def test_value_that_cannot_be_pickled_is_an_error_of_its_call(start: Start) -> N
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@on_one_driver
-def test_info_that_cannot_be_pickled_is_an_error_of_its_step(start: Start) -> None:
-    """The env has stepped, but the result can't be sent."""
-    group, tokens = start(two_workers()), Tokens()
-    group.call("faulty-1", "answer_with", info=lambda: {"lock": threading.Lock()})
-    with pytest.raises(EnvRaised, match="the result can't be pickled"):
-        group.step(tokens.steps(["faulty-1"]))
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
-
-
 MISFITS: dict[str, tuple[dict[str, Any], str]] = {
     "shape": (
         {"observation": lambda: np.zeros((2, 3))},

@@ -18,7 +18,7 @@ from patience import HANG
 import rlightning_aio
 from rlightning_aio import registry
 from rlightning_aio._core.hosts import times
-from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
+from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -237,30 +237,6 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
         group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
     assert "in __init__" in caught.value.stderr_tail
     tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
-
-
-def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> None:
-    """Nothing is lost, doubled, or mixed up with another request."""
-    group, tokens = start(two_workers(step_timeout=60)), Tokens()
-    pid = pid_of(group, "faulty-0")
-    waits: list[dict[str, Any]] = [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}]
-    for waiting in waits:
-        stop(pid)
-        group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
-        for _ in range(3):
-            with pytest.raises(TimeoutError, match="nothing is lost"):
-                group.collect_async(deadline=0.05, **waiting)
-        os.kill(pid, signal.SIGCONT)
-        ids: list[str] = []
-        while len(ids) < 2:
-            batch, _ = group.collect_async(**waiting)
-            tokens.check(batch)
-            ids += batch.ids()
-        assert sorted(ids) == ["faulty-0", "faulty-1"]
-        with pytest.raises(NothingPending):
-            group.collect_async()
-        for _ in range(3):
-            tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 @on_one_driver

@@ -711,7 +711,7 @@ class Model:
                 if env.kept and (request is None or env_id in busy):
                     env.kept.pop(0)
                     self.counts["error of an aborted request"] += 1
-                    if isinstance(one, WorkerDied):
+                    if isinstance(one, WorkerDied) and env.may_be_lost:  # Else that was shown.
                         self.died(env, one)
                     continue
                 require(
