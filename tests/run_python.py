@@ -13,8 +13,6 @@ from patience import HANG
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["blocks", "output_of"]
-
 
 def blocks(language: str, page: str) -> list[str]:
     """Return the blocks of code in this language, in the text of a page."""

@@ -7,8 +7,6 @@ import os
 import re
 import resource
 import signal
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,6 +15,7 @@ import pytest
 from kit.driven import Driven, kinds_on_both_drivers, on_one_driver
 from kit.processes import fork_server_pid, kill, pid_of
 from kit.tokens import Tokens, entry, marked, two_workers
+from run_python import output_of
 
 from rlightning_aio.errors import StartFailed, WorkerDied
 
@@ -294,27 +293,21 @@ def test_stacks_of_a_crash_appear_once(
 
 def test_handling_a_death_imports_no_module() -> None:
     """An import needs descriptors, and at a death there may be none left."""
-    script = """
+    tests = str(Path(__file__).parents[1])
+    script = f"""
 import sys
+sys.path.insert(0, {tests!r})
 from kit.tokens import Tokens, two_workers
 import rlightning_aio.sync
 with rlightning_aio.sync.build_env_group(two_workers()) as group:
     tokens = Tokens()
     batch, _ = group.step(tokens.steps(group.env_ids))
     before = set(sys.modules)
-    batch, _ = group.step(tokens.steps(group.env_ids, {"faulty-0": "sigkill"}))
+    batch, _ = group.step(tokens.steps(group.env_ids, {{"faulty-0": "sigkill"}}))
     assert batch.restarted.any()
     print(*sorted(set(sys.modules) - before))
 """
-    tests = str(Path(__file__).parents[1])
-    ran = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([tests, *sys.path])},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert ran.stdout.split() == []
+    assert output_of("-c", script).split() == []
 
 
 @on_one_driver

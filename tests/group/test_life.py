@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import re
-import subprocess
 import sys
 import threading
 import warnings
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import uvloop
 from group import sample_envs
+from run_python import output_of
 
 import rlightning_aio
 from rlightning_aio import BatchedData, GroupClosed, PolicyResponse, StartFailed, sync
@@ -280,12 +280,7 @@ def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
     """With their classes, functions and spaces in `__main__`, for both placements."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == ["process [38] 7", "inline [38] 7", "[7]"]
-    assert done.stderr == ""
+    assert output_of(script).splitlines() == ["process [38] 7", "inline [38] 7", "[7]"]
 
 
 @pytest.mark.one_driver_for_each_place

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from run_python import output_of
 
 from rlightning_aio import EnvConfig, StartFailed, sync
 from rlightning_aio._core.hosts.process import spares
@@ -124,10 +123,6 @@ if not child:
 assert os.waitpid(child, 0)[1] == 0
 assert spare.process.poll() is None
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    pids = done.stdout.split()
+    pids = output_of("-c", script).split()
     assert len(set(pids)) == 2
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
