@@ -575,7 +575,6 @@ async def test_play_that_ends_early_stops_the_arm_before_its_agent_ends(
 async def test_an_agent_that_leaves_its_episode_stops_the_arm(
     arm: Any, log: Path, placement: str
 ) -> None:
-    """Whatever makes it do so between two steps, nobody drives the arm any more."""
     async with build_env_group(arm(placement)) as group:
         with pytest.raises(ZeroDivisionError):
             async with group.episode(group.env_ids[0]):

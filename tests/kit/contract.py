@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["EnvContract"]
-
 Expected = tuple[Any, Any, Any, Any]
 """Observation, reward, terminated, truncated; NumPy arrays and Python scalars in them."""
 

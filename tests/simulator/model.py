@@ -659,6 +659,8 @@ class Model:
             may_be_lost = env.may_be_lost or failed_start
             require(env.host.mortal and may_be_lost, "marked, and nothing has died")
             is_known = env.entry.on_death != "raise" or env.host.aborted or env.host.raised
+            owed = [e for e in self.envs.values() if e.host is env.host and e.request]
+            is_known |= len(owed) > 1  # Another's error may still have to be raised.
             require(is_known, "marked, where a death is to be raised")
         cause = "worker_restarted" if env.client is None else "client_lost"
         self.judge_heads(row, cause)
