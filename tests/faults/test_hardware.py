@@ -269,14 +269,18 @@ async def test_only_the_arm_stops_whose_own_action_is_refused(
         assert "stop" not in lines(logs[1])
 
 
-class AwaitableArm(Arm):
-    """An arm whose methods are coroutine functions."""
+class Coroutines:
+    """Makes coroutine functions of the methods of an arm, but for those that end its motion."""
 
-    async def reset(self, **arguments: Any) -> EnvRet:  # type: ignore[override]
-        return super().reset(**arguments)
+    async def reset(self, **arguments: Any) -> Any:
+        return super().reset(**arguments)  # type: ignore[misc]
 
-    async def step(self, policy_resp: PolicyResponse) -> EnvRet:  # type: ignore[override]
-        return super().step(policy_resp)
+    async def step(self, action: Any) -> Any:
+        return super().step(action)  # type: ignore[misc]
+
+
+class AwaitableArm(Coroutines, Arm):  # type: ignore[misc]
+    pass
 
 
 class Hanging(AwaitableArm):
@@ -464,14 +468,8 @@ class GymnasiumArm(Counts):
             file.write("close\n")
 
 
-class CoroutineArm(GymnasiumArm):
-    """Its methods are coroutine functions, but for those that end its motion."""
-
-    async def reset(self, **arguments: Any) -> Any:  # type: ignore[override]
-        return super().reset(**arguments)
-
-    async def step(self, action: Any) -> Any:  # type: ignore[override]
-        return super().step(action)
+class CoroutineArm(Coroutines, GymnasiumArm):  # type: ignore[misc]
+    pass
 
 
 class StoppedByCoroutine(CoroutineArm):

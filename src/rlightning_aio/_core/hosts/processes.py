@@ -45,15 +45,28 @@ def children() -> dict[int, list[int]]:
     except OSError:  # There are no descriptors.
         return found
     for pid in pids:
-        try:
-            # The name in parentheses may contain anything.
-            text = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2]
-        except OSError:  # It has ended meanwhile.
-            continue
-        state, parent, *_ = text.split()
+        state, parent = _state_and_parent(pid)
         if state not in (b"Z", b"X"):
-            found.setdefault(int(parent), []).append(pid)
+            found.setdefault(parent, []).append(pid)
     return found
+
+
+def is_suspended(pid: int) -> bool:
+    """Return True if a process was stopped, by a signal or a debugger."""
+    return _state_and_parent(pid)[0] in (b"T", b"t")
+
+
+def _state_and_parent(pid: int) -> tuple[bytes, int]:
+    """Return the kernel's letter for the state of a process, ``X`` once it has ended, and the pid
+    of its parent.
+    """
+    try:
+        # The name in parentheses may contain anything.
+        text = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2]
+    except OSError:  # It has ended, or this isn't Linux.
+        return b"X", 0
+    state, parent, *_ = text.split()
+    return state, int(parent)
 
 
 def kill_below(process: int, but: Collection[int] = ()) -> None:
@@ -101,15 +114,6 @@ def resident_mb(pid: int) -> float:
         with contextlib.suppress(OSError):  # A thread may have ended, too.
             children += map(int, (thread / "children").read_text().split())
     return pages * _PAGE_MB + sum(map(resident_mb, children))
-
-
-def is_suspended(pid: int) -> bool:
-    """Return True if a process was stopped, by a signal or a debugger."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_bytes().rpartition(b") ")[2]
-    except OSError:  # It has ended, or this isn't Linux.
-        return False
-    return text[:1] in (b"T", b"t")
 
 
 def processor_ns(pid: int) -> int | None:

@@ -11,7 +11,7 @@ import time
 from contextvars import Context
 from typing import TYPE_CHECKING, Any, Self
 
-from rlightning_aio._core.group.api.facade import response_to
+from rlightning_aio._core.group.api.facade import response_to, stop_hardware
 from rlightning_aio._core.group.engine.agent_steps import AgentStep, EpisodeStart, MethodCall
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio.errors import EpisodeLost
@@ -137,7 +137,7 @@ class EnvEpisode:
 
     async def __aexit__(self, *exc: object) -> None:
         if not self.is_over:  # Nobody drives the env any more.
-            self._agents.steps.stop_hardware(self.env.env_id)
+            stop_hardware(self._group, [self.env.env_id])
         for step in self._open_steps:
             if not step.is_outstanding:
                 step.reply.cancel()  # It will not be sent.

@@ -94,11 +94,11 @@ def is_resettable(group: Any, env_id: str) -> bool:
     return not core.tables.record_of(core.envs.find_one(env_id)).is_hardware
 
 
-def stop_hardware(group: Any) -> None:
-    """Stop all envs that move something real, as what plays on them ends early."""
+def stop_hardware(group: Any, env_ids: Sequence[str] | None = None) -> None:
+    """Stop envs that move something real, of `env_ids` or all, as what plays on them ends early."""
     core: Core = group._core  # noqa: SLF001
     if core.lifetime.open:
-        core.tables.stop_hardware(core.envs.all.tolist())
+        core.tables.stop_hardware(core.envs.chosen(env_ids).tolist())
 
 
 def is_lost_hardware(group: Any, env_id: str) -> bool:

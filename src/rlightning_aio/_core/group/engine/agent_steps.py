@@ -152,11 +152,6 @@ class AgentSteps:
             self._ended(slot)
             self._waiting.leave(slot)
 
-    def stop_hardware(self, env_id: str) -> None:
-        """Stop an env if it moves something real."""
-        if self._tables.lifetime.open:
-            self._tables.stop_hardware([self._tables.envs.find_one(env_id)])
-
     def loss(self, env_id: str) -> Outcome | None:
         """The loss of an idle env's episode since its newest result; None if it has not lost it."""
         why = self._tables.episodes.why_lost(self._tables.envs.find_one(env_id))

@@ -6,7 +6,6 @@ all envs waits until every place of an env_server has a client.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
@@ -96,12 +95,10 @@ class Resets:
         """Wait until every place has a client."""
         began = now
         while empty := self._places.empty():
-            seconds = [r.place.server.connect_timeout for r in empty if r.place is not None]
-            late = [r for r, most in zip(empty, seconds, strict=True) if now >= began + most]
+            late, due = self._places.late(empty, began, now)
             if late:
                 raise self._places.away(late)
-            due = began + min(seconds)
-            now = yield Wait(self._supervisor.next_check(due if due < math.inf else None))
+            now = yield Wait(self._supervisor.next_check(due))
             self._waiting.check(now)
         return now
 

@@ -7,7 +7,6 @@ read wakes all of them, so many envs that are asked one by one share one call (s
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -224,12 +223,11 @@ class Waiting:
                 if owner == COLLECTOR:
                     since = max(since, self.collecting)
                 self._alone_since[call] = since
-                ends = [since + r.place.server.connect_timeout for r in own if r.place is not None]
-                late = [record for record, end in zip(own, ends, strict=True) if now >= end]
+                late, next_end = self._supervisor.places.late(own, since, now)
                 if late:  # What is left for the collector may wait on.
                     self.intake.end_held(late if owner == COLLECTOR else own)
                     due = now
-                due = earliest(due, *(end for end in ends if now < end < math.inf))
+                due = earliest(due, next_end)
         return due
 
     def _alone(

@@ -7,6 +7,7 @@ wait looks at it. `Supervisor` and `Intake` call this; it sends nothing itself.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +94,18 @@ class Places:
     def empty(self) -> list[HostRecord]:
         """Return the places without a client."""
         return [record for record in self._records if record.stage is Stage.DOWN]
+
+    @staticmethod
+    def late(
+        empty: Sequence[HostRecord], since: float, now: float
+    ) -> tuple[list[HostRecord], float | None]:
+        """Return the places for which a call has waited too long, and when others are among them.
+
+        None: never.
+        """
+        ends = [since + r.place.server.connect_timeout for r in empty if r.place is not None]
+        late = [record for record, end in zip(empty, ends, strict=True) if now >= end]
+        return late, min((end for end in ends if now < end < math.inf), default=None)
 
     def away(self, empty: Sequence[HostRecord]) -> EnvAway:
         """Return the error for a call that has waited for empty places for too long."""

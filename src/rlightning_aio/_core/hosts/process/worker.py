@@ -292,17 +292,17 @@ class Worker:
         """Return what says which envs must stop now: all, once the trainer is gone or stopped."""
         poll = select.poll()
         poll.register(self._channel, select.POLLRDHUP)
-        num_looks, is_late = 0, False
+        num_looks, is_stopped = 0, False
 
         def to_stop() -> list[BaseEnv]:
-            nonlocal num_looks, is_late
-            runners, was_late = self._runners, is_late
+            nonlocal num_looks, is_stopped
+            runners, was_stopped = self._runners, is_stopped
             num_looks += 1
             if trainer_pid is not None and not num_looks % _LOOKS:
-                is_late = is_suspended(trainer_pid)
+                is_stopped = is_suspended(trainer_pid)
             if not poll.poll(0):
-                chosen = self._rings.to_stop(self._first_slot, whatever=is_late)
-                if was_late or not is_late:
+                chosen = self._rings.to_stop(self._first_slot, whatever=is_stopped)
+                if was_stopped or not is_stopped:
                     runners = [runners[k] for k in chosen]
             return [runner.env for runner in runners if not runner.has_closed]
 
