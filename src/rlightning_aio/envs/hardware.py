@@ -177,10 +177,7 @@ def stopped_by_signals() -> Generator[None]:
 
 @contextlib.contextmanager
 def signals_held_back() -> Generator[None]:
-    """Handle signals after the block.
-
-    For what must not be left half done.
-    """
+    """Handle signals after the block, for what must not be left half done."""
     if current_thread() is not main_thread():
         yield  # Handlers run in the main thread alone.
         return

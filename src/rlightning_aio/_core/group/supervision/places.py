@@ -99,9 +99,8 @@ class Places:
     def late(
         empty: Sequence[HostRecord], since: float, now: float
     ) -> tuple[list[HostRecord], float | None]:
-        """Return the places for which a call has waited too long, and when others are among them.
-
-        None: never.
+        """Return the places that a call has waited for too long, and when the next one will be
+        among them; None for never.
         """
         ends = [since + r.place.server.connect_timeout for r in empty if r.place is not None]
         late = [record for record, end in zip(empty, ends, strict=True) if now >= end]

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 _LOOKS: Final = 10
-"""At the state of the trainer of hardware is looked once in so many looks, a tenth of a second."""
+"""A worker of hardware looks at its trainer's state in every tenth look, ten times a second."""
 
 
 class TrainerGone(Exception):
